@@ -1,0 +1,116 @@
+"""Enumerations of the wire, for every layer. Each member is a `str` equal to what travels.
+
+A server may send a value that no enum knows; such a value stays a plain `str` wherever a type reads
+`SomeEnum | str`, see `known`.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import TypeVar
+
+__all__ = [
+    "ActuatorType",
+    "CameraMode",
+    "CameraTiming",
+    "ControlMode",
+    "ControllerKind",
+    "ObservationLevel",
+    "PIEState",
+    "StepMode",
+    "Transport",
+    "known",
+]
+
+E = TypeVar("E", bound=StrEnum)
+
+
+class StepMode(StrEnum):
+    """What advances physics."""
+
+    AUTO = "auto"
+    DIRECT = "direct"
+    PUPPET = "puppet"
+    LIVE = "live"
+
+
+class ControlMode(StrEnum):
+    """Who turns set-points into actuator signals."""
+
+    UE_CONTROLLER = "ue_controller"
+    RAW = "raw"
+
+
+class ActuatorType(StrEnum):
+    """Authored MJCF actuator element; `<general>` is reported as `MOTOR`."""
+
+    MOTOR = "motor"
+    POSITION = "position"
+    VELOCITY = "velocity"
+    INT_VELOCITY = "intvelocity"
+    DAMPER = "damper"
+    CYLINDER = "cylinder"
+    MUSCLE = "muscle"
+    ADHESION = "adhesion"
+    DC_MOTOR = "dcmotor"
+
+
+class ControllerKind(StrEnum):
+    """Kind of the controller attached to an articulation."""
+
+    PD = "pd"
+    PASSTHROUGH = "passthrough"
+
+    @classmethod
+    def _missing_(cls, value: object) -> ControllerKind | None:
+        # The plugin calls its passthrough controller "base".
+        return cls.PASSTHROUGH if value == "base" else None
+
+
+class CameraMode(StrEnum):
+    """What a camera's pixels mean."""
+
+    REAL = "real"
+    DEPTH = "depth"
+    SEMANTIC = "semantic"
+    INSTANCE = "instance"
+
+
+class CameraTiming(StrEnum):
+    """Which frame a step reply carries: one rendered after the step, or the newest at hand."""
+
+    SYNC = "sync"
+    LATEST = "latest"
+
+
+class ObservationLevel(StrEnum):
+    """How much state the server serialises per step."""
+
+    MINIMAL = "minimal"
+    STANDARD = "standard"
+    FULL = "full"
+
+
+class PIEState(StrEnum):
+    """Where Play-In-Editor stands."""
+
+    READY = "ready"
+    COMPILE_FAILED = "compile_failed"
+    TIMEOUT = "timeout"
+    OFF = "off"
+    COMPILING = "compiling"
+
+
+class Transport(StrEnum):
+    """How requests travel."""
+
+    ZMQ = "zmq"
+    SHM = "shm"
+
+
+def known(enum: type[E], value: str) -> E | str:
+    """Return the member of `enum` equal to `value`, or `value` itself when a newer server invented it."""
+    try:
+        return enum(value)
+    except ValueError:
+        return value

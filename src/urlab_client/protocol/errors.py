@@ -1,0 +1,445 @@
+"""Every exception this package raises on purpose, and the table from wire codes to exception classes.
+
+`str()` of each says what failed, on what, and what to do next. All of them pickle, so they cross worker pools.
+Mistakes in arguments are plain `ValueError` or `TypeError`, raised before anything is sent.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+from urlab_client.protocol.enums import PIEState
+
+__all__ = [
+    "RPC_ERRORS",
+    "ClientClosed",
+    "ConcurrentReadError",
+    "ConnectionLost",
+    "ForkedError",
+    "OutcomeUnknown",
+    "ProtocolError",
+    "ServerUnreachable",
+    "SessionTakenOver",
+    "StreamOverflow",
+    "URLabConnectionError",
+    "URLabError",
+    "URLabPIEError",
+    "URLabRPCError",
+    "URLabTimeoutError",
+    "URLabVersionMismatch",
+    "rpc_error",
+]
+
+
+def _rebuild(cls: type[URLabError], args: tuple[Any, ...], state: dict[str, Any]) -> URLabError:
+    error = cls.__new__(cls)
+    error.args = args
+    error.__dict__.update(state)
+    return error
+
+
+class URLabError(Exception):
+    """Base of everything this package raises on purpose.
+
+    Attributes:
+        op: Name of the op that failed, or None.
+        code: Short stable code, or None where no server was involved.
+        hint: What to do next; part of `str()` already.
+    """
+
+    op: str | None
+    code: str | None
+    hint: str | None
+
+    def __init__(
+        self, message: str, *, op: str | None = None, code: str | None = None, hint: str | None = None
+    ) -> None:
+        super().__init__(message)
+        self.op = op
+        self.code = code
+        self.hint = hint
+
+    def __str__(self) -> str:
+        text = str(self.args[0]) if self.args else ""
+        return f"{text} {self.hint}" if self.hint else text
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _rebuild, (type(self), self.args, dict(self.__dict__))
+
+
+class URLabConnectionError(URLabError, ConnectionError):
+    """The link to the server is unusable."""
+
+
+class ServerUnreachable(URLabConnectionError):
+    """No connection could be made within the deadline; nothing was sent."""
+
+
+class ConnectionLost(URLabConnectionError):
+    """The connection broke. Nothing that changes the simulation was under way."""
+
+
+class OutcomeUnknown(URLabConnectionError):
+    """The connection broke after a request was sent that changes state: it may or may not have been executed."""
+
+
+class ClientClosed(URLabConnectionError):
+    """The client was closed, before this call or during it."""
+
+
+class ForkedError(URLabConnectionError):
+    """The client was made in another process; a forked child must make its own."""
+
+
+class URLabTimeoutError(URLabError, TimeoutError):
+    """No reply arrived within the deadline. A request that was sent may still be executed by the server."""
+
+
+class ProtocolError(URLabError):
+    """A frame from the server could not be understood.
+
+    Attributes:
+        raw: The first bytes of the frame.
+    """
+
+    raw: bytes
+
+    def __init__(self, message: str, *, op: str | None = None, raw: bytes = b"", hint: str | None = None) -> None:
+        super().__init__(message, op=op, hint=hint)
+        self.raw = raw[:256]
+
+
+class URLabVersionMismatch(URLabError):
+    """Client and server MuJoCo builds differ, so the compiled model cannot be loaded here.
+
+    Attributes:
+        server_version: MuJoCo version of the server.
+        client_version: MuJoCo version installed here.
+    """
+
+    server_version: str
+    client_version: str
+
+    def __init__(self, server_version: str, client_version: str, *, hint: str | None = None) -> None:
+        super().__init__(
+            f"The server runs MuJoCo {server_version}, this process has MuJoCo {client_version}.",
+            op="hello",
+            hint=hint
+            or (
+                f"Install mujoco=={server_version}, or pass mujoco_version_check=False to go on with a warning, "
+                "or local_model=False to work without a local model."
+            ),
+        )
+        self.server_version = server_version
+        self.client_version = client_version
+
+
+class StreamOverflow(URLabError):
+    """A stream read with policy `all` fell behind its bounded buffer."""
+
+
+class ConcurrentReadError(URLabError):
+    """A second task tried to read a stream that already has a reader."""
+
+
+RPC_ERRORS: dict[str, type[URLabRPCError]] = {}
+"""Wire code to exception class; codes not listed here raise `URLabRPCError` itself."""
+
+
+class URLabRPCError(URLabError):
+    """The server refused a request.
+
+    Attributes:
+        code: Short stable code, for example `unknown_articulation`.
+        message: The server's text; its wording is not stable.
+    """
+
+    advice: ClassVar[str | None] = None
+    code: str
+    message: str
+
+    def __init_subclass__(cls, *, code: str | None = None, advice: str | None = None, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if code is not None:
+            if code in RPC_ERRORS:
+                raise TypeError(f"error code {code!r} is declared twice")
+            RPC_ERRORS[code] = cls
+        if advice is not None:
+            cls.advice = advice
+
+    def __init__(self, code: str, message: str, *, op: str | None = None, hint: str | None = None) -> None:
+        what = f"{op}: {code}" if op else code
+        super().__init__(
+            f"{what}: {message}" if message else what, op=op, code=code, hint=hint if hint is not None else self.advice
+        )
+        self.code = code
+        self.message = message
+
+
+def rpc_error(code: str, message: str, *, op: str | None = None) -> URLabRPCError:
+    """Make the exception for an error reply: the class declared for `code`, else `URLabRPCError`."""
+    return RPC_ERRORS.get(code, URLabRPCError)(code, message, op=op)
+
+
+class URLabPIEError(URLabRPCError):
+    """`sim.start()` did not reach Playing.
+
+    Attributes:
+        state: Where Play-In-Editor stands.
+        message: MuJoCo's compile log when the model was rejected, else an explanation.
+    """
+
+    state: PIEState
+
+    def __init__(self, *, code: str, message: str, state: PIEState) -> None:
+        super().__init__(code, message, op="begin_pie")
+        self.state = state
+
+
+# One class per wire code. The docstring is the row of the error table in the documentation.
+
+
+class SessionTakenOver(
+    URLabRPCError,
+    URLabConnectionError,
+    code="session_expired",
+    advice="Call discover() to open a new session; it takes the server over from whoever holds it now.",
+):
+    """The server no longer knows this session: another client said hello, or the server restarted."""
+
+
+class BadRequest(URLabRPCError, code="bad_request"):
+    """The frame is neither a msgpack map nor a JSON object."""
+
+
+class MissingOp(URLabRPCError, code="missing_op"):
+    """The request has no usable `op`."""
+
+
+class UnknownOp(URLabRPCError, code="unknown_op", advice="This server does not offer the op; see `meta` for its list."):
+    """The server has no op of that name; a packaged build answers this to every editor op."""
+
+
+class NotInEditor(URLabRPCError, code="not_in_editor"):
+    """The op needs the editor."""
+
+
+class WrongTransport(URLabRPCError, code="wrong_transport"):
+    """The op is not served over shared memory. It was not executed."""
+
+
+class ReplyTooLarge(URLabRPCError, code="reply_too_large"):
+    """The reply does not fit a shared-memory slot; the message says whether the op was executed."""
+
+
+class Unsupported(URLabRPCError, code="unsupported"):
+    """Only a server without Unreal answers this: it cannot do what was asked."""
+
+
+class MissingField(URLabRPCError, code="missing_field"):
+    """A required field is absent, empty or malformed."""
+
+
+class NoActiveManager(
+    URLabRPCError, code="no_active_manager", advice="Start a play session first: client.sim.start()."
+):
+    """No play session is running."""
+
+
+class NotReady(URLabRPCError, code="not_ready"):
+    """The play session has no compiled model (yet), or the part of it the op needs is missing."""
+
+
+class StepTimeout(
+    URLabRPCError,
+    code="step_timeout",
+    advice="Is physics paused (client.runtime.set_paused(False)), a replay running, or n_steps too long? "
+    "The queued steps still run when the physics loop gets to them.",
+):
+    """A direct step did not finish within the server's own limit of 5 s; the queued work is not cancelled."""
+
+
+class ShuttingDown(URLabRPCError, code="shutting_down"):
+    """The server is stopping."""
+
+
+class UnknownKeyframe(URLabRPCError, code="unknown_keyframe"):
+    """The compiled model has no keyframe of that name; nothing was reset."""
+
+
+class ModeLocked(URLabRPCError, code="mode_locked_by_server"):
+    """The project pins the step mode."""
+
+
+class BadMode(URLabRPCError, code="bad_mode"):
+    """Unknown step mode."""
+
+
+class BadValue(URLabRPCError, code="bad_value"):
+    """A value outside the op's list of choices."""
+
+
+class UnknownArticulation(URLabRPCError, code="unknown_articulation"):
+    """No articulation has this key or actor id."""
+
+
+class NoController(URLabRPCError, code="no_controller"):
+    """The articulation has no controller."""
+
+
+class ControllerSchemaViolation(URLabRPCError, code="controller_schema_violation"):
+    """Controller parameters do not fit the controller's schema; nothing was changed."""
+
+
+class NoTwistController(URLabRPCError, code="no_twist_controller"):
+    """The articulation has no twist controller."""
+
+
+class NoJoints(URLabRPCError, code="no_joints"):
+    """The articulation has no joints."""
+
+
+class DimMismatch(URLabRPCError, code="dim_mismatch"):
+    """The vector's length does not fit the articulation."""
+
+
+class UnknownBody(URLabRPCError, code="unknown_body"):
+    """The compiled model has no body of that name."""
+
+
+class NotMocapBody(URLabRPCError, code="not_mocap_body"):
+    """The body is not flagged `mocap="true"`."""
+
+
+class RecordingAlreadyActive(URLabRPCError, code="recording_already_active"):
+    """A recording is already running."""
+
+
+class RecordingNotActive(URLabRPCError, code="recording_not_active"):
+    """No recording is running."""
+
+
+class PathNotWritable(URLabRPCError, code="path_not_writable"):
+    """The recording could not be written, or there is nothing to save."""
+
+
+class PathNotReadable(URLabRPCError, code="path_not_readable"):
+    """The recording is missing or is not one."""
+
+
+class ReplaySessionNotFound(URLabRPCError, code="replay_session_not_found"):
+    """No replay session has this name."""
+
+
+class ReplayRequiresStepped(
+    URLabRPCError, code="replay_requires_stepped", advice="Switch first: client.runtime.set_mode('direct')."
+):
+    """Replay needs mode `direct` or `puppet`."""
+
+
+class ImportFailed(URLabRPCError, code="import_failed"):
+    """The MJCF file is missing or was rejected, or an old blueprint could not be removed."""
+
+
+class CreateLevelFailed(URLabRPCError, code="create_level_failed"):
+    """The level exists already, a play session runs, or it could not be saved."""
+
+
+class LoadLevelFailed(URLabRPCError, code="load_level_failed"):
+    """The level does not exist, cannot be read, or a play session runs."""
+
+
+class SaveLevelFailed(URLabRPCError, code="save_level_failed"):
+    """The level has no path yet, a play session runs, or it could not be written."""
+
+
+class SpawnFailed(URLabRPCError, code="spawn_failed"):
+    """The class cannot be spawned, or the actor id belongs to an actor of another class."""
+
+
+class InvalidCount(URLabRPCError, code="invalid_count"):
+    """A grid count is not above zero."""
+
+
+class TooManyCells(URLabRPCError, code="too_many_cells"):
+    """A grid of more than 1024 cells."""
+
+
+class DestroyFailed(URLabRPCError, code="destroy_failed"):
+    """No actor matches."""
+
+
+class DestroyAssetFailed(URLabRPCError, code="destroy_asset_failed"):
+    """The asset exists but cannot be deleted."""
+
+
+class SetActorTransformFailed(URLabRPCError, code="set_actor_transform_failed"):
+    """No actor matches, or the rotation is not one."""
+
+
+class DuplicateFailed(URLabRPCError, code="duplicate_failed"):
+    """No actor matches, or the new id belongs to an actor of another class."""
+
+
+class ActorHierarchyFailed(URLabRPCError, code="actor_hierarchy_failed"):
+    """No actor matches."""
+
+
+class SnapshotFailed(URLabRPCError, code="snapshot_failed"):
+    """There is no world to describe."""
+
+
+class ListActorsFailed(URLabRPCError, code="list_actors_failed"):
+    """There is no world to list."""
+
+
+class ListBlueprintsFailed(URLabRPCError, code="list_blueprints_failed"):
+    """The content could not be searched."""
+
+
+class FindActorsFailed(URLabRPCError, code="find_actors_failed"):
+    """There is no world to search."""
+
+
+class GetActorBoundsFailed(URLabRPCError, code="get_actor_bounds_failed"):
+    """No actor matches."""
+
+
+class SelectFailed(URLabRPCError, code="select_failed"):
+    """No actor matches."""
+
+
+class AddQuickConvertFailed(URLabRPCError, code="add_quick_convert_failed"):
+    """No actor matches, or it has no mesh to convert."""
+
+
+class RemoveQuickConvertFailed(URLabRPCError, code="remove_quick_convert_failed"):
+    """No actor matches, or it is not converted."""
+
+
+class GameThreadTimeout(URLabRPCError, code="timeout"):
+    """The editor's game thread did not answer in time; often a modal dialog is open."""
+
+
+class NoWorld(URLabRPCError, code="no_world"):
+    """Neither a play world nor an editor world exists."""
+
+
+class NoEngine(URLabRPCError, code="no_engine"):
+    """There is no engine object to draw with."""
+
+
+class NoViewport(URLabRPCError, code="no_viewport"):
+    """The editor has no perspective viewport."""
+
+
+class UnknownActor(URLabRPCError, code="unknown_actor"):
+    """No actor matches; the message is the key."""
+
+
+class NoBounds(URLabRPCError, code="no_bounds"):
+    """The actor has no valid bounds."""
+
+
+class InvalidMode(URLabRPCError, code="invalid_mode"):
+    """Unknown viewport mode."""
