@@ -1,0 +1,1 @@
+"""The wire without I/O: ops, structs, codec, errors and binary layouts. Imports neither asyncio, zmq nor threads."""

@@ -43,17 +43,15 @@ class URLabError(Exception):
 
     Attributes:
         op: Name of the op that failed, or None.
-        code: Short stable code, or None where no server was involved.
+        code: Short stable code; empty where no server was involved.
         hint: What to do next; part of `str()` already.
     """
 
     op: str | None
-    code: str | None
+    code: str
     hint: str | None
 
-    def __init__(
-        self, message: str, *, op: str | None = None, code: str | None = None, hint: str | None = None
-    ) -> None:
+    def __init__(self, message: str, *, op: str | None = None, code: str = "", hint: str | None = None) -> None:
         super().__init__(message)
         self.op = op
         self.code = code
@@ -155,7 +153,6 @@ class URLabRPCError(URLabError):
     """
 
     advice: ClassVar[str | None] = None
-    code: str
     message: str
 
     def __init_subclass__(cls, *, code: str | None = None, advice: str | None = None, **kwargs: Any) -> None:
@@ -172,7 +169,6 @@ class URLabRPCError(URLabError):
         super().__init__(
             f"{what}: {message}" if message else what, op=op, code=code, hint=hint if hint is not None else self.advice
         )
-        self.code = code
         self.message = message
 
 

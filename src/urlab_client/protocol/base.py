@@ -1,0 +1,198 @@
+"""Vocabulary of the op declarations: `Request`, `Reply`, `Op` and the field types they share.
+
+For whoever declares an op (`messages/*`) or derives something from the declarations. No I/O.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Annotated, Any, Generic, Literal, TypeAlias, TypeVar
+
+import msgspec
+import numpy as np
+from msgspec import Meta, Struct
+from numpy.typing import NDArray
+
+__all__ = [
+    "ActorId",
+    "ActorTarget",
+    "Color",
+    "EulerDeg",
+    "Floats",
+    "Needs",
+    "Op",
+    "QuatWXYZ",
+    "QuatXYZW",
+    "Reply",
+    "Request",
+    "RequiresPieRestart",
+    "TargetBy",
+    "Timing",
+    "Vec3",
+    "doc",
+]
+
+Floats: TypeAlias = NDArray[np.float64]
+"""A vector of numbers on the wire, an array of shape `(n,)` here."""
+
+Vec3: TypeAlias = tuple[float, float, float]
+Quat: TypeAlias = tuple[float, float, float, float]
+
+
+def doc(text: str) -> Meta:
+    """Describe a field: `percent: Annotated[float, doc("Percent of real time.")]`."""
+    return Meta(description=text)
+
+
+Location: TypeAlias = Annotated[Vec3, doc("Position in the world frame, metres.")]
+QuatXYZW: TypeAlias = Annotated[Quat, doc("Rotation in MuJoCo's world frame, unit quaternion (x, y, z, w).")]
+QuatWXYZ: TypeAlias = Annotated[Quat, doc("Unit quaternion (w, x, y, z), world frame.")]
+EulerDeg: TypeAlias = Annotated[Vec3, doc("Rotation (roll, pitch, yaw) in degrees, Unreal's rotator convention.")]
+Color: TypeAlias = Annotated[Vec3, doc("Red, green, blue in [0, 1].")]
+ActorId: TypeAlias = Annotated[str, doc("Stable id given by the client; empty when none.")]
+ActorTarget: TypeAlias = Annotated[str, doc("Actor id, or the engine's actor name with `by_name`.")]
+TargetBy: TypeAlias = Annotated[
+    Literal["actor_id", "actor_name"], doc("Look `target` up by the engine's actor name instead of the actor id.")
+]
+RequiresPieRestart: TypeAlias = Annotated[
+    bool, doc("True while a play session runs: the edit shows after the next start.")
+]
+
+
+class Reply(Struct, tag_field="op", kw_only=True):
+    """A successful answer; the tag is its `op` on the wire."""
+
+
+R_co = TypeVar("R_co", bound=Reply, covariant=True)
+
+
+class Request(Struct, Generic[R_co], tag_field="op", kw_only=True, omit_defaults=True):
+    """A question whose answer is an `R_co`. The session stamps `session_id` when it sends it."""
+
+    session_id: Annotated[str, doc("Session id from the latest `hello_ok`.")] = ""
+
+
+class Needs(StrEnum):
+    """What a server must have running for an op: the op's category on the wire."""
+
+    NOTHING = "no_manager"
+    EDITOR = "editor_only"
+    MANAGER = "manager_required"
+
+
+class Timing(StrEnum):
+    """What the caller may assume when the reply to an op is lost."""
+
+    READ = "read"
+    """Changes nothing: may be sent again."""
+    WRITE = "write"
+    """May have been executed: never sent again by itself."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Op:
+    """One op, declared once. Everything that knows an op derives from this.
+
+    Attributes:
+        request: The request struct; its tag is the op's name.
+        ns: Namespace on the client (`scene`, …); empty for ops of the client itself.
+        method: Name of the client's method; defaults to the op's name.
+        needs: What must be running.
+        effect: Whether it may be sent again after a lost reply.
+        timeout: Seconds to wait for the reply at least; None leaves it to the client's default.
+        hot: Built by the client itself at kilohertz rates, so sent without checking the struct's field types again.
+        errors: Codes the op itself can answer, besides the envelope's.
+        generated: Whether `tools/gen_ops.py` writes the client's method. Ops that mirror state or build handles
+            have theirs written by hand.
+        returns: For a generated method: name of the reply field to return, a class to fill from the reply's fields
+            of the same names, or None.
+        positional: For a generated method: how many leading parameters are positional.
+        undeclared: Required fields that only the op's handler checks, so that `meta` does not list them.
+        declares: Reply fields as `meta` lists them, where the plugin's list differs from what it sends.
+    """
+
+    request: type[Request[Any]]
+    ns: str = ""
+    method: str = ""
+    needs: Needs = Needs.EDITOR
+    effect: Timing = Timing.WRITE
+    timeout: float | None = None
+    hot: bool = False
+    errors: tuple[str, ...] = ()
+    generated: bool = False
+    returns: str | type[Struct] | None = None
+    positional: int = 0
+    undeclared: tuple[str, ...] = ()
+    declares: tuple[str, ...] | None = None
+    name: str = field(init=False)
+    reply: type[Reply] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "name", str(self.request.__struct_config__.tag))
+        object.__setattr__(self, "reply", _reply_type(self.request))
+        if not self.method:
+            object.__setattr__(self, "method", self.name)
+
+    @property
+    def reply_name(self) -> str:
+        """`op` of the successful reply. Not always the op's name plus `_ok`: see `set_viewport_mode`."""
+        return str(self.reply.__struct_config__.tag)
+
+    @property
+    def required(self) -> tuple[str, ...]:
+        """Wire names of the request fields that have no default, in order of declaration."""
+        return tuple(f.encode_name for f in msgspec.structs.fields(self.request) if f.required)
+
+    @property
+    def declared_required(self) -> tuple[str, ...]:
+        """The required fields that `meta` lists and the dispatcher checks."""
+        return tuple(name for name in self.required if name not in self.undeclared)
+
+    @property
+    def declared_reply(self) -> tuple[str, ...]:
+        """Reply fields as `meta` lists them, `name:type` with `?` for optional ones."""
+        if self.declares is not None:
+            return self.declares
+        fields = (f"{f.encode_name}:{_meta_type(f.type)}{'' if f.required else '?'}" for f in _fields(self.reply))
+        return ("op:string", *fields)
+
+
+def _fields(struct: type[Struct]) -> tuple[msgspec.structs.FieldInfo, ...]:
+    return msgspec.structs.fields(struct)
+
+
+def _reply_type(request: type[Request[Any]]) -> type[Reply]:
+    for base in getattr(request, "__orig_bases__", ()):
+        for argument in getattr(base, "__args__", ()):
+            if isinstance(argument, type) and issubclass(argument, Reply):
+                return argument
+    raise TypeError(f"{request.__name__} must derive from Request[SomeReply]")
+
+
+def _meta_type(annotation: Any) -> str:
+    info = msgspec.inspect.type_info(annotation)
+    info = _bare(info)
+    if isinstance(info, msgspec.inspect.UnionType):
+        members = (_bare(member) for member in info.types)
+        info = next(member for member in members if not isinstance(member, msgspec.inspect.NoneType))
+    for kinds, name in _META_TYPES.items():
+        if isinstance(info, kinds):
+            return name
+    raise TypeError(f"meta has no name for {annotation!r}")
+
+
+def _bare(info: msgspec.inspect.Type) -> msgspec.inspect.Type:
+    return info.type if isinstance(info, msgspec.inspect.Metadata) else info
+
+
+_META_TYPES: Mapping[tuple[type, ...], str] = {
+    (msgspec.inspect.StrType, msgspec.inspect.EnumType, msgspec.inspect.LiteralType): "string",
+    (msgspec.inspect.BoolType,): "bool",
+    (msgspec.inspect.IntType,): "int",
+    (msgspec.inspect.FloatType,): "float",
+    (msgspec.inspect.ListType, msgspec.inspect.TupleType, msgspec.inspect.VarTupleType): "array",
+    (msgspec.inspect.CustomType,): "array",
+    (msgspec.inspect.StructType, msgspec.inspect.DictType): "object",
+}

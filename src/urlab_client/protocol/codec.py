@@ -1,0 +1,283 @@
+"""Bytes to structs and back, with the plugin's conventions. No I/O.
+
+The plugin emits every number as a float64 and accepts any number; arrays of numbers are NumPy arrays in structs.
+Replies are msgpack unless the session asked for JSON, in which case binary values travel as base64 text under their
+key plus `__b64__`. Unknown fields are ignored, so that an old client can talk to a newer server.
+"""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import Callable
+from functools import cache
+from typing import Any, TypeVar, cast
+
+import msgspec
+import numpy as np
+from msgspec import Struct
+
+from urlab_client.protocol.base import Op, Reply, Request
+from urlab_client.protocol.errors import ProtocolError, rpc_error
+from urlab_client.protocol.messages.session import ErrorReply
+from urlab_client.protocol.registry import OPS
+
+__all__ = [
+    "MAX_REPLY_BYTES",
+    "MAX_REQUEST_BYTES",
+    "check_request",
+    "decode_reply",
+    "encode_reply",
+    "encode_request",
+    "from_wire_array",
+    "op_of",
+]
+
+MAX_REQUEST_BYTES = 64 * 1024 * 1024
+MAX_REPLY_BYTES = 2 * 1024 * 1024 * 1024
+
+_BINARY_SUFFIX = "__b64__"
+
+R = TypeVar("R", bound=Reply)
+Buffer = bytes | bytearray | memoryview
+
+_OP_BY_REQUEST = {op.request: op for op in OPS.values()}
+
+
+def op_of(request: Request[Any] | type[Request[Any]]) -> Op:
+    """Return the declaration of a request's op."""
+    return _OP_BY_REQUEST[request if isinstance(request, type) else type(request)]
+
+
+def from_wire_array(kind: type, value: Any) -> Any:
+    """Decoding hook: a list of numbers becomes a float64 array of shape (n,)."""
+    array: np.ndarray[Any, np.dtype[np.float64]] = np.array(value, dtype=np.float64)
+    if array.ndim != 1:
+        raise ValueError(f"expected a flat array of numbers, got {array.ndim} dimensions")
+    return array
+
+
+def _to_wire(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return cast("np.ndarray[Any, Any]", value).tolist()
+    if isinstance(value, np.generic):
+        return cast("np.generic[Any]", value).item()
+    raise TypeError(f"{type(value).__name__} cannot travel")
+
+
+_encoder = msgspec.msgpack.Encoder(enc_hook=_to_wire)
+_json_encoder = msgspec.json.Encoder(enc_hook=_to_wire)
+
+
+def encode_request(request: Request[Any], session_id: str, *, json: bool = False) -> bytes:
+    """Stamp `session_id` on `request` and return the bytes to send.
+
+    Raises:
+        TypeError: A field holds something that cannot travel.
+        ValueError: The request is larger than `MAX_REQUEST_BYTES`.
+    """
+    request.session_id = session_id
+    frame = _json_ascii(request) if json else _encoder.encode(request)
+    if len(frame) > MAX_REQUEST_BYTES:
+        raise ValueError(
+            f"{op_of(request).name}: a request of {len(frame)} bytes exceeds the limit {MAX_REQUEST_BYTES}"
+        )
+    return frame
+
+
+def _json_ascii(request: Request[Any]) -> bytes:
+    # The plugin cuts JSON by byte count after decoding, so anything but ASCII makes it read past the frame.
+    text = _json_encoder.encode(request).decode()
+    return re.sub(r"[^\x00-\x7f]", _escape, text).encode("ascii")
+
+
+def _escape(match: re.Match[str]) -> str:
+    units = match[0].encode("utf-16-be")
+    return "".join(f"\\u{units[i]:02x}{units[i + 1]:02x}" for i in range(0, len(units), 2))
+
+
+@cache
+def _request_decoder(kind: type[Request[Any]]) -> msgspec.msgpack.Decoder[Request[Any]]:
+    return msgspec.msgpack.Decoder(kind, dec_hook=from_wire_array)
+
+
+def check_request(request: Request[Any], frame: bytes) -> None:
+    """Check an encoded msgpack request against its own declaration.
+
+    msgspec validates on decoding only, so this decodes what is about to travel.
+
+    Raises:
+        TypeError: A field has the wrong type.
+        ValueError: A field has the right type and a wrong length or choice.
+    """
+    try:
+        _request_decoder(type(request)).decode(frame)
+    except msgspec.ValidationError as error:
+        problem, _, path = str(error).partition(" - at ")
+        where = path.strip("`").removeprefix("$.") or "request"
+        kind = ValueError if "length" in problem or "enum" in problem else TypeError
+        raise kind(f"{op_of(request).name}: {where}: {problem[:1].lower()}{problem[1:]}") from None
+
+
+@cache
+def _reply_decoder(reply: type[R]) -> msgspec.msgpack.Decoder[R | ErrorReply]:
+    # Not strict: the plugin sends integers as floats.
+    return cast(
+        "msgspec.msgpack.Decoder[R | ErrorReply]",
+        msgspec.msgpack.Decoder(reply | ErrorReply, strict=False, dec_hook=from_wire_array),
+    )
+
+
+def decode_reply(op: Op, reply: type[R], frame: Buffer) -> R:
+    """Decode the server's answer to `op`; whether it is msgpack or JSON shows in its first byte.
+
+    Raises:
+        URLabRPCError: The server refused.
+        ProtocolError: The frame is not an answer to `op`.
+    """
+    if len(frame) > MAX_REPLY_BYTES:
+        raise ProtocolError(f"{op.name}: a reply of {len(frame)} bytes exceeds the limit {MAX_REPLY_BYTES}", op=op.name)
+    try:
+        answer = _decode_json(reply, frame) if frame[:1] == b"{" else _reply_decoder(reply).decode(frame)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise ProtocolError(
+            f"{op.name}: the server's answer is not a valid {op.reply_name}: {error}.",
+            op=op.name,
+            raw=bytes(frame[:256]),
+        ) from error
+    if isinstance(answer, ErrorReply):
+        raise _refusal(op, answer)
+    return cast("R", answer)
+
+
+def _refusal(op: Op, answer: ErrorReply) -> Exception:
+    message = answer.message
+    if not message and answer.absolute_path is not None:
+        message = f"nothing to save, or {answer.absolute_path} cannot be written"
+    return rpc_error(answer.code, message, op=op.name)
+
+
+def _decode_json(reply: type[R], frame: Buffer) -> R | ErrorReply:
+    plain = _restore_binary(msgspec.json.decode(frame))
+    return cast("R | ErrorReply", msgspec.convert(plain, reply | ErrorReply, strict=False, dec_hook=from_wire_array))
+
+
+def _restore_binary(value: Any) -> Any:
+    if isinstance(value, dict):
+        items = cast("dict[str, Any]", value).items()
+        return {
+            key.removesuffix(_BINARY_SUFFIX): base64.b64decode(item)
+            if key.endswith(_BINARY_SUFFIX) and isinstance(item, str)
+            else _restore_binary(item)
+            for key, item in items
+        }
+    if isinstance(value, list):
+        return [_restore_binary(item) for item in cast("list[Any]", value)]
+    return value
+
+
+def encode_reply(reply: Struct, *, json: bool = False) -> bytes:
+    """Return the bytes of a reply as the plugin would send it: every number a float64.
+
+    `reply` is consumed: its integers are widened in place.
+    """
+    widen = _widener(type(reply))
+    if widen is not None:
+        widen(reply)
+    if not json:
+        return _encoder.encode(reply)
+    plain = msgspec.to_builtins(reply, builtin_types=(bytes,), enc_hook=_to_wire)
+    return msgspec.json.encode(_spell_binary(plain))
+
+
+def _spell_binary(value: Any) -> Any:
+    if isinstance(value, dict):
+        items = cast("dict[str, Any]", value).items()
+        return {
+            f"{key}{_BINARY_SUFFIX}" if isinstance(item, bytes) else key: _spell_binary(item) for key, item in items
+        }
+    if isinstance(value, list):
+        return [_spell_binary(item) for item in cast("list[Any]", value)]
+    if isinstance(value, bytes):
+        return base64.b64encode(value).decode("ascii")
+    return value
+
+
+# Widening integers. Structs declare counters as `int` for the people who read them, the wire wants float64. Which
+# fields need it is worked out once per struct type; most structs need nothing or one assignment.
+
+Widener = Callable[[Any], Any]
+
+
+@cache
+def _widener(struct: type[Struct]) -> Widener | None:
+    """Return a function that widens the numbers of a `struct` in place, or None if it can hold none."""
+    plan = [(f.name, widen) for f in msgspec.structs.fields(struct) if (widen := _plan(f.type, struct)) is not None]
+    if not plan:
+        return None
+
+    def apply(value: Any) -> Any:
+        for name, widen in plan:
+            item = getattr(value, name)
+            if item is not None:
+                setattr(value, name, widen(item))
+        return value
+
+    return apply
+
+
+def _plan(annotation: Any, owner: type[Struct]) -> Widener | None:
+    return _plan_info(msgspec.inspect.type_info(annotation), owner)
+
+
+def _plan_info(info: msgspec.inspect.Type, owner: type[Struct]) -> Widener | None:  # noqa: PLR0911
+    match info:
+        case msgspec.inspect.Metadata(type=inner):
+            return _plan_info(inner, owner)
+        case msgspec.inspect.UnionType(types=types):
+            plans = [plan for member in types if (plan := _plan_info(member, owner)) is not None]
+            return plans[0] if plans else None
+        case msgspec.inspect.IntType() | msgspec.inspect.FloatType():
+            return float
+        case msgspec.inspect.TupleType() | msgspec.inspect.VarTupleType():
+            return _widen_sequence
+        case msgspec.inspect.ListType(item_type=item):
+            return _each(_plan_info(item, owner))
+        case msgspec.inspect.DictType(value_type=item):
+            return _each_value(_plan_info(item, owner))
+        case msgspec.inspect.StructType(cls=cls):
+            # A struct that contains itself is looked up when it is met, not while its plan is being made.
+            return _widen_struct if cls is owner else _widener(cls)
+        case msgspec.inspect.AnyType():
+            return _widen_any
+        case _:
+            return None
+
+
+def _widen_struct(value: Struct) -> Struct:
+    widen = _widener(type(value))
+    return widen(value) if widen is not None else value
+
+
+def _widen_sequence(value: Any) -> Any:
+    return [float(v) if isinstance(v, (int, float)) and not isinstance(v, bool) else v for v in value]
+
+
+def _each(widen: Widener | None) -> Widener | None:
+    return None if widen is None else lambda values: [widen(v) for v in values]
+
+
+def _each_value(widen: Widener | None) -> Widener | None:
+    return None if widen is None else lambda values: {k: widen(v) for k, v in values.items()}
+
+
+def _widen_any(value: Any) -> Any:
+    if isinstance(value, bool):
+        return value
+    if isinstance(value, int):
+        return float(value)
+    if isinstance(value, dict):
+        return {k: _widen_any(v) for k, v in cast("dict[str, Any]", value).items()}
+    if isinstance(value, (list, tuple)):
+        return [_widen_any(v) for v in cast("list[Any]", value)]
+    return value

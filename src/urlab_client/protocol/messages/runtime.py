@@ -1,0 +1,214 @@
+"""Ops of `client.runtime`: live changes to the running simulation."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from msgspec import Struct
+
+from urlab_client.protocol.base import ActorId, Floats, QuatWXYZ, Reply, Request, TargetBy, Vec3, doc
+from urlab_client.protocol.types import Contact, KeyframeInfo, SimOptions
+
+__all__ = [
+    "ConfigureController",
+    "ConfigureControllerOk",
+    "ContactFilter",
+    "GetContacts",
+    "GetContactsOk",
+    "ListKeyframes",
+    "ListKeyframesOk",
+    "ReadMocapPose",
+    "ReadMocapPoseOk",
+    "SetControlSource",
+    "SetControlSourceOk",
+    "SetMocapPose",
+    "SetMocapPoseOk",
+    "SetMode",
+    "SetModeOk",
+    "SetPaused",
+    "SetPausedOk",
+    "SetQpos",
+    "SetQposOk",
+    "SetSimOptions",
+    "SetSimOptionsOk",
+    "SetSimSpeed",
+    "SetSimSpeedOk",
+    "SetTwist",
+    "SetTwistOk",
+]
+
+
+class SetModeOk(Reply, tag="set_mode_ok", kw_only=True):
+    """The mode before and after."""
+
+    previous_mode: Annotated[str, doc("Step mode before the call.")]
+    current_mode: Annotated[str, doc("Step mode now.")]
+
+
+class SetMode(Request[SetModeOk], tag="set_mode", kw_only=True):
+    """Switch the step mode; any mode but live un-pauses physics."""
+
+    mode: Annotated[str, doc("`live`, `direct`, `puppet` or `auto`.")]
+
+
+class SetPausedOk(Reply, tag="set_paused_ok", kw_only=True):
+    """The resulting state."""
+
+    paused: Annotated[bool, doc("Whether physics is paused now.")]
+
+
+class SetPaused(Request[SetPausedOk], tag="set_paused", kw_only=True):
+    """Pause or resume physics and return the state in force."""
+
+    paused: Annotated[bool, doc("True to pause.")]
+
+
+class SetSimSpeedOk(Reply, tag="set_sim_speed_ok", kw_only=True):
+    """The resulting pacing."""
+
+    percent: Annotated[float, doc("Percent of real time, clamped to 5..100.")]
+
+
+class SetSimSpeed(Request[SetSimSpeedOk], tag="set_sim_speed", kw_only=True):
+    """Set the pacing of live mode and return the value in force."""
+
+    percent: Annotated[float, doc("Percent of real time; the engine clamps to 5..100.")]
+
+
+class SetControlSourceOk(Reply, tag="set_control_source_ok", kw_only=True, omit_defaults=True):
+    """What was switched."""
+
+    source: Annotated[str, doc("`zmq` or `ui`.")]
+    scope: Annotated[str, doc("`global` or `articulation`.")]
+    articulation: Annotated[str | None, doc("Articulation key, with that scope.")] = None
+
+
+class SetControlSource(Request[SetControlSourceOk], tag="set_control_source", kw_only=True, omit_defaults=True):
+    """Choose whose set-points drive the actuators: those of this protocol or those of the editor's panel."""
+
+    source: Annotated[str, doc("`zmq` or `ui`.")]
+    articulation: Annotated[str | None, doc("Articulation key; None for all.")] = None
+
+
+class SetTwistOk(Reply, tag="set_twist_ok", kw_only=True):
+    """The twist in force."""
+
+    articulation: Annotated[str, doc("Articulation key.")]
+    linear: Annotated[Vec3, doc("(vx, vy, 0), m/s.")]
+    angular: Annotated[Vec3, doc("(0, 0, yaw rate), rad/s.")]
+
+
+class SetTwist(Request[SetTwistOk], tag="set_twist", kw_only=True, omit_defaults=True):
+    """Store a commanded base velocity for policies to read; it does not drive the simulation."""
+
+    articulation: Annotated[str, doc("Articulation key.")]
+    linear: Annotated[Vec3, doc("(vx, vy, ignored), m/s, base frame.")] = (0.0, 0.0, 0.0)
+    angular: Annotated[Vec3, doc("(ignored, ignored, yaw rate), rad/s, base frame.")] = (0.0, 0.0, 0.0)
+
+
+class SetQposOk(Reply, tag="set_qpos_ok", kw_only=True, omit_defaults=True):
+    """What was written."""
+
+    target: Annotated[str, doc("As requested.")]
+    actor_name: Annotated[str, doc("Articulation key.")]
+    actor_id: ActorId = ""
+    qpos: Annotated[Floats, doc("Values read back, shape (7,) for the shortcut, else all of the articulation's.")]
+    free_base_shortcut: Annotated[bool, doc("True when only the free base was written.")]
+
+
+class SetQpos(Request[SetQposOk], tag="set_qpos", kw_only=True, omit_defaults=True):
+    """Write joint positions of an articulation and run `mj_forward`; velocities and time stay."""
+
+    target: Annotated[str, doc("Actor id, or the articulation key with `by_name`.")]
+    qpos: Annotated[Floats, doc("All joint positions in joint order, or 7 values for the free base alone.")]
+    target_by: TargetBy = "actor_id"
+
+
+class MocapReply(Reply, kw_only=True):
+    """Pose of a mocap body."""
+
+    body: Annotated[str, doc("Compiled body name.")]
+    pos: Annotated[Vec3, doc("Position, metres, world frame.")]
+    quat: QuatWXYZ
+
+
+class SetMocapPoseOk(MocapReply, tag="set_mocap_pose_ok", kw_only=True):
+    """The pose in force."""
+
+
+class SetMocapPose(Request[SetMocapPoseOk], tag="set_mocap_pose", kw_only=True, omit_defaults=True):
+    """Place a mocap body; body poses follow at the next step or `forward()`."""
+
+    body: Annotated[str, doc("Compiled body name, prefix included.")]
+    pos: Annotated[Vec3 | None, doc("Position, metres, world frame; None keeps it.")] = None
+    quat: Annotated[QuatWXYZ | None, doc("Unit quaternion (w, x, y, z), world frame; None keeps it.")] = None
+
+
+class ReadMocapPoseOk(MocapReply, tag="read_mocap_pose_ok", kw_only=True):
+    """The stored pose."""
+
+
+class ReadMocapPose(Request[ReadMocapPoseOk], tag="read_mocap_pose", kw_only=True):
+    """Read the pose of a mocap body."""
+
+    body: Annotated[str, doc("Compiled body name, prefix included.")]
+
+
+class GetContactsOk(Reply, tag="get_contacts_ok", kw_only=True):
+    """Active contacts."""
+
+    n_contacts: Annotated[int, doc("Length of `contacts`, not the total.")]
+    truncated: Annotated[bool, doc("True when more contacts matched.")]
+    contacts: Annotated[list[Contact], doc("In the order of `mjData.contact`.")]
+
+
+class ContactFilter(Struct, kw_only=True, omit_defaults=True):
+    """Exact compiled names, combined with AND and compared by position in the contact."""
+
+    body1: Annotated[str | None, doc("Body of the first geom.")] = None
+    body2: Annotated[str | None, doc("Body of the second geom.")] = None
+    geom1: Annotated[str | None, doc("First geom.")] = None
+    geom2: Annotated[str | None, doc("Second geom.")] = None
+
+
+class GetContacts(Request[GetContactsOk], tag="get_contacts", kw_only=True, omit_defaults=True):
+    """Snapshot the active contacts."""
+
+    max_contacts: Annotated[int, doc("Cap on the number returned.")] = 64
+    filter: Annotated[ContactFilter | None, doc("Names to match.")] = None
+
+
+class ListKeyframesOk(Reply, tag="list_keyframes_ok", kw_only=True):
+    """Compiled keyframes."""
+
+    keyframes: Annotated[list[KeyframeInfo], doc("In id order.")]
+
+
+class ListKeyframes(Request[ListKeyframesOk], tag="list_keyframes", kw_only=True):
+    """List the compiled keyframes."""
+
+
+class ConfigureControllerOk(Reply, tag="configure_controller_ok", kw_only=True):
+    """The parameters in force."""
+
+    articulation: Annotated[str, doc("Articulation key.")]
+    params: Annotated[dict[str, Any], doc("All current parameters.")]
+
+
+class ConfigureController(Request[ConfigureControllerOk], tag="configure_controller", kw_only=True):
+    """Change parameters of an articulation's controller; those left out stay."""
+
+    articulation: Annotated[str, doc("Articulation key.")]
+    params: Annotated[dict[str, Any], doc("Parameters to change.")]
+
+
+class SetSimOptionsOk(Reply, tag="set_sim_options_ok", kw_only=True):
+    """The options in force."""
+
+    options: Annotated[SimOptions, doc("Read back from the model.")]
+
+
+class SetSimOptions(Request[SetSimOptionsOk], tag="set_sim_options", kw_only=True):
+    """Change fields of `mjOption`; effective from the next step."""
+
+    options: Annotated[SimOptions, doc("Fields to change; None leaves a field alone.")]

@@ -1,0 +1,271 @@
+"""Ops of the client itself: `hello`, `meta`, `step`, `reset`, `forward`, and the state blocks they share."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from msgspec import Struct
+
+from urlab_client.protocol.base import Floats, QuatWXYZ, Reply, Request, Vec3, doc
+
+__all__ = [
+    "ArticulationCommand",
+    "ArticulationInfo",
+    "ArticulationState",
+    "BodyPose",
+    "CameraFrame",
+    "CameraInfo",
+    "Clock",
+    "ControllerInfo",
+    "EntityInfo",
+    "EntityState",
+    "ErrorReply",
+    "Forward",
+    "ForwardOk",
+    "Hello",
+    "HelloOk",
+    "Meta",
+    "MetaOk",
+    "OpInfo",
+    "OriginalNames",
+    "Perturbation",
+    "Reset",
+    "ResetOk",
+    "Step",
+    "StepOk",
+    "TwistState",
+]
+
+
+class ErrorReply(Reply, tag="error", kw_only=True):
+    """The server refused a request."""
+
+    code: Annotated[str, doc("Short stable code.")]
+    message: Annotated[str, doc("Text for people; absent from one plugin reply.")] = ""
+    absolute_path: Annotated[str | None, doc("Path that `recording_save` could not write.")] = None
+
+
+class Clock(Struct, kw_only=True):
+    """A point in time as two integers, truncated, not rounded."""
+
+    sec: Annotated[int, doc("Whole seconds.")]
+    nsec: Annotated[int, doc("Nanoseconds within the second.")]
+
+
+class TwistState(Struct, kw_only=True):
+    """The last commanded twist, not a measured velocity."""
+
+    linear: Annotated[Vec3, doc("(vx, vy, 0), m/s, base frame.")]
+    angular: Annotated[Vec3, doc("(0, 0, yaw rate), rad/s, base frame.")]
+
+
+class BodyPose(Struct, kw_only=True):
+    """World pose of one body."""
+
+    xpos: Annotated[Vec3, doc("Position, metres, world frame.")]
+    xquat: QuatWXYZ
+
+
+class ArticulationState(Struct, kw_only=True, omit_defaults=True):
+    """State of one articulation. Arrays follow its joints or actuators in ascending MuJoCo id."""
+
+    qpos: Annotated[Floats, doc("Joint positions, shape (nq of the articulation,).")]
+    qvel: Annotated[Floats, doc("Joint velocities, shape (nv of the articulation,).")]
+    ctrl: Annotated[Floats | None, doc("`mjData.ctrl`, what was applied after any controller. Level standard.")] = None
+    act: Annotated[Floats | None, doc("First activation per actuator, 0 where stateless. Level standard.")] = None
+    sensors: Annotated[
+        dict[str, list[float]] | None, doc("Raw `sensordata` by unprefixed sensor name. Level standard.")
+    ] = None
+    bodies: Annotated[dict[str, BodyPose] | None, doc("World pose by unprefixed body name. Level full.")] = None
+    actuator_force: Annotated[Floats | None, doc("`mjData.actuator_force`, ordered as `ctrl`. Level full.")] = None
+    twist: Annotated[TwistState | None, doc("Commanded twist, at every level.")] = None
+    actions: Annotated[int | None, doc("Bit field of pressed action keys, bits 0 to 9.")] = None
+
+
+class EntityState(Struct, kw_only=True, omit_defaults=True):
+    """State of one dynamic body outside any articulation."""
+
+    xpos: Annotated[Vec3, doc("Position, metres, world frame.")]
+    xquat: QuatWXYZ
+    qpos: Annotated[Floats | None, doc("Free joint position, shape (7,): xyz, quaternion wxyz.")] = None
+    qvel: Annotated[Floats | None, doc("Free joint velocity, shape (6,): linear world, angular body frame.")] = None
+
+
+class CameraFrame(Struct, kw_only=True):
+    """Pixels of one camera, top row first."""
+
+    width: Annotated[int, doc("Pixels per row.")]
+    height: Annotated[int, doc("Rows.")]
+    dtype: Annotated[str, doc("`bgra8`, or `float32` for depth in centimetres.")]
+    data: Annotated[bytes, doc("width * height * 4 bytes.")]
+
+
+class Perturbation(Struct, kw_only=True):
+    """A mouse drag in the editor's viewport."""
+
+    body_id: Annotated[int, doc("MuJoCo body id, above 0.")]
+    version: Annotated[int, doc("Grows with each sample.")]
+    xfrc: Annotated[Floats, doc("(fx, fy, fz, tx, ty, tz), N and N m, world frame, at the body's centre of mass.")]
+
+
+class StateReply(Reply, kw_only=True, omit_defaults=True):
+    """What `step`, `reset` and `forward` have in common."""
+
+    time: Annotated[float, doc("`mjData.time`, seconds.")]
+    step: Annotated[int, doc("Step counter of the session; constant in live mode.")]
+    per_articulation: Annotated[dict[str, ArticulationState], doc("State by articulation key.")]
+    sim_time: Annotated[Clock | None, doc("`time` as two integers.")] = None
+    wall_time: Annotated[Clock | None, doc("UTC when the reply was built.")] = None
+
+
+class StepOk(StateReply, tag="step_ok", kw_only=True, omit_defaults=True):
+    """State after the step."""
+
+    entities: Annotated[dict[str, EntityState] | None, doc("Plain entities by name.")] = None
+    cameras: Annotated[dict[str, CameraFrame] | None, doc("Frames, keyed exactly as requested.")] = None
+    perturbation: Annotated[Perturbation | None, doc("Only in puppet mode pinned by the project.")] = None
+
+
+class ArticulationCommand(Struct, kw_only=True, omit_defaults=True):
+    """What a direct or live step tells one articulation."""
+
+    ctrl: Annotated[list[float] | None, doc("Set-points in actuator order.")] = None
+    ctrl_map: Annotated[dict[str, float] | None, doc("Set-points by actuator name; wins over `ctrl`. Direct only.")] = (
+        None
+    )
+    control_mode: Annotated[str | None, doc("`raw` bypasses the controller for this request. Direct only.")] = None
+    xfrc_applied: Annotated[
+        dict[str, list[float]] | None, doc("(fx, fy, fz, tx, ty, tz) by body, world frame. Direct only.")
+    ] = None
+
+
+class Step(Request[StepOk], tag="step", kw_only=True, omit_defaults=True):
+    """Advance physics, or exchange state, as the step mode says."""
+
+    n_steps: Annotated[int, doc("Sub-steps; values below 1 count as 1. Direct only.")] = 1
+    observations: Annotated[str | None, doc("Observation level; sticky on the server.")] = None
+    include_cameras: Annotated[bool | dict[str, str | None], doc("True, or camera name to `sync` or `latest`.")] = False
+    per_articulation: Annotated[dict[str, ArticulationCommand] | None, doc("Commands by articulation key.")] = None
+    qpos: Annotated[Floats | None, doc("Full `mjData.qpos`, shape (nq,). Puppet only.")] = None
+    qvel: Annotated[Floats | None, doc("Full `mjData.qvel`, shape (nv,). Puppet only.")] = None
+    ctrl: Annotated[Floats | None, doc("Full `mjData.ctrl`, shape (nu,). Puppet only.")] = None
+    time: Annotated[float | None, doc("`mjData.time`, seconds; absent sets 0. Puppet only.")] = None
+
+
+class ResetOk(StateReply, tag="reset_ok", kw_only=True, omit_defaults=True):
+    """State after the reset; `step` is 0."""
+
+
+class Reset(Request[ResetOk], tag="reset", kw_only=True, omit_defaults=True):
+    """Reset the simulation, optionally to a keyframe, then override joints."""
+
+    keyframe_name: Annotated[str | None, doc("Compiled keyframe name, prefix included.")] = None
+    seed: Annotated[int | None, doc("Remembered by the server; no effect on MuJoCo.")] = None
+    per_articulation_qpos: Annotated[
+        dict[str, dict[str, float]] | None, doc("First coordinate of a joint, by articulation key and joint name.")
+    ] = None
+
+
+class ForwardOk(StateReply, tag="forward_ok", kw_only=True, omit_defaults=True):
+    """State after `mj_forward`."""
+
+
+class Forward(Request[ForwardOk], tag="forward", kw_only=True):
+    """Run `mj_forward`: kinematics and dynamics without integration; time and step counter stay."""
+
+
+class ControllerInfo(Struct, kw_only=True):
+    """Controller attached to an articulation."""
+
+    kind: Annotated[str, doc("`pd`; the plugin's passthrough controller says `base`.")]
+    params: Annotated[dict[str, Any], doc("Current parameters.")]
+    schema: Annotated[dict[str, Any], doc("Parameter name to `{type, dtype, min}`.")]
+
+
+class CameraInfo(Struct, kw_only=True):
+    """One camera of an articulation."""
+
+    mode: Annotated[str, doc("`real`, `depth`, `semantic` or `instance`.")]
+    resolution: Annotated[tuple[int, int], doc("(width, height), pixels.")]
+    fovy: Annotated[float, doc("Vertical field of view, degrees.")]
+    zmq_endpoint: Annotated[str, doc("Publisher endpoint as bound: the host may be 0.0.0.0.")]
+    zmq_topic: Annotated[str, doc("Topic without the trailing space that messages carry.")]
+
+
+class OriginalNames(Struct, kw_only=True):
+    """Live short name to MJCF name, for elements whose name had to change."""
+
+    actuators: Annotated[dict[str, str], doc("Renamed actuators.")] = {}
+    joints: Annotated[dict[str, str], doc("Renamed joints.")] = {}
+    sensors: Annotated[dict[str, str], doc("Renamed sensors.")] = {}
+    bodies: Annotated[dict[str, str], doc("Renamed bodies.")] = {}
+
+
+class ArticulationInfo(Struct, kw_only=True, omit_defaults=True):
+    """One articulation as the handshake describes it."""
+
+    prefix: Annotated[str, doc("Articulation key, no trailing underscore.")]
+    actor_id: Annotated[str, doc("Stable id; empty when unset.")]
+    default_control_mode: Annotated[str, doc("`ue_controller` with a controller attached, else `raw`.")]
+    controller: Annotated[ControllerInfo | None, doc("The attached controller.")] = None
+    actuator_types: Annotated[dict[str, str], doc("Authored kind by short actuator name.")]
+    original_names: Annotated[OriginalNames, doc("Elements that were renamed.")]
+    camera_topics: Annotated[dict[str, CameraInfo], doc("Cameras by name.")]
+
+
+class EntityInfo(Struct, kw_only=True, omit_defaults=True):
+    """One dynamic body outside any articulation."""
+
+    id: Annotated[int, doc("MuJoCo body id.")]
+    has_free_base: Annotated[bool, doc("True when its first joint is free.")]
+    free_joint: Annotated[str | None, doc("Name of the free joint, when it has one.")] = None
+    free_joint_id: Annotated[int | None, doc("MuJoCo joint id.")] = None
+    qpos_offset: Annotated[int | None, doc("Start of its 7 values in `mjData.qpos`.")] = None
+    qvel_offset: Annotated[int | None, doc("Start of its 6 values in `mjData.qvel`.")] = None
+
+
+class HelloOk(Reply, tag="hello_ok", kw_only=True, omit_defaults=True):
+    """The handshake."""
+
+    session_id: Annotated[str, doc("New session id, a lower-case GUID.")]
+    urlab_version: Annotated[str, doc("Server version.")]
+    mujoco_version_int: Annotated[int, doc("`mj_version()` of the server.")]
+    mujoco_version: Annotated[str, doc("`mj_versionString()` of the server.")]
+    manager_present: Annotated[bool, doc("True while a play session runs.")]
+    shm_session_dir: Annotated[str | None, doc("Directory of the shared state region.")] = None
+    mjb: Annotated[bytes | None, doc("The compiled model in MuJoCo's binary format.")] = None
+    mjb_base64: Annotated[str | None, doc("The same bytes as text; sent under msgpack as well.")] = None
+    mjb_size: Annotated[int | None, doc("Length of `mjb` in bytes.")] = None
+    mjcf_compiled: Annotated[str | None, doc("The model as MJCF, with `include_assets`.")] = None
+    vfs_assets: Annotated[dict[str, bytes] | None, doc("Asset bytes by bare file name, with `include_assets`.")] = None
+    articulations: Annotated[list[ArticulationInfo], doc("Empty without a play session.")]
+    entities: Annotated[dict[str, EntityInfo] | None, doc("Plain entities by name.")] = None
+    global_cameras: Annotated[dict[str, CameraInfo] | None, doc("Scene-level cameras.")] = None
+
+
+class Hello(Request[HelloOk], tag="hello", kw_only=True, omit_defaults=True):
+    """Open a session; the previous one becomes invalid at once."""
+
+    observations: Annotated[str | None, doc("Observation level of the session; absent keeps the server's.")] = None
+    encoding: Annotated[str | None, doc("`json` for readable replies, else msgpack.")] = None
+    include_assets: Annotated[bool, doc("Ship the model as MJCF with its assets, too.")] = False
+
+
+class OpInfo(Struct, kw_only=True, omit_defaults=True):
+    """One op as the server lists it."""
+
+    name: Annotated[str, doc("Name of the op.")]
+    category: Annotated[str, doc("`editor_only`, `manager_required` or `no_manager`.")]
+    namespace: Annotated[str, doc("Namespace; empty for `step` and `reset`.")]
+    required_fields: Annotated[list[str] | None, doc("Fields checked before the handler runs.")] = None
+    reply_fields: Annotated[list[str] | None, doc("`name:type`, `?` marks optional fields.")] = None
+
+
+class MetaOk(Reply, tag="meta_ok", kw_only=True):
+    """The server's list of ops."""
+
+    ops: Annotated[list[OpInfo], doc("Every registered op but `hello` and `meta`.")]
+
+
+class Meta(Request[MetaOk], tag="meta", kw_only=True):
+    """List the ops this server offers; needs no session."""

@@ -1,0 +1,45 @@
+"""Ops of `client.sim`: the life cycle of a play session."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from urlab_client.protocol.base import Reply, Request, doc
+from urlab_client.protocol.messages.session import HelloOk
+
+__all__ = ["BeginPie", "BeginPieOk", "PieStatus", "PieStatusOk", "StopPie", "StopPieOk"]
+
+
+class BeginPieOk(Reply, tag="begin_pie_ok", kw_only=True, omit_defaults=True):
+    """How the start ended."""
+
+    state: Annotated[str, doc("`ready`, `compile_failed` or `timeout`.")]
+    compile_error: Annotated[str, doc("MuJoCo's message when the model was rejected.")]
+    handshake_payload: Annotated[HelloOk | None, doc("The handshake of the new play world, when ready.")] = None
+
+
+class BeginPie(Request[BeginPieOk], tag="begin_pie", kw_only=True, omit_defaults=True):
+    """Start Play-In-Editor and wait until the model is compiled."""
+
+    level_path: Annotated[str | None, doc("Level to open first, a full `/Game/` path.")] = None
+    timeout_s: Annotated[float, doc("Seconds to wait for the compile.")] = 30.0
+
+
+class StopPieOk(Reply, tag="stop_pie_ok", kw_only=True):
+    """The end was requested; the plugin may still be winding down."""
+
+
+class StopPie(Request[StopPieOk], tag="stop_pie", kw_only=True):
+    """End the play session; a success without one."""
+
+
+class PieStatusOk(Reply, tag="pie_status_ok", kw_only=True, omit_defaults=True):
+    """Where Play-In-Editor stands."""
+
+    state: Annotated[str, doc("`off`, `compiling`, `compile_failed` or `ready`.")]
+    compile_error: Annotated[str, doc("MuJoCo's message after a failed compile, else empty.")]
+    sim_time: Annotated[float | None, doc("`mjData.time`, seconds, when data exist.")] = None
+
+
+class PieStatus(Request[PieStatusOk], tag="pie_status", kw_only=True):
+    """Read the state of Play-In-Editor."""

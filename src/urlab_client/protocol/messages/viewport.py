@@ -1,0 +1,113 @@
+"""Ops of `client.viewport`: the editor's perspective viewport."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from urlab_client.protocol.base import (
+    ActorTarget,
+    EulerDeg,
+    Location,
+    Quat,
+    QuatXYZW,
+    Reply,
+    Request,
+    TargetBy,
+    Vec3,
+    doc,
+)
+
+__all__ = [
+    "FrameActor",
+    "FrameActorOk",
+    "GetCamera",
+    "GetCameraOk",
+    "SetCamera",
+    "SetCameraOk",
+    "SetViewportMode",
+    "SetViewportModeOk",
+    "TrackActor",
+    "TrackActorOk",
+    "Untrack",
+    "UntrackOk",
+]
+
+
+class CameraReply(Reply, kw_only=True):
+    """Pose of the viewport's camera: local +x looks forward, +z is up."""
+
+    location: Location
+    rotation_quat: QuatXYZW
+    rotation_euler: EulerDeg
+    fov: Annotated[float, doc("Horizontal field of view, degrees.")]
+
+
+class SetCameraOk(CameraReply, tag="set_camera_ok", kw_only=True):
+    """The pose in force."""
+
+
+class SetCamera(Request[SetCameraOk], tag="set_camera", kw_only=True, omit_defaults=True):
+    """Place the perspective viewport's camera."""
+
+    location: Location
+    rotation_quat: Annotated[
+        Quat | None, doc("Rotation (x, y, z, w) in Unreal's frame; send (-x, y, -z, w) for a MuJoCo quaternion.")
+    ] = None
+    rotation_euler: EulerDeg | None = None
+    fov: Annotated[float | None, doc("Horizontal field of view, degrees; None keeps it.")] = None
+
+
+class GetCameraOk(CameraReply, tag="get_camera_ok", kw_only=True):
+    """The pose in force."""
+
+
+class GetCamera(Request[GetCameraOk], tag="get_camera", kw_only=True):
+    """Read the viewport camera's pose."""
+
+
+class FrameActorOk(CameraReply, tag="frame_actor_ok", kw_only=True):
+    """The pose in force."""
+
+
+class FrameActor(Request[FrameActorOk], tag="frame_actor", kw_only=True, omit_defaults=True):
+    """Move the camera so that an actor fills the view; the view direction stays."""
+
+    target: ActorTarget
+    target_by: TargetBy = "actor_id"
+
+
+class SetViewportModeOk(Reply, tag="set_mode_ok", kw_only=True):
+    """The mode in force. Its `op` is that of the runtime op `set_mode`."""
+
+    mode: Annotated[str, doc("As requested.")]
+
+
+class SetViewportMode(Request[SetViewportModeOk], tag="set_viewport_mode", kw_only=True):
+    """Switch the viewport's view mode and return it."""
+
+    mode: Annotated[str, doc("`lit`, `unlit`, `wireframe`, `collision` or `reflections`.")]
+
+
+class TrackActorOk(Reply, tag="track_actor_ok", kw_only=True):
+    """The tracked actor."""
+
+    tracked_actor_path: Annotated[str, doc("Full object path.")]
+
+
+class TrackActor(Request[TrackActorOk], tag="track_actor", kw_only=True, omit_defaults=True):
+    """Make the camera follow an actor and return its object path; a new call replaces the old target."""
+
+    target: ActorTarget
+    target_by: TargetBy = "actor_id"
+    offset: Annotated[Vec3 | None, doc("Camera position in the actor's frame, metres.")] = None
+    smoothing: Annotated[float, doc("Share of the old pose kept per tick, in [0, 1).")] = 0.0
+
+
+class UntrackOk(Reply, tag="untrack_ok", kw_only=True):
+    """Tracking ended."""
+
+    was_tracking: Annotated[bool, doc("Whether a track was active.")]
+
+
+class Untrack(Request[UntrackOk], tag="untrack", kw_only=True):
+    """Stop following; returns whether a track was active."""
