@@ -1,0 +1,57 @@
+"""Golden bytes of the wire, from `data/vectors.json`.
+
+Test directories are no packages: pytest puts each on `sys.path`, so test modules need unique names and import this
+one as `import vectors`, or take the `vector` fixture.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+
+class Vector(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One golden example.
+
+    Attributes:
+        name: Unique name.
+        hex: All bytes; of a multi-frame message, its frames joined.
+        origin: `plugin` (it sends or must read these bytes), `client` (a client sends them), `derived` (own text in
+            free-form places) or `later-peer` (a newer server sends them).
+        expect: Whether a reader must `accept` or `reject` the bytes.
+        decoded: What the bytes mean; for a reject, the `reason`.
+        frames_hex: The frames of a multi-frame message.
+        note: Remark for readers.
+    """
+
+    name: str
+    hex: str
+    origin: str
+    expect: str
+    decoded: dict[str, Any]
+    frames_hex: list[str] = []
+    note: str = ""
+
+    @property
+    def data(self) -> bytes:
+        return bytes.fromhex(self.hex)
+
+    @property
+    def frames(self) -> list[bytes]:
+        return [bytes.fromhex(frame) for frame in self.frames_hex]
+
+
+_VECTORS = {
+    vector.name: vector
+    for vector in msgspec.json.decode((Path(__file__).parent / "data" / "vectors.json").read_bytes(), type=list[Vector])
+}
+
+
+def load(name: str) -> Vector:
+    return _VECTORS[name]
+
+
+def all() -> list[Vector]:  # noqa: A001
+    return list(_VECTORS.values())
