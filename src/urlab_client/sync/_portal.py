@@ -1,0 +1,453 @@
+"""What the generated façade stands on: a background event loop per client, and the base of its classes.
+
+Everything blocking-only lives here; the other modules of `urlab_client.sync` are generated and hold no behaviour.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import inspect
+import logging
+import os
+import sys
+import threading
+import warnings
+import weakref
+from collections.abc import Callable, Coroutine
+from types import TracebackType
+from typing import Any, Generic, TypeVar, cast, overload
+
+from urlab_client.protocol.errors import ClientClosed, ForkedError, URLabError, URLabRPCError
+from urlab_client.protocol.names import NameMap
+
+__all__ = ["GRACE", "Facade", "FacadeRoot", "Portal"]
+
+T = TypeVar("T")
+F = TypeVar("F", bound="Facade")
+
+GRACE = 1.0
+"""Seconds given to clean-up: to an interrupted call, and to each phase of stopping a loop."""
+
+# A lock wait on Windows does not see Ctrl-C, so there it is taken in slices.
+_WAIT_SLICE = 0.1 if sys.platform == "win32" else threading.TIMEOUT_MAX
+
+_log = logging.getLogger("urlab_client.sync")
+
+
+class _Job(Generic[T]):
+    """A coroutine on its way through the loop: made and awaited by the calling thread, finished by the I/O thread."""
+
+    __slots__ = ("_finished", "_waiter", "coro", "error", "task", "value")
+
+    value: T
+
+    def __init__(self, coro: Coroutine[Any, Any, T]) -> None:
+        self.coro = coro
+        self.task: asyncio.Task[T] | None = None
+        self.error: BaseException | None = None
+        self._finished = False
+        self._waiter = threading.Lock()
+        self._waiter.acquire()
+
+    def wait(self, timeout: float = threading.TIMEOUT_MAX) -> bool:
+        """Block until the job is finished, at most `timeout` seconds; return whether it is."""
+        while not self._finished and timeout > 0:
+            piece = min(timeout, _WAIT_SLICE)
+            self._waiter.acquire(timeout=piece)
+            timeout -= piece
+        return self._finished
+
+    def finish(self) -> None:
+        """Let the caller go on. `value` or `error` is set by now."""
+        self._finished = True
+        self._waiter.release()
+
+
+class _IOThread:
+    """A daemon thread and the event loop it runs.
+
+    Refers to no portal and no façade object, so that dropping these ends the thread.
+    """
+
+    def __init__(self, at_stop: Callable[[], Coroutine[Any, Any, object]] | None) -> None:
+        # Not new_event_loop(): the user's loop policy is about the user's loop, and pyzmq needs a selector on Windows.
+        self._loop = asyncio.SelectorEventLoop()
+        self._thread = threading.Thread(target=self._run, name="urlab-io", daemon=True)
+        self._pid = os.getpid()
+        self._at_stop = at_stop
+        self._stop_requested = asyncio.Event()
+        self._jobs: set[_Job[Any]] = set()
+        # Guards `_stopping`, `_jobs` and the loop's end: a job is either refused or finished, never left waiting.
+        # Reentrant, because a signal handler may close the client in the middle of `submit`.
+        self._lock = threading.RLock()
+        self._stopping = False
+
+    def start(self) -> None:
+        """Start the thread. If that is interrupted, the thread, should there be one, ends by itself."""
+        try:
+            self._thread.start()
+        except Exception:
+            self._loop.close()
+            raise
+        except BaseException:
+            self._request_stop()
+            raise
+
+    @property
+    def is_current(self) -> bool:
+        """Whether the caller runs on this thread."""
+        return threading.get_ident() == self._thread.ident
+
+    @property
+    def stopping(self) -> bool:
+        """Whether `stop` was called."""
+        return self._stopping
+
+    def submit(self, job: _Job[Any]) -> None:
+        """Start `job` on the loop. Raises `ClientClosed` if the loop is on its way out."""
+        with self._lock:
+            if self._stopping:
+                raise _closed()
+            self._jobs.add(job)
+            self._loop.call_soon_threadsafe(self._start_job, job)
+
+    def abandon(self, job: _Job[Any]) -> None:
+        """Cancel `job`, whose caller was interrupted anywhere in `submit` or while waiting; wait for its clean-up."""
+        with self._lock:
+            if under_way := job in self._jobs:
+                self._loop.call_soon_threadsafe(self._cancel_job, job)
+        if not under_way:
+            job.coro.close()
+        elif not job.wait(GRACE):
+            _log.warning("%s goes on %g s after it was interrupted", job.coro.__qualname__, GRACE)
+
+    def stop(self) -> None:
+        """Wind the loop down and join the thread, in bounded time, from any thread."""
+        if os.getpid() != self._pid:
+            return  # A forked child shares the parent's epoll set: closing the loop would deafen the parent's.
+        self._request_stop()
+        if not self.is_current:  # The garbage collector may call from any thread.
+            self._thread.join(4 * GRACE)
+
+    def _request_stop(self) -> None:
+        with self._lock:
+            if not self._stopping:
+                self._stopping = True
+                self._loop.call_soon_threadsafe(self._stop_requested.set)
+
+    def _start_job(self, job: _Job[Any]) -> None:
+        if job in self._jobs:
+            job.task = self._loop.create_task(job.coro)
+            job.task.add_done_callback(lambda _: self._finish_job(job))
+
+    def _cancel_job(self, job: _Job[Any]) -> None:
+        if job.task is not None:
+            job.task.cancel()
+        elif job in self._jobs:  # The interrupt came before the start was scheduled.
+            self._finish_job(job)
+
+    def _finish_job(self, job: _Job[Any]) -> None:
+        self._jobs.discard(job)
+        task = job.task
+        if task is None or not task.done():
+            job.error = _closed("during this call")
+            if task is None:
+                job.coro.close()
+        elif task.cancelled():
+            job.error = _closed("during this call") if self._stopping else asyncio.CancelledError()
+        elif (error := task.exception()) is not None:
+            job.error = error
+        else:
+            job.value = task.result()
+        # Not left to the caller to drop: a signal handler that raises amid weak reference callbacks gets printed.
+        job.task = None
+        job.finish()
+
+    def _run(self) -> None:
+        main = self._loop.create_task(self._main())
+        while not main.done():
+            # A coroutine that raises one of these breaks out of the loop. Its caller gets it through its job.
+            with contextlib.suppress(KeyboardInterrupt, SystemExit):
+                self._loop.run_until_complete(main)
+        with self._lock:
+            for job in tuple(self._jobs):
+                self._finish_job(job)
+            self._loop.close()
+
+    async def _main(self) -> None:
+        await self._stop_requested.wait()
+        if self._at_stop is not None:
+            await _in_bounded_time(asyncio.ensure_future(self._at_stop()))
+        tasks = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in tasks:
+            task.cancel()
+        await _in_bounded_time(*tasks)
+        await _in_bounded_time(asyncio.ensure_future(self._loop.shutdown_asyncgens()))
+
+
+async def _in_bounded_time(*tasks: asyncio.Task[Any]) -> None:
+    if not tasks:
+        return
+    done, pending = await asyncio.wait(tasks, timeout=GRACE)
+    for task in done:
+        if not task.cancelled() and (error := task.exception()) is not None:
+            _log.debug("a task failed while the client was closing", exc_info=error)
+    for task in pending:
+        _log.debug("a task outlived the closing of its client: %r", task)
+
+
+class Portal:
+    """The way from blocking code into one client's event loop.
+
+    Cheap to make: the loop and its daemon thread start with the first `call`. They end with `close`, when the portal
+    is garbage collected, or at interpreter exit; then `at_stop` runs, remaining tasks are cancelled and awaited,
+    asynchronous generators are closed and the thread is joined, each in bounded time.
+
+    Args:
+        at_stop: Makes the coroutine that releases what lives on the loop. It must not refer to the portal.
+    """
+
+    __slots__ = ("__weakref__", "_at_stop", "_closed", "_finalizer", "_io", "_lock", "_pid", "_twins")
+
+    def __init__(self, at_stop: Callable[[], Coroutine[Any, Any, object]] | None = None) -> None:
+        self._at_stop = at_stop
+        self._pid = os.getpid()
+        self._lock = threading.RLock()
+        self._io: _IOThread | None = None
+        self._finalizer: weakref.finalize[[], Portal] | None = None
+        self._closed = False
+        # Weak: twins refer to the portal, so a strong reference back would leave closing to the cycle collector.
+        self._twins: weakref.WeakValueDictionary[int, Facade] = weakref.WeakValueDictionary()
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the thread runs and belongs to this process."""
+        return self._io is not None and not self._io.stopping and self._pid == os.getpid()
+
+    def call(self, coro: Coroutine[Any, Any, T]) -> T:
+        """Run `coro` on the loop and return its result; block until then.
+
+        An exception that strikes the calling thread meanwhile, such as `KeyboardInterrupt`, cancels the coroutine,
+        gives its `finally` blocks up to `GRACE` seconds, and goes on. The portal stays usable.
+
+        Raises:
+            ForkedError: If this process is a fork of the one that made the portal.
+            ClientClosed: If the portal is closed, before or during the call.
+            URLabError: If called on the loop's own thread, where waiting would never end.
+        """
+        io: _IOThread | None = None
+        job = _Job(coro)
+        try:
+            io = self._ready()
+            io.submit(job)
+            job.wait()
+        except BaseException:
+            if io is None:
+                coro.close()
+            else:
+                io.abandon(job)
+            raise
+        error = job.error
+        if error is None:
+            return job.value
+        # A refusal by the server is told by its message and its notes; frames of the client would only bury them.
+        trace = None if isinstance(error, URLabRPCError) else _without_earlier_raise(error.__traceback__)
+        try:
+            raise error.with_traceback(trace)
+        finally:
+            del error, job, trace  # The traceback refers to this frame: leave no cycle.
+
+    def next(self, coro: Coroutine[Any, Any, T]) -> T:
+        """`call` for a façade's `__next__`: the end of the asynchronous iteration ends the blocking one."""
+        try:
+            return self.call(coro)
+        except StopAsyncIteration:
+            raise StopIteration from None
+
+    def close(self, last: Coroutine[Any, Any, object] | None = None) -> None:
+        """Run `last`, then end the loop and its thread. Later calls raise `ClientClosed`; closing again does nothing.
+
+        In a forked child, too, this does nothing: what there is to release belongs to the parent.
+        """
+        if self._closed or os.getpid() != self._pid:
+            if last is not None:
+                last.close()
+            return
+        if self._io is not None and self._io.is_current:
+            if last is not None:
+                last.close()
+            raise _on_io_thread()
+        try:
+            if last is not None:
+                with contextlib.suppress(ClientClosed):  # Another thread was faster.
+                    self.call(last)
+        finally:
+            with self._lock:
+                self._closed = True
+            if self._finalizer is not None:
+                self._finalizer()
+
+    # None is an object, too; the first match wins.
+    @overload
+    def wrap(self, cls: type[F], aio: None) -> None: ...  # type: ignore[overload-overlap]  # pyright: ignore[reportOverlappingOverload]
+    @overload
+    def wrap(self, cls: type[F], aio: object) -> F: ...
+    def wrap(self, cls: type[F], aio: object) -> F | None:
+        """Return the façade twin of `aio`, always the same one; None for None.
+
+        Args:
+            cls: Façade class of the declared type; the twin's is that of `aio`'s own class, which may be derived.
+            aio: The asynchronous object.
+        """
+        if aio is None:
+            return None
+        twin = self._twins.get(id(aio))
+        if twin is None:
+            if os.getpid() != self._pid:
+                raise _forked()  # Another thread may have held the lock at the fork.
+            with self._lock:
+                twin = self._twins.get(id(aio))
+                if twin is None:
+                    actual = next((_FACADES[base] for base in type(aio).__mro__ if base in _FACADES), cls)
+                    twin = cast("Facade", object.__new__(actual))
+                    self.adopt(twin, aio)
+        return cast("F", twin)
+
+    def adopt(self, twin: Facade, aio: object) -> None:
+        """Make `twin` the façade of `aio`."""
+        Facade.__init__(twin, aio, self)
+        self._twins[id(aio)] = twin
+
+    def _ready(self) -> _IOThread:
+        """Return the running thread, or raise the reason why there cannot be one."""
+        if os.getpid() != self._pid:
+            raise _forked()
+        if self._io is None:
+            with self._lock:
+                if self._closed:
+                    raise _closed()
+                if self._io is None:
+                    io = _IOThread(self._at_stop)
+                    io.start()
+                    self._finalizer = weakref.finalize(self, io.stop)
+                    self._io = io
+        elif self._io.is_current:
+            raise _on_io_thread()
+        return self._io
+
+
+def _closed(when: str = "before this call") -> ClientClosed:
+    return ClientClosed(f"The client was closed {when}.", hint="Make a new one.")
+
+
+def _forked() -> ForkedError:
+    return ForkedError(
+        "This client was made before the process forked: its thread and sockets stayed with the parent.",
+        hint="Make a client in the child, or start workers with multiprocessing's 'spawn' method.",
+    )
+
+
+def _on_io_thread() -> URLabError:
+    return URLabError(
+        "A blocking call was made on the client's own I/O thread, which would wait for itself.",
+        hint="Hand the work to another thread, or use urlab_client.aio in code that runs on the event loop.",
+    )
+
+
+def _without_earlier_raise(trace: TracebackType | None) -> TracebackType | None:
+    """Cut off what raising the same exception object through an earlier call left at the end of `trace`.
+
+    The leftover begins in a frame of that call's callers and goes on through `Portal.call`.
+    """
+    entry = trace
+    while entry is not None and entry.tb_frame.f_code is not Portal.call.__code__:
+        entry = entry.tb_next
+    if trace is None or entry is None:
+        return trace
+    callers = {entry.tb_frame}
+    frame = entry.tb_frame.f_back
+    while frame is not None:
+        callers.add(frame)
+        frame = frame.f_back
+    if trace.tb_frame in callers:
+        return trace  # A coroutine of this loop made a blocking call into another one: nothing is left over.
+    last = trace
+    while last.tb_next is not None and last.tb_next.tb_frame not in callers:
+        last = last.tb_next
+    last.tb_next = None
+    return trace
+
+
+_FACADES: dict[type, type[Facade]] = {}
+
+
+class Facade:
+    """Base of the generated classes: the blocking twin of one asynchronous object.
+
+    A subclass names the class it stands for: `class Scene(Facade, twin=aio.Scene)`. It is made by `Portal.wrap` only.
+    """
+
+    __slots__ = ("__weakref__", "_aio", "_maps", "_portal")
+
+    _aio: Any
+    _maps: dict[str, tuple[NameMap[Any], NameMap[Any]]]
+    _portal: Portal
+
+    def __init_subclass__(cls, *, twin: type | None = None, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if twin is not None:
+            _FACADES[twin] = cls
+
+    def __init__(self, aio: object, portal: Portal) -> None:
+        self._aio = aio
+        self._portal = portal
+        self._maps = {}
+
+    def _map(self, name: str, cls: type[F], source: NameMap[Any]) -> NameMap[F]:
+        """Return the twins of the entries of `source`, as the same map as long as property `name` has this `source`.
+
+        Remembered here, not by `NameMap.mapped`: the loop's tasks keep `source` alive, which must not keep the twins.
+        """
+        known, twins = self._maps.get(name, (None, None))
+        if twins is None or known is not source:
+            entries = cast("NameMap[object]", source).items()
+            twins = NameMap({key: self._portal.wrap(cls, entry) for key, entry in entries}, source.aliases, source.kind)
+            self._maps[name] = source, twins
+        return twins
+
+    def __repr__(self) -> str:
+        if type(self._aio).__repr__ is object.__repr__:
+            return super().__repr__()
+        return repr(self._aio)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        raise TypeError(
+            f"{type(self).__name__} cannot be pickled or copied: it belongs to a connection of this process. "
+            "Make a client where it is needed."
+        )
+
+
+class FacadeRoot(Facade):
+    """Base of a generated class that users construct: owns the portal."""
+
+    __slots__ = ("_opened_at",)
+
+    def __init__(self, aio: Any) -> None:
+        Portal(aio.close).adopt(self, aio)
+        self._opened_at = _first_line_outside_package()
+
+    def __del__(self) -> None:
+        portal: Portal | None = getattr(self, "_portal", None)  # None if the constructor failed.
+        if portal is not None and portal.is_open:
+            file, line = self._opened_at
+            message = f"unclosed {self!r}, opened at {file}:{line}; use `with` or call close()"
+            warnings.warn_explicit(message, ResourceWarning, file, line)
+
+
+def _first_line_outside_package() -> tuple[str, int]:
+    package = __name__.partition(".")[0]
+    frame = inspect.currentframe()
+    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] == package:
+        frame = frame.f_back
+    return (frame.f_code.co_filename, frame.f_lineno) if frame is not None else ("<unknown>", 0)

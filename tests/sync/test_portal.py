@@ -1,0 +1,944 @@
+"""The blocking façade's machinery: calls, closing, interrupts, forks, interpreter exit, twins."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import contextvars
+import copy
+import gc
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import traceback
+import warnings
+import weakref
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from urlab_client.protocol.errors import ClientClosed, ForkedError, URLabError, URLabRPCError
+from urlab_client.protocol.names import NameMap
+from urlab_client.sync import _portal
+from urlab_client.sync._portal import Facade, FacadeRoot, Portal
+
+
+async def answer(value: object = 42) -> object:
+    await asyncio.sleep(0)
+    return value
+
+
+async def fail(error: BaseException) -> None:
+    await asyncio.sleep(0)
+    raise error
+
+
+async def io_thread() -> threading.Thread:
+    return threading.current_thread()
+
+
+@pytest.fixture
+def portal() -> Iterator[Portal]:
+    portal = Portal()
+    yield portal
+    portal.close()
+
+
+class TestCall:
+    def test_returns_the_result(self, portal: Portal) -> None:
+        assert portal.call(answer("x")) == "x"
+
+    def test_nothing_starts_before_the_first_call(self) -> None:
+        before = threading.active_count()
+        portal = Portal()
+        assert threading.active_count() == before
+        assert not portal.is_open
+
+    def test_one_daemon_thread_serves_all_callers(self, portal: Portal) -> None:
+        with ThreadPoolExecutor(8) as pool:
+            threads = set(pool.map(lambda _: portal.call(io_thread()), range(64)))
+        (thread,) = threads
+        assert thread.name == "urlab-io"
+        assert thread.daemon
+
+    def test_calls_of_several_threads_overlap(self, portal: Portal) -> None:
+        everyone_is_in: list[asyncio.Barrier] = []
+
+        async def make() -> None:
+            everyone_is_in.append(asyncio.Barrier(4))
+
+        async def meet() -> None:
+            await everyone_is_in[0].wait()
+
+        portal.call(make())
+        with ThreadPoolExecutor(4) as pool:
+            list(pool.map(lambda _: portal.call(meet()), range(4)))
+
+    def test_sees_the_callers_context_variables(self, portal: Portal) -> None:
+        span: contextvars.ContextVar[str] = contextvars.ContextVar("span")
+
+        async def read() -> str:
+            return span.get()
+
+        span.set("rollout-7")
+        assert portal.call(read()) == "rollout-7"
+
+    async def test_works_while_the_callers_thread_runs_a_loop(self, portal: Portal) -> None:
+        assert portal.call(answer()) == 42
+
+    def test_refuses_to_wait_for_itself(self, portal: Portal) -> None:
+        async def inner() -> None:
+            portal.call(answer())
+
+        with pytest.raises(URLabError, match=r"own I/O thread.*urlab_client\.aio"):
+            portal.call(inner())
+        assert portal.call(answer()) == 42
+
+    def test_refuses_to_close_from_its_own_thread(self, portal: Portal) -> None:
+        async def inner() -> None:
+            portal.close(answer())
+
+        with pytest.raises(URLabError, match="own I/O thread"):
+            portal.call(inner())
+        assert portal.call(answer()) == 42
+
+    def test_one_portal_may_wait_for_another(self, portal: Portal) -> None:
+        other = Portal()
+
+        async def inner() -> object:
+            return other.call(answer())
+
+        assert portal.call(inner()) == 42
+        other.close()
+
+    @pytest.mark.parametrize("error", [SystemExit(3), KeyboardInterrupt(), asyncio.CancelledError(), ValueError("x")])
+    def test_passes_on_any_exception_and_stays_usable(self, portal: Portal, error: BaseException) -> None:
+        with pytest.raises(type(error)):
+            portal.call(fail(error))
+        assert portal.call(answer()) == 42
+
+    def test_ends_an_iteration(self, portal: Portal) -> None:
+        async def count() -> AsyncIterator[int]:
+            for i in range(3):
+                yield i
+
+        class Numbers:
+            def __init__(self) -> None:
+                self.items = count()
+
+            async def get(self) -> int:
+                return await anext(self.items)
+
+            def __iter__(self) -> Iterator[int]:
+                return self
+
+            def __next__(self) -> int:
+                return portal.next(self.get())
+
+        assert list(Numbers()) == [0, 1, 2]
+
+
+class TestTracebacks:
+    def test_shows_caller_portal_and_coroutine(self, portal: Portal) -> None:
+        with pytest.raises(ValueError, match="x") as caught:
+            portal.call(fail(ValueError("x")))
+        names = [frame.name for frame in traceback.extract_tb(caught.value.__traceback__)]
+        assert names == ["test_shows_caller_portal_and_coroutine", "call", "fail"]
+
+    def test_a_refusal_shows_no_inner_frames(self, portal: Portal) -> None:
+        with pytest.raises(URLabRPCError) as caught:
+            portal.call(fail(URLabRPCError("not_ready", "no model", op="step")))
+        names = [frame.name for frame in traceback.extract_tb(caught.value.__traceback__)]
+        assert names == ["test_a_refusal_shows_no_inner_frames", "call"]
+
+    def test_raising_the_same_object_again_does_not_grow_its_traceback(self, portal: Portal) -> None:
+        error = RuntimeError("link down")
+
+        def facade_method() -> None:
+            portal.call(fail(error))
+
+        def user_code() -> list[str]:
+            try:
+                facade_method()
+            except RuntimeError as exc:
+                return [frame.name for frame in traceback.extract_tb(exc.__traceback__)]
+            pytest.fail("not raised")
+
+        assert [user_code() for _ in range(3)] == [["user_code", "facade_method", "call", "fail"]] * 3
+
+    def test_keeps_the_frames_of_a_call_made_inside_a_coroutine(self, portal: Portal) -> None:
+        other = Portal()
+
+        async def outer() -> None:
+            other.call(fail(RuntimeError("inner")))
+
+        with pytest.raises(RuntimeError) as caught:
+            portal.call(outer())
+        names = [frame.name for frame in traceback.extract_tb(caught.value.__traceback__)]
+        assert names[1:] == ["call", "outer", "call", "fail"]
+        other.close()
+
+    def test_leaves_no_reference_cycle(self) -> None:
+        async def err() -> None:
+            await asyncio.sleep(0)
+            raise ValueError
+
+        portal = Portal()
+        gc.collect()
+        gc.disable()
+        try:
+            with contextlib.suppress(ValueError):
+                portal.call(err())
+            thread = portal.call(io_thread())
+            del portal
+            assert not thread.is_alive()
+        finally:
+            gc.enable()
+
+
+class TestClose:
+    def test_runs_the_last_coroutine_then_ends_the_thread(self) -> None:
+        portal = Portal()
+        thread = portal.call(io_thread())
+        seen: list[threading.Thread] = []
+
+        async def last() -> None:
+            seen.append(await io_thread())
+
+        portal.close(last())
+        assert seen == [thread]
+        assert not thread.is_alive()
+
+    def test_again_does_nothing(self) -> None:
+        portal = Portal()
+        portal.call(answer())
+        portal.close(answer())
+        portal.close(fail(AssertionError("ran")))
+        portal.close()
+
+    def test_refuses_later_calls_and_leaves_no_coroutine_unawaited(self) -> None:
+        portal = Portal()
+        portal.call(answer())
+        portal.close()
+        coro = answer()
+        with pytest.raises(ClientClosed):
+            portal.call(coro)
+        assert coro.cr_frame is None
+
+    def test_before_any_call_starts_no_thread(self) -> None:
+        before = threading.active_count()
+        portal = Portal()
+        portal.close()
+        assert threading.active_count() == before
+        with pytest.raises(ClientClosed):
+            portal.call(answer())
+
+    def test_ends_the_thread_though_the_last_coroutine_fails(self) -> None:
+        portal = Portal()
+        thread = portal.call(io_thread())
+        with pytest.raises(OSError, match="gone"):
+            portal.close(fail(OSError("gone")))
+        assert not thread.is_alive()
+
+    def test_releases_callers_in_other_threads(self) -> None:
+        portal = Portal()
+        log: list[str] = []
+        entered = threading.Event()
+
+        async def hang() -> None:
+            entered.set()
+            try:
+                await asyncio.Event().wait()
+            finally:
+                await asyncio.sleep(0)
+                log.append("cleaned up")
+
+        with ThreadPoolExecutor(1) as pool:
+            future = pool.submit(portal.call, hang())
+            entered.wait()
+            portal.close()
+            with pytest.raises(ClientClosed, match="during this call"):
+                future.result()
+        assert log == ["cleaned up"]
+
+    def test_releases_the_caller_of_a_coroutine_that_refuses_to_end(
+        self, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        monkeypatch.setattr(_portal, "GRACE", 0.05)
+        portal = Portal()
+        entered = threading.Event()
+        let_go: list[Callable[[], object]] = []
+
+        async def stubborn() -> None:
+            free = asyncio.Event()
+            let_go.append(free.set)
+            entered.set()
+            while not free.is_set():
+                try:
+                    await free.wait()
+                except asyncio.CancelledError:
+                    asyncio.get_running_loop().call_later(0.2, free.set)
+
+        with ThreadPoolExecutor(1) as pool:
+            future = pool.submit(portal.call, stubborn())
+            entered.wait()
+            portal.close()
+            with pytest.raises(ClientClosed, match="during this call"):
+                future.result()
+        with caplog.at_level("CRITICAL", logger="asyncio"):  # it says, rightly, that a pending task was destroyed
+            gc.collect()
+
+    def test_from_two_threads(self) -> None:
+        portal = Portal()
+        portal.call(answer())
+        both = threading.Barrier(2)
+
+        def close() -> None:
+            both.wait()
+            portal.close(answer())
+
+        with ThreadPoolExecutor(2) as pool:
+            for future in [pool.submit(close) for _ in range(2)]:
+                future.result()
+
+    def test_racing_calls_end_one_way_or_the_other(self) -> None:
+        for _ in range(50):
+            portal = Portal()
+            portal.call(answer())
+
+            def call_until_refused(portal: Portal = portal) -> None:
+                with contextlib.suppress(ClientClosed):
+                    while True:
+                        portal.call(answer())
+
+            with ThreadPoolExecutor(2) as pool:
+                futures = [pool.submit(call_until_refused) for _ in range(2)]
+                portal.close()
+                for future in futures:
+                    future.result()
+
+
+class TestGarbageCollection:
+    def test_stops_in_order(self) -> None:
+        log: list[str] = []
+        generators: list[AsyncIterator[None]] = []
+
+        async def say_goodbye() -> None:
+            await asyncio.sleep(0)
+            log.append("at_stop")
+
+        async def serve() -> None:
+            try:
+                await asyncio.Event().wait()
+            finally:
+                await asyncio.sleep(0)
+                log.append("task cancelled")
+
+        async def generate() -> AsyncIterator[None]:
+            try:
+                yield
+            finally:
+                log.append("generator closed")
+
+        async def begin() -> asyncio.Task[None]:
+            task = asyncio.create_task(serve())
+            generators.append(generate())
+            await anext(generators[0])
+            return task
+
+        portal = Portal(say_goodbye)
+        task = portal.call(begin())
+        thread = portal.call(io_thread())
+        del portal
+        assert not thread.is_alive()
+        assert log == ["at_stop", "task cancelled", "generator closed"]
+        assert task.cancelled()
+
+    def test_is_silent_about_a_failing_at_stop(self, caplog: pytest.LogCaptureFixture) -> None:
+        portal = Portal(lambda: fail(ConnectionResetError("server gone")))
+        thread = portal.call(io_thread())
+        del portal
+        assert not thread.is_alive()
+        assert [record for record in caplog.records if record.levelname != "DEBUG"] == []
+
+    def test_on_the_io_thread_itself_does_not_deadlock(self) -> None:
+        async def loop() -> asyncio.AbstractEventLoop:
+            return asyncio.get_running_loop()
+
+        box = [Portal()]
+        thread = box[0].call(io_thread())
+        box[0].call(loop()).call_soon_threadsafe(box.clear)
+        thread.join(10)
+        assert not thread.is_alive()
+
+    def test_a_background_task_does_not_keep_the_portal_alive(self) -> None:
+        tasks: list[asyncio.Task[object]] = []
+
+        async def begin() -> None:
+            tasks.append(asyncio.create_task(asyncio.Event().wait()))
+
+        portal = Portal()
+        portal.call(begin())
+        alive = weakref.ref(portal)
+        del portal
+        assert alive() is None
+        assert tasks[0].cancelled()
+
+
+def child(script: str, *flags: str) -> subprocess.Popen[str]:
+    prelude = """
+        import asyncio, os, signal, sys, threading
+        from urlab_client.protocol.errors import ClientClosed, ForkedError
+        from urlab_client.sync import _portal
+        from urlab_client.sync._portal import Portal
+
+        def say(*words):
+            print(*words, flush=True)
+
+        async def answer():
+            await asyncio.sleep(0)
+            return 42
+    """
+    source = textwrap.dedent(prelude) + textwrap.dedent(script)
+    return subprocess.Popen(
+        [sys.executable, "-X", "dev", "-W", "error", *flags, "-c", source],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def outcome(process: subprocess.Popen[str]) -> tuple[int, list[str], str]:
+    out, err = process.communicate(timeout=60)
+    return process.returncode, out.splitlines(), err
+
+
+def interrupt_when_ready(process: subprocess.Popen[str]) -> None:
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    process.send_signal(signal.SIGINT)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="console signals cannot be sent to one process there")
+class TestInterrupt:
+    def test_cleans_up_before_the_caller_does_and_leaves_the_portal_usable(self) -> None:
+        process = child("""
+            async def hang():
+                say("ready")
+                try:
+                    await asyncio.Event().wait()
+                finally:
+                    await asyncio.sleep(0.01)
+                    say("op cleaned up")
+
+            portal = Portal()
+            try:
+                try:
+                    portal.call(hang())
+                finally:
+                    say("caller cleans up")
+            except KeyboardInterrupt:
+                say("interrupted")
+            say(portal.call(answer()))
+            portal.close()
+        """)
+        interrupt_when_ready(process)
+        assert outcome(process) == (0, ["op cleaned up", "caller cleans up", "interrupted", "42"], "")
+
+    def test_unhandled_ends_the_process_with_one_portal_frame(self) -> None:
+        process = child("""
+            async def hang():
+                say("ready")
+                await asyncio.Event().wait()
+
+            portal = Portal()
+            portal.call(hang())
+        """)
+        interrupt_when_ready(process)
+        code, out, err = outcome(process)
+        assert code == -signal.SIGINT
+        assert out == []
+        assert err.rstrip().endswith("KeyboardInterrupt")
+        frames = [line for line in err.splitlines() if line.startswith("  File ")]
+        assert [frame.rpartition(" in ")[2] for frame in frames] == ["<module>", "call", "wait"]
+
+    def test_does_not_wait_for_a_coroutine_that_ignores_it(self) -> None:
+        process = child("""
+            import logging
+            logging.getLogger("urlab_client").addHandler(logging.StreamHandler(sys.stdout))
+            _portal.GRACE = 0.05
+
+            async def stubborn():
+                say("ready")
+                with __import__("contextlib").suppress(asyncio.CancelledError):
+                    await asyncio.Event().wait()
+                await finish.wait()
+                say("ended by itself")
+
+            async def make():
+                return asyncio.Event()
+
+            async def let_go():
+                finish.set()
+                await asyncio.sleep(0.01)
+
+            portal = Portal()
+            finish = portal.call(make())
+            try:
+                portal.call(stubborn())
+            except KeyboardInterrupt:
+                say("interrupted")
+            portal.call(let_go())
+            portal.close()
+        """)
+        interrupt_when_ready(process)
+        code, out, err = outcome(process)
+        assert (code, err) == (0, "")
+        assert out == ["stubborn goes on 0.05 s after it was interrupted", "interrupted", "ended by itself"]
+
+    def test_works_inside_a_running_loop(self) -> None:
+        process = child("""
+            async def hang():
+                say("ready")
+                try:
+                    await asyncio.Event().wait()
+                finally:
+                    say("op cleaned up")
+
+            async def notebook():
+                signal.signal(signal.SIGINT, signal.default_int_handler)  # as a kernel does for a cell
+                try:
+                    portal.call(hang())
+                except KeyboardInterrupt:
+                    say("interrupted")
+                say(portal.call(answer()))
+
+            portal = Portal()
+            asyncio.run(notebook())
+        """)
+        interrupt_when_ready(process)
+        assert outcome(process) == (0, ["op cleaned up", "interrupted", "42"], "")
+
+    def test_a_signal_handler_may_close_the_client(self) -> None:
+        process = child("""
+            async def hang():
+                say("ready")
+                await asyncio.Event().wait()
+
+            async def farewell():
+                say("closing")
+
+            portal = Portal()
+            signal.signal(signal.SIGINT, lambda *_: portal.close(farewell()))
+            try:
+                portal.call(hang())
+            except ClientClosed as error:
+                say(error)
+        """)
+        interrupt_when_ready(process)
+        assert outcome(process) == (
+            0,
+            ["closing", "The client was closed during this call. Make a new one."],
+            "",
+        )
+
+    def test_at_any_moment_leaves_the_portal_usable(self) -> None:
+        # An exception may strike between any two instructions of the portal; hundreds of timer signals try.
+        process = child(
+            """
+            import gc
+            gc.disable()  # an exception that strikes in a collector's callback is printed, whoever runs it
+
+            class Struck(Exception):
+                pass
+
+            def strike(*_):
+                raise Struck
+
+            async def op():
+                for _ in range(3):
+                    await asyncio.sleep(0)
+
+            portal = Portal()
+            portal.call(answer())
+            signal.signal(signal.SIGALRM, strike)
+            struck = 0
+            for i in range(600):
+                try:
+                    signal.setitimer(signal.ITIMER_REAL, 1e-6 * (1 + i % 300))
+                    try:
+                        portal.call(op())
+                    finally:
+                        signal.setitimer(signal.ITIMER_REAL, 0)
+                except Struck:
+                    struck += 1
+            say(struck > 20, portal.call(answer()), len(portal._io._jobs))
+            portal.close()
+            """,
+            "-W",
+            "ignore:coroutine 'op' was never awaited:RuntimeWarning",  # struck before `call` was entered
+        )
+        assert outcome(process) == (0, ["True 42 0"], "")
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="the platform has no fork")
+class TestFork:
+    IGNORE_ADVICE = ("-W", "ignore:This process:DeprecationWarning")  # Python 3.12 warns at a fork with threads
+
+    def test_a_child_gets_advice_and_the_parent_goes_on(self) -> None:
+        process = child(
+            """
+            portal = Portal()
+            portal.call(answer())
+            pid = os.fork()
+            if pid == 0:
+                try:
+                    portal.call(answer())
+                except ForkedError as error:
+                    say(error)
+                portal.close(answer())
+                sys.exit(7)
+            say(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
+            say(portal.call(answer()))
+            """,
+            *self.IGNORE_ADVICE,
+        )
+        code, out, err = outcome(process)
+        assert (code, err) == (0, "")
+        assert "spawn" in out[0]
+        assert "in the child" in out[0]
+        assert out[1:] == ["7", "42"]
+
+    def test_a_child_forked_while_locks_are_held_does_not_hang(self) -> None:
+        process = child(
+            """
+            class Twin(_portal.Facade, twin=object):
+                pass
+
+            portal = Portal()
+            portal.call(answer())
+            held = threading.Event()
+            release = threading.Event()
+
+            def hold():
+                with portal._lock, portal._io._lock:
+                    held.set()
+                    release.wait()
+
+            holder = threading.Thread(target=hold)
+            holder.start()
+            held.wait()
+            pid = os.fork()
+            if pid == 0:
+                for attempt in (lambda: portal.call(answer()), lambda: portal.wrap(Twin, object())):
+                    try:
+                        attempt()
+                    except ForkedError:
+                        say("refused")
+                portal.close()
+                del portal
+                sys.exit(0)
+            say(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
+            release.set()
+            holder.join()
+            say(portal.call(answer()))
+            """,
+            *self.IGNORE_ADVICE,
+        )
+        assert outcome(process) == (0, ["refused", "refused", "0", "42"], "")
+
+    def test_a_child_leaving_a_with_block_keeps_its_exit_code(self) -> None:
+        process = child(
+            """
+            class Twin:
+                async def close(self):
+                    say("closed")
+
+            class Client(_portal.FacadeRoot):
+                def __enter__(self):
+                    self._portal.call(answer())
+                    return self
+                def __exit__(self, *exc):
+                    self._portal.close(self._aio.close())
+
+            with Client(Twin()):
+                pid = os.fork()
+                if pid == 0:
+                    sys.exit(5)
+                say(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
+            """,
+            *self.IGNORE_ADVICE,
+        )
+        # "closed" twice: by the last coroutine and, idempotently, by at_stop; both in the parent.
+        assert outcome(process) == (0, ["5", "closed", "closed"], "")
+
+    def test_the_error_pickles(self) -> None:
+        assert isinstance(pickle.loads(pickle.dumps(ForkedError("x"))), ForkedError)
+
+
+class TestExit:
+    def test_cleans_up_silently(self) -> None:
+        process = child("""
+            async def at_stop():
+                await asyncio.sleep(0)
+                say("at_stop")
+
+            async def serve():
+                try:
+                    await asyncio.Event().wait()
+                finally:
+                    await asyncio.sleep(0)
+                    say("task cancelled")
+
+            async def begin():
+                return asyncio.create_task(serve())
+
+            portal = Portal(at_stop)
+            task = portal.call(begin())
+            say("main ends")
+        """)
+        assert outcome(process) == (0, ["main ends", "at_stop", "task cancelled"], "")
+
+    def test_keeps_the_exit_code_while_another_thread_waits(self) -> None:
+        process = child("""
+            entered = threading.Event()
+
+            async def hang():
+                entered.set()
+                try:
+                    await asyncio.Event().wait()
+                finally:
+                    say("op cleaned up")
+
+            def wait():
+                try:
+                    portal.call(hang())
+                except ClientClosed:
+                    pass
+
+            portal = Portal()
+            threading.Thread(target=wait, daemon=True).start()
+            entered.wait()
+            sys.exit(3)
+        """)
+        assert outcome(process) == (3, ["op cleaned up"], "")
+
+    def test_shows_only_the_users_own_error(self) -> None:
+        process = child("""
+            portal = Portal()
+            portal.call(answer())
+            raise ValueError("mine")
+        """)
+        code, out, err = outcome(process)
+        assert (code, out) == (1, [])
+        lines = err.splitlines()
+        assert lines[0] == "Traceback (most recent call last):"
+        assert lines[-1] == "ValueError: mine"
+        assert sum(line.startswith("  File ") for line in lines) == 1
+
+    def test_an_unclosed_client_is_closed_without_a_warning(self) -> None:
+        process = child("""
+            class Twin:
+                async def close(self):
+                    say("closed")
+
+            class Client(_portal.FacadeRoot):
+                def use(self):
+                    return self._portal.call(answer())
+
+            client = Client(Twin())
+            say(client.use())
+        """)
+        assert outcome(process) == (0, ["42", "closed"], "")
+
+
+class Robot:
+    def __init__(self, name: str = "arm") -> None:
+        self.name = name
+
+    def __repr__(self) -> str:
+        return f"Robot({self.name!r})"
+
+
+class WalkingRobot(Robot):
+    pass
+
+
+class Plain:
+    pass
+
+
+class RobotTwin(Facade, twin=Robot):
+    __slots__ = ()
+
+
+class WalkingRobotTwin(RobotTwin, twin=WalkingRobot):
+    __slots__ = ()
+
+
+class PlainTwin(Facade, twin=Plain):
+    __slots__ = ()
+
+
+class Fleet:
+    def __init__(self) -> None:
+        self.robots = NameMap({"arm_1": Robot(), "dog": WalkingRobot()}, {"arm": ["arm_1"]}, "robot")
+
+
+class FleetTwin(Facade, twin=Fleet):
+    __slots__ = ()
+
+    @property
+    def robots(self) -> NameMap[RobotTwin]:
+        return self._map("robots", RobotTwin, self._aio.robots)
+
+
+class TestTwins:
+    def test_are_the_same_while_held(self, portal: Portal) -> None:
+        robot = Robot()
+        twin = portal.wrap(RobotTwin, robot)
+        assert portal.wrap(RobotTwin, robot) is twin
+        assert portal.wrap(RobotTwin, Robot()) is not twin
+
+    def test_of_none_is_none(self, portal: Portal) -> None:
+        assert portal.wrap(RobotTwin, None) is None
+
+    def test_have_the_most_derived_class(self, portal: Portal) -> None:
+        class Unlisted(WalkingRobot):
+            pass
+
+        assert type(portal.wrap(RobotTwin, WalkingRobot())) is WalkingRobotTwin
+        assert type(portal.wrap(RobotTwin, Unlisted())) is WalkingRobotTwin
+
+    def test_are_made_once_under_races(self, portal: Portal) -> None:
+        with ThreadPoolExecutor(8) as pool:
+            for _ in range(50):
+                robot = Robot()
+                ready = threading.Barrier(8)
+
+                def get(_: int, robot: Robot = robot, ready: threading.Barrier = ready) -> Facade:
+                    ready.wait()
+                    return portal.wrap(RobotTwin, robot)
+
+                assert len(set(pool.map(get, range(8)))) == 1
+
+    def test_keep_neither_themselves_nor_the_portal_alive(self) -> None:
+        robot = Robot()
+        portal = Portal()
+        twin = portal.wrap(RobotTwin, robot)
+        dead = [weakref.ref(twin), weakref.ref(portal)]
+        del portal
+        assert dead[1]() is not None, "a twin in use keeps its connection"
+        del twin
+        assert [ref() for ref in dead] == [None, None]
+
+    def test_of_a_map_keep_identity_and_aliases(self, portal: Portal) -> None:
+        fleet = Fleet()
+        twin = portal.wrap(FleetTwin, fleet)
+        assert twin.robots is twin.robots
+        assert twin.robots["arm"] is twin.robots["arm_1"] is portal.wrap(RobotTwin, fleet.robots["arm"])
+        assert type(twin.robots["dog"]) is WalkingRobotTwin
+        with pytest.raises(KeyError, match=r"no robot 'dgo'\. Did you mean 'dog'"):
+            twin.robots["dgo"]
+
+    def test_of_a_map_follow_its_replacement(self, portal: Portal) -> None:
+        fleet = Fleet()
+        twin = portal.wrap(FleetTwin, fleet)
+        arm = twin.robots["arm"]
+        fleet.robots = NameMap({"arm": fleet.robots["arm"]}, {}, "robot")
+        assert list(twin.robots) == ["arm"]
+        assert twin.robots["arm"] is arm
+
+    def test_of_a_map_do_not_keep_the_portal_alive(self) -> None:
+        fleet = Fleet()
+        portal = Portal()
+        alive = weakref.ref(portal)
+        twin = portal.wrap(FleetTwin, fleet)
+        assert len(twin.robots) == 2
+        del portal, twin
+        assert alive() is None
+
+    def test_refuse_attributes_that_do_not_exist(self, portal: Portal) -> None:
+        twin = portal.wrap(RobotTwin, Robot())
+        with pytest.raises(AttributeError):
+            twin.contrl_mode = "raw"  # pyright: ignore[reportAttributeAccessIssue]
+
+    def test_show_what_they_stand_for(self, portal: Portal) -> None:
+        assert repr(portal.wrap(RobotTwin, Robot("arm"))) == "Robot('arm')"
+        assert "PlainTwin" in repr(portal.wrap(PlainTwin, Plain()))
+
+    @pytest.mark.parametrize("action", [pickle.dumps, copy.copy, copy.deepcopy])
+    def test_cannot_be_pickled_or_copied(self, portal: Portal, action: Callable[[object], object]) -> None:
+        with pytest.raises(TypeError, match="RobotTwin cannot be pickled"):
+            action(portal.wrap(RobotTwin, Robot()))
+
+
+class AioClient:
+    def __init__(self, address: str = "tcp://localhost") -> None:
+        if "://" not in address:
+            raise ValueError(f"{address!r} is not an address")
+        self.address = address
+        self.closed = 0
+
+    def __repr__(self) -> str:
+        return f"Client({self.address!r})"
+
+    async def ping(self) -> int:
+        return 1
+
+    async def close(self) -> None:
+        self.closed += 1
+
+
+class Client(FacadeRoot, twin=AioClient):
+    __slots__ = ()
+
+    def __init__(self, address: str = "tcp://localhost") -> None:
+        super().__init__(AioClient(address))
+
+    def run(self, make: Callable[[AioClient], Awaitable[object]]) -> object:
+        async def call() -> object:
+            return await make(self._aio)
+
+        return self._portal.call(call())
+
+    def close(self) -> None:
+        self._portal.close(self._aio.close())
+
+
+class TestRoot:
+    def test_warns_of_an_unclosed_client_with_the_line_that_opened_it(self) -> None:
+        client = Client("tcp://robot")
+        line = Client.__init__.__code__.co_firstlineno + 1  # this class is the user's own
+        client.run(AioClient.ping)
+        twin = client._aio
+        with pytest.warns(ResourceWarning) as caught:
+            del client
+        assert f"unclosed Client('tcp://robot'), opened at {__file__}:{line};" in str(caught[0].message)
+        assert (caught[0].filename, caught[0].lineno) == (__file__, line)
+        assert twin.closed == 1
+
+    def test_is_silent_when_closed_or_never_used(self) -> None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            client = Client()
+            client.run(AioClient.ping)
+            client.close()
+            del client
+            unused = Client()
+            del unused
+            gc.collect()
+
+    def test_a_failing_constructor_leaves_nothing(self) -> None:
+        with pytest.raises(ValueError, match="not an address"):
+            Client("robot")
+        gc.collect()
+
+    def test_is_the_twin_of_its_own_async_client(self) -> None:
+        client = Client()
+        assert client._portal.wrap(Client, client._aio) is client
