@@ -1,0 +1,565 @@
+from __future__ import annotations
+
+import contextlib
+import math
+import pickle
+import struct
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from urlab_client.protocol import rows
+from urlab_client.protocol.enums import CameraMode
+from urlab_client.protocol.errors import ProtocolError
+from urlab_client.protocol.rows import (
+    ActionsRow,
+    ActuatorInfo,
+    BaseStateRow,
+    CameraEndpoint,
+    ControlPayload,
+    JointGains,
+    JointRow,
+    SceneRow,
+    SensorRow,
+    Topic,
+    TopicKind,
+    TwistRow,
+)
+
+OF_COMPONENT = [TopicKind.JOINT, TopicKind.BASE_STATE, TopicKind.SENSOR, TopicKind.CAMERA]
+OF_ARTICULATION = [TopicKind.TWIST, TopicKind.ACTIONS, TopicKind.CONTROL, TopicKind.SET_GAINS]
+OF_SCENE = {TopicKind.XPOS: 3, TopicKind.XQUAT: 4, TopicKind.QPOS: 7, TopicKind.QVEL: 6}
+
+names = st.text(st.characters(codec="utf-8", exclude_characters="/"), min_size=1).filter(
+    lambda name: not name.endswith(" ")
+)
+float32 = st.floats(width=32)
+int32 = st.integers(-(2**31), 2**31 - 1)
+
+
+def vectors32(size: int | st.SearchStrategy[int]) -> st.SearchStrategy[np.ndarray]:
+    return hnp.arrays(np.float32, size, elements=float32)
+
+
+def same(a: np.ndarray, b: np.ndarray) -> bool:
+    return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+
+
+class TestTopics:
+    @given(
+        st.one_of(
+            st.builds(Topic, st.sampled_from(OF_COMPONENT), names, names),
+            st.builds(Topic, st.sampled_from(OF_ARTICULATION), names),
+            st.builds(Topic, st.sampled_from(list(OF_SCENE)), names),
+            st.just(Topic(TopicKind.STATE_FULL)),
+        ).filter(lambda topic: topic.owner != "scene")
+    )
+    def test_round_trip(self, topic: Topic) -> None:
+        frame = topic.encode()
+        assert Topic.parse(frame) == topic
+        assert Topic.parse(memoryview(frame)) == topic
+        assert frame.endswith(b" ") == (topic.kind in {TopicKind.CONTROL, TopicKind.SET_GAINS, TopicKind.CAMERA})
+
+    @pytest.mark.parametrize(
+        ("frame", "topic"),
+        [
+            (b"scene/joint/knee", Topic(TopicKind.JOINT, "scene", "knee")),
+            (b"scene/twist", Topic(TopicKind.TWIST, "scene")),
+            (b"scene/camera/head ", Topic(TopicKind.CAMERA, "scene", "head")),
+            (b"scene/joint/xpos", Topic(TopicKind.XPOS, "joint")),
+            (b"scene/scene/qvel", Topic(TopicKind.QVEL, "scene")),
+            (b"state/twist", Topic(TopicKind.TWIST, "state")),
+            (b"joint/joint/joint", Topic(TopicKind.JOINT, "joint", "joint")),
+        ],
+    )
+    def test_articulations_named_like_a_part_of_the_grammar(self, frame: bytes, topic: Topic) -> None:
+        assert Topic.parse(frame) == topic
+
+    @pytest.mark.parametrize(
+        ("frame", "problem"),
+        [
+            (b"", "expected <articulation>"),
+            (b"g1", "expected <articulation>"),
+            (b"g1/", "expected <articulation>"),
+            (b"g1/joint", "expected <articulation>"),
+            (b"g1/joint/", "expected <articulation>"),
+            (b"/joint/knee", "expected <articulation>"),
+            (b"g1/joint/left/knee", "expected <articulation>"),
+            (b"g1/twist/x", "expected <articulation>"),
+            (b"g1/velocity/knee", "expected <articulation>"),
+            (b"scene//xpos", "expected <articulation>"),
+            (b"g1/joint/knee ", "must not end in a space"),
+            (b"g1/twist ", "must not end in a space"),
+            (b"scene/box/xpos ", "must not end in a space"),
+            (b"state/full ", "expected <articulation>"),
+            (b"g1/camera/wrist", "must end in one space"),
+            (b"g1/control", "must end in one space"),
+            (b"g1/camera/wrist  ", "a name ends in a space"),
+            (b"g1/joint/\xff", "not UTF-8"),
+        ],
+    )
+    def test_refused(self, frame: bytes, problem: str) -> None:
+        with pytest.raises(ProtocolError, match=problem) as caught:
+            Topic.parse(frame)
+        assert caught.value.raw == frame
+
+    @given(st.binary(max_size=40))
+    def test_any_bytes_give_a_topic_that_encodes_alike_or_an_error(self, frame: bytes) -> None:
+        try:
+            topic = Topic.parse(frame)
+        except ProtocolError:
+            return
+        assert topic.encode() == frame
+
+    @pytest.mark.parametrize(
+        "topic",
+        [
+            Topic(TopicKind.JOINT, "g1"),
+            Topic(TopicKind.JOINT, "", "knee"),
+            Topic(TopicKind.TWIST, "g1", "knee"),
+            Topic(TopicKind.XPOS),
+            Topic(TopicKind.STATE_FULL, "g1"),
+            Topic(TopicKind.JOINT, "a/b", "knee"),
+            Topic(TopicKind.JOINT, "g1", "left/knee"),
+            Topic(TopicKind.CAMERA, "g1", "wrist "),
+        ],
+    )
+    def test_encode_refuses_what_could_not_be_read_back(self, topic: Topic) -> None:
+        with pytest.raises(ValueError, match=r"topic"):
+            topic.encode()
+
+
+class TestFilters:
+    @given(names, names, st.sampled_from([None, *OF_COMPONENT, *OF_ARTICULATION]))
+    def test_an_articulation_never_brings_in_another(self, key: str, other: str, kind: TopicKind | None) -> None:
+        chosen = rows.articulation_filter(key, kind)
+        for topic in (
+            *(Topic(of, other, "knee") for of in OF_COMPONENT),
+            *(Topic(of, other) for of in OF_ARTICULATION),
+        ):
+            wanted = other == key and kind in {None, topic.kind}
+            assert topic.encode().startswith(chosen) == wanted
+
+    def test_scene(self) -> None:
+        assert Topic(TopicKind.XPOS, "box").encode().startswith(rows.scene_filter())
+        assert Topic(TopicKind.XPOS, "box").encode().startswith(rows.scene_filter("box"))
+        assert not Topic(TopicKind.XPOS, "box2").encode().startswith(rows.scene_filter("box"))
+
+    def test_camera(self) -> None:
+        # As the handshake gives it, without the trailing space, and as published, with it.
+        for zmq_topic in ("arm0/camera/wrist", "arm0/camera/wrist "):
+            chosen = rows.camera_filter(zmq_topic)
+            assert chosen == Topic(TopicKind.CAMERA, "arm0", "wrist").encode()
+            assert not Topic(TopicKind.CAMERA, "arm0", "wrist2").encode().startswith(chosen)
+
+    @pytest.mark.parametrize(
+        ("key", "kind"),
+        [("", None), ("a/b", None), ("g1 ", None), ("g1", TopicKind.XPOS), ("g1", TopicKind.STATE_FULL)],
+    )
+    def test_refused(self, key: str, kind: TopicKind | None) -> None:
+        with pytest.raises(ValueError, match=r"topic|empty"):
+            rows.articulation_filter(key, kind)
+
+
+class TestEndpoints:
+    @pytest.mark.parametrize("bound", ["0.0.0.0", "*", "::", "[::]", ""])
+    def test_unspecified_hosts_become_the_servers(self, bound: str) -> None:
+        assert rows.resolve_endpoint(f"tcp://{bound}:5560", "sim.lab") == "tcp://sim.lab:5560"
+
+    @pytest.mark.parametrize("host", ["fe80::1", "[fe80::1]"])
+    def test_ipv6_host_is_bracketed(self, host: str) -> None:
+        assert rows.resolve_endpoint("tcp://0.0.0.0:5558", host) == "tcp://[fe80::1]:5558"
+
+    @pytest.mark.parametrize(
+        "endpoint", ["tcp://10.0.0.7:5558", "tcp://[fe80::2]:5558", "ipc:///tmp/cam", "inproc://cam"]
+    )
+    def test_others_stay(self, endpoint: str) -> None:
+        assert rows.resolve_endpoint(endpoint, "sim.lab") == endpoint
+
+    @pytest.mark.parametrize(
+        "endpoint",
+        ["tcp://0.0.0.0", "tcp://0.0.0.0:", "tcp://0.0.0.0:*", "tcp://*:0", "tcp://*:65536", "tcp://*:²", "*:5558", ""],
+    )
+    def test_unusable(self, endpoint: str) -> None:
+        with pytest.raises(ProtocolError, match="expected tcp://HOST:PORT"):
+            rows.resolve_endpoint(endpoint, "sim.lab")
+
+    def test_the_host_itself_must_be_an_address(self) -> None:
+        with pytest.raises(ValueError, match="no address to connect to"):
+            rows.resolve_endpoint("tcp://0.0.0.0:5558", "0.0.0.0")
+
+
+class TestStateRows:
+    @given(int32, float32, float32, float32)
+    def test_joint(self, joint: int, position: float, velocity: float, acceleration: float) -> None:
+        frame = JointRow(joint, position, velocity, acceleration).encode()
+        row = JointRow.decode(frame)
+        assert row.id == joint
+        assert struct.pack("<fff", row.position, row.velocity, row.acceleration) == frame[4:]
+        assert [row.position, row.velocity, row.acceleration] == pytest.approx(
+            [position, velocity, acceleration], nan_ok=True, rel=0, abs=0
+        )
+
+    @given(st.tuples(vectors32(3), vectors32(4), vectors32(3), vectors32(3)))
+    def test_base_state(self, parts: tuple[np.ndarray, ...]) -> None:
+        row = BaseStateRow.decode(BaseStateRow(*parts).encode())
+        decoded = (row.position, row.quat_xyzw, row.linear_velocity, row.angular_velocity)
+        assert all(map(same, decoded, parts))
+
+    @given(int32, vectors32(st.integers(0, 20)))
+    def test_sensor(self, sensor: int, values: np.ndarray) -> None:
+        row = SensorRow.decode(SensorRow(sensor, values).encode())
+        assert row.id == sensor
+        assert same(row.values, values)
+
+    @given(float32, float32, float32)
+    def test_twist(self, vx: float, vy: float, yaw_rate: float) -> None:
+        row = TwistRow.decode(TwistRow(vx, vy, yaw_rate).encode())
+        assert [row.vx, row.vy, row.yaw_rate] == pytest.approx([vx, vy, yaw_rate], nan_ok=True, rel=0, abs=0)
+
+    @given(st.sets(st.integers(0, 9)))
+    def test_actions(self, keys: set[int]) -> None:
+        row = ActionsRow.decode(ActionsRow(sum(1 << key for key in keys)).encode())
+        assert row.bits == tuple(sorted(keys))
+
+    @given(st.data(), st.sampled_from(list(OF_SCENE)))
+    def test_scene(self, data: st.DataObject, quantity: TopicKind) -> None:
+        values = data.draw(hnp.arrays(np.float64, OF_SCENE[quantity]))
+        row = SceneRow.decode(quantity, SceneRow(quantity, values).encode())
+        assert row.quantity is quantity
+        assert same(row.values, values)
+
+    def test_base_state_of_a_real_free_joint(self) -> None:
+        model = mujoco.MjModel.from_xml_string(
+            "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
+        )
+        data = mujoco.MjData(model)
+        data.qpos[:] = [1.0, 2.0, 3.0, 0.5, -0.5, 0.25, 0.75]
+        data.qvel[:] = [1, 2, 3, 4, 5, 6]
+        row = BaseStateRow.decode(BaseStateRow.from_free_joint(data.qpos, data.qvel).encode())
+        assert row.position.tolist() == [1, 2, 3]
+        assert row.quat_xyzw.tolist() == [-0.5, 0.25, 0.75, 0.5]
+        assert row.linear_velocity.tolist() == [1, 2, 3]
+        assert row.angular_velocity.tolist() == [4, 5, 6]
+
+    def test_a_row_made_from_live_data_does_not_follow_it(self) -> None:
+        qpos, qvel = np.ones(7, np.float32), np.ones(6, np.float32)
+        row = BaseStateRow.from_free_joint(qpos, qvel)
+        qpos[:] = 0
+        qvel[:] = 0
+        assert row.position.tolist() == row.angular_velocity.tolist() == [1, 1, 1]
+
+    def test_a_simulation_that_blew_up_still_streams(self) -> None:
+        assert JointRow.decode(JointRow(3, 1e300, -1e300, math.nan).encode()).position == math.inf
+        assert SensorRow.decode(SensorRow(3, np.array([-1e300])).encode()).values.tolist() == [-math.inf]
+        assert TwistRow.decode(TwistRow(1e300, 0, 0).encode()).vx == math.inf
+
+    def test_decoded_arrays_are_the_callers_own(self) -> None:
+        for topic, row in (
+            (Topic(TopicKind.BASE_STATE, "g1", "root"), BaseStateRow(*map(np.ones, (3, 4, 3, 3)))),
+            (Topic(TopicKind.SENSOR, "g1", "imu"), SensorRow(1, np.ones(3))),
+            (Topic(TopicKind.QPOS, "box"), SceneRow(TopicKind.QPOS, np.ones(7))),
+        ):
+            buffer = bytearray(row.encode())
+            decoded = rows.decode_row(topic, buffer)
+            buffer[:] = bytes(len(buffer))
+            values = decoded.position if isinstance(decoded, BaseStateRow) else decoded.values
+            assert values.any()
+            values[:] = 2
+
+    @pytest.mark.parametrize(
+        ("topic", "size", "expected"),
+        [
+            (b"g1/joint/knee", 12, "12 bytes, expected 16"),
+            (b"g1/joint/knee", 20, "20 bytes, expected 16"),
+            (b"g1/base_state/root", 0, "0 bytes, expected 52"),
+            (b"g1/base_state/root", 104, "104 bytes, expected 52"),
+            (b"g1/twist", 16, "16 bytes, expected 12"),
+            (b"g1/actions", 8, "8 bytes, expected 4"),
+            (b"scene/box/xpos", 12, "12 bytes, expected 24"),
+            (b"scene/box/xquat", 24, "24 bytes, expected 32"),
+            (b"scene/box/qpos", 48, "48 bytes, expected 56"),
+            (b"scene/box/qvel", 56, "56 bytes, expected 48"),
+            (b"g1/sensor/imu", 4, r"4 bytes, expected 8 \+ 4\*dim"),
+        ],
+    )
+    def test_wrong_size(self, topic: bytes, size: int, expected: str) -> None:
+        with pytest.raises(ProtocolError, match=expected) as caught:
+            rows.decode_row(Topic.parse(topic), bytes(size))
+        assert repr(topic.decode()) in str(caught.value)
+
+    @pytest.mark.parametrize(("dim", "problem"), [(-1, "dim is -1"), (2, "expected 16"), (2**31 - 1, "expected 85899")])
+    def test_sensor_dim_must_be_that_of_the_row(self, dim: int, problem: str) -> None:
+        with pytest.raises(ProtocolError, match=problem):
+            SensorRow.decode(struct.pack("<iif", 1, dim, 0.5))
+
+    def test_a_topic_without_row(self) -> None:
+        with pytest.raises(ProtocolError, match="'g1/camera/head ': a camera topic carries none"):
+            rows.decode_row(Topic.parse(b"g1/camera/head "), b"")
+
+    def test_encode_refuses_wrong_shapes(self) -> None:
+        with pytest.raises(ValueError, match=r"quat_xyzw has shape \(3,\), expected \(4,\)"):
+            BaseStateRow(*map(np.zeros, (3, 3, 3, 3))).encode()
+        with pytest.raises(ValueError, match=r"values has shape \(2, 2\)"):
+            SensorRow(1, np.zeros((2, 2))).encode()
+        with pytest.raises(ValueError, match=r"qpos has shape \(6,\), expected \(7,\)"):
+            SceneRow(TopicKind.QPOS, np.zeros(6)).encode()
+
+    def test_errors_travel_between_processes(self) -> None:
+        with pytest.raises(ProtocolError) as caught:
+            JointRow.decode(b"abc", "g1/joint/knee")
+        copy = pickle.loads(pickle.dumps(caught.value))
+        assert (str(copy), copy.raw) == (str(caught.value), b"abc")
+
+
+class TestControl:
+    @given(st.data(), st.integers(0, 30))
+    def test_round_trip(self, data: st.DataObject, n: int) -> None:
+        ids, values = data.draw(hnp.arrays(np.int32, n)), data.draw(vectors32(n))
+        payload = ControlPayload.decode(ControlPayload(ids, values).encode() + b"more")
+        assert same(payload.actuator_ids, ids)
+        assert same(payload.values, values)
+
+    def test_decoded_arrays_are_the_callers_own(self) -> None:
+        buffer = bytearray(ControlPayload(np.arange(1, 3), np.ones(2)).encode())
+        payload = ControlPayload.decode(buffer)
+        buffer[:] = bytes(len(buffer))
+        assert payload.actuator_ids.tolist() == [1, 2]
+        assert payload.values.tolist() == [1, 1]
+
+    @pytest.mark.parametrize(
+        ("payload", "problem"),
+        [
+            (b"", r"0 bytes, expected 4 \+ 8\*n"),
+            (struct.pack("<i", -1), "n is -1"),
+            (struct.pack("<iif", 2, 0, 1.0), "12 bytes, expected at least 20"),
+            (struct.pack("<i", 2**31 - 1), "4 bytes, expected at least 17179869180"),
+        ],
+    )
+    def test_refused(self, payload: bytes, problem: str) -> None:
+        with pytest.raises(ProtocolError, match=f"on 'g1/control ': .*{problem}"):
+            ControlPayload.decode(payload, Topic(TopicKind.CONTROL, "g1"))
+
+    @pytest.mark.parametrize(
+        ("ids", "values"),
+        [
+            (np.zeros(2, np.int32), np.zeros(3)),
+            (np.zeros((1, 2), np.int32), np.zeros((1, 2))),
+            (np.array([2**31]), np.zeros(1)),
+            (np.array([0.5]), np.zeros(1)),
+        ],
+    )
+    def test_encode_refuses(self, ids: np.ndarray, values: np.ndarray) -> None:
+        with pytest.raises(ValueError, match="actuator_ids"):
+            ControlPayload(ids, values).encode()
+
+
+class TestGains:
+    gain = st.none() | st.floats(allow_nan=False, allow_infinity=False)
+
+    @given(st.dictionaries(st.text(), st.builds(JointGains, kp=gain, kv=gain, torque_limit=gain)))
+    def test_round_trip_in_ascii(self, gains: dict[str, JointGains]) -> None:
+        payload = rows.encode_gains(gains)
+        assert payload.isascii()
+        assert rows.decode_gains(payload) == gains
+
+    def test_unknown_parameters_are_ignored(self) -> None:
+        assert rows.decode_gains(b'{"knee":{"kp":1,"ki":2}}') == {"knee": JointGains(kp=1.0)}
+
+    @pytest.mark.parametrize(
+        "payload", [b"", b"[]", b'{"knee":3}', b'{"knee":{"kp":"1"}}', b'{"\xff":{}}', b'{"a":{"x":' + b"[" * 100_000]
+    )
+    def test_refused(self, payload: bytes) -> None:
+        with pytest.raises(ProtocolError, match="set_gains payload on 'g1'"):
+            rows.decode_gains(payload, "g1")
+
+    def test_a_gain_that_json_cannot_carry(self) -> None:
+        with pytest.raises(ValueError, match="JSON"):
+            rows.encode_gains({"knee": JointGains(kp=math.inf)})
+
+
+class TestInfo:
+    def test_round_trip(self) -> None:
+        info = ActuatorInfo(
+            "g1",
+            ("g1_knee",),
+            np.array([3]),
+            np.array([-0.5]),
+            np.array([100.0]),
+            (CameraEndpoint("head", "tcp://*:1"),),
+        )
+        read = ActuatorInfo.decode(info.encode())
+        assert (read.robot, read.names, read.cameras) == (info.robot, info.names, info.cameras)
+        assert (read.ids.tolist(), read.mins.tolist(), read.maxs.tolist()) == ([3], [-0.5], [100.0])
+
+    def test_ids_spelled_as_floats(self) -> None:
+        frame = (
+            b'{"type":"actuator_list","robot":"g1","names":["a"],"ids":[3.0],"mins":[-1],"maxs":[1],"camera_list":[]}'
+        )
+        info = ActuatorInfo.decode(frame)
+        assert info.ids.tolist() == [3]
+        assert info.ids.dtype == np.int32
+
+    @pytest.mark.parametrize(
+        ("frame", "problem"),
+        [
+            (b"", "truncated"),
+            (b'{"type":"other"}', "Invalid value 'other'"),
+            (b'{"type":"actuator_list","robot":"g1","names":[],"ids":[],"mins":[]}', "missing required field `maxs`"),
+            (
+                b'{"type":"actuator_list","robot":"g1","names":["a"],"ids":[3],"mins":[],"maxs":[1]}',
+                "differ in length: names 1, ids 1, mins 0, maxs 1",
+            ),
+            (
+                b'{"type":"actuator_list","robot":"g1","names":["a"],"ids":[3.5],"mins":[0],"maxs":[1]}',
+                "actuator id 3.5 is no 32-bit integer",
+            ),
+            (
+                b'{"type":"actuator_list","robot":"g1","names":["a"],"ids":[3e9],"mins":[0],"maxs":[1]}',
+                "is no 32-bit integer",
+            ),
+        ],
+    )
+    def test_refused(self, frame: bytes, problem: str) -> None:
+        with pytest.raises(ProtocolError, match=problem):
+            ActuatorInfo.decode(frame)
+
+
+sizes = st.tuples(st.integers(1, 9), st.integers(1, 9))
+
+
+def header(version: int, width: int, height: int, magic: int = 0x314D4355) -> bytes:
+    if version == 1:
+        return struct.pack("<IIQdII", magic, version, 7, 1.5, width, height)
+    return struct.pack("<IIQdIId", magic, version, 7, 1.5, width, height, 99.25)
+
+
+class TestCamera:
+    @given(st.data(), sizes, st.sampled_from(["real", "semantic", "instance", "thermal"]), st.booleans())
+    def test_colour_round_trip(self, data: st.DataObject, size: tuple[int, int], mode: str, reuse: bool) -> None:
+        width, height = size
+        pixels = data.draw(hnp.arrays(np.uint8, (height, width, 4)))
+        out = np.empty_like(pixels) if reuse else None
+        payload = rows.encode_camera(pixels, mode)
+        decoded = rows.decode_camera(payload, mode, width, height, out=out).pixels
+        expected = pixels.copy()
+        if mode == "real":
+            expected[..., 3] = 255
+        assert same(decoded, expected)
+        assert out is None or decoded is out
+
+    @given(st.data(), sizes, st.booleans())
+    def test_depth_is_centimetres_on_the_wire_and_metres_here(
+        self, data: st.DataObject, size: tuple[int, int], reuse: bool
+    ) -> None:
+        width, height = size
+        centimetres = data.draw(hnp.arrays(np.float32, (height, width), elements=float32))
+        out = np.empty_like(centimetres) if reuse else None
+        metres = rows.decode_camera(centimetres.tobytes(), CameraMode.DEPTH, width, height, out=out).pixels
+        assert metres.dtype == np.float32
+        np.testing.assert_array_equal(metres, centimetres / np.float32(100))
+        assert out is None or metres is out
+
+    def test_depth_sent(self) -> None:
+        metres = np.array([[0.5, 2.25], [np.inf, 3e38]], np.float32)
+        assert np.frombuffer(rows.encode_camera(metres, "depth"), "<f4").tolist() == [50, 225, math.inf, math.inf]
+
+    def test_depth_with_signalling_nan(self) -> None:
+        frame = rows.decode_camera(b"\x01\x00\xa0\x7f", "depth", 1, 1)
+        assert np.isnan(frame.pixels).all()
+
+    def test_rgb_from_a_renderer(self) -> None:
+        rgb = np.array([[[1, 2, 3], [4, 5, 6]]], np.uint8)
+        assert rows.encode_camera(rgb, CameraMode.REAL) == bytes([3, 2, 1, 255, 6, 5, 4, 255])
+        assert rows.encode_camera(rgb[:, ::-1], CameraMode.REAL) == bytes([6, 5, 4, 255, 3, 2, 1, 255])
+
+    @pytest.mark.parametrize("mode", ["real", "semantic", "depth"])
+    def test_pixels_are_the_callers_own(self, mode: str) -> None:
+        buffer = bytearray(b"\x40" * 16)
+        pixels = rows.decode_camera(buffer, mode, 2, 2).pixels
+        before = pixels.copy()
+        buffer[:] = bytes(16)
+        assert same(pixels, before)
+        pixels[:] = 0
+
+    @pytest.mark.parametrize("mode", ["real", "semantic", "depth"])
+    def test_slot_at_an_odd_address(self, mode: str) -> None:
+        payload = bytes(range(64, 80))
+        decoded = rows.decode_camera(memoryview(b"?" + payload)[1:], mode, 2, 2).pixels
+        assert same(decoded, rows.decode_camera(payload, mode, 2, 2).pixels)
+
+    @pytest.mark.parametrize("size", [0, 15, 17, 24, 47, 49, 64])
+    def test_wrong_size_is_never_reshaped(self, size: int) -> None:
+        with pytest.raises(ProtocolError, match=rf"'arm/camera/wrist ': {size} bytes, expected 16 \(2x2 pixels"):
+            rows.decode_camera(bytes(size), "real", 2, 2, where=Topic(TopicKind.CAMERA, "arm", "wrist"))
+
+    def test_header_says_when(self) -> None:
+        frame = rows.decode_camera(header(2, 2, 2) + bytes(16), "semantic", 2, 2)
+        assert (frame.frame_id, frame.sim_time, frame.capture_time) == (7, 1.5, 99.25)
+        frame = rows.decode_camera(header(1, 2, 2) + bytes(16), "semantic", 2, 2)
+        assert (frame.frame_id, frame.sim_time, frame.capture_time) == (7, 1.5, None)
+
+    def test_pixels_cannot_imitate_a_header(self) -> None:
+        payload = header(1, 2, 2).ljust(2 * 8 * 4, b"\xee")
+        frame = rows.decode_camera(payload, "semantic", 8, 2)
+        assert frame.frame_id is None
+        assert frame.pixels.tobytes() == payload
+
+    @pytest.mark.parametrize("payload", [header(1, 2, 2, magic=1), header(3, 2, 2)[:32], header(2, 2, 2)[:32]])
+    def test_a_length_alone_makes_no_header(self, payload: bytes) -> None:
+        with pytest.raises(ProtocolError, match="48 bytes, expected 16"):
+            rows.decode_camera(payload + bytes(16), "real", 2, 2)
+
+    def test_header_of_another_resolution(self) -> None:
+        with pytest.raises(ProtocolError, match="header says 4x1 pixels, the handshake 2x2"):
+            rows.decode_camera(header(1, 4, 1) + bytes(16), "real", 2, 2)
+
+    @pytest.mark.parametrize(
+        "out",
+        [
+            np.empty((2, 2, 3), np.uint8),
+            np.empty((2, 2, 4), np.float32),
+            np.empty((2, 4, 4), np.uint8)[:, ::2],
+        ],
+    )
+    def test_out_must_fit(self, out: np.ndarray) -> None:
+        with pytest.raises(ValueError, match=r"expected C-contiguous uint8 \(2, 2, 4\)"):
+            rows.decode_camera(bytes(16), "real", 2, 2, out=out)
+
+    @pytest.mark.parametrize(
+        ("pixels", "mode", "problem"),
+        [
+            (np.zeros((2, 2), np.uint8), "real", r"expected uint8 \(H, W, 3\) or \(H, W, 4\)"),
+            (np.zeros((2, 2, 3), np.uint8), "semantic", r"expected uint8 \(H, W, 4\)"),
+            (np.zeros((2, 2, 4), np.float32), "real", "expected uint8"),
+            (np.zeros((2, 2, 1), np.float32), "depth", r"expected float32 \(H, W\)"),
+            (np.zeros((2, 2), np.float64), "depth", "expected float32"),
+        ],
+    )
+    def test_encode_refuses(self, pixels: np.ndarray, mode: str, problem: str) -> None:
+        with pytest.raises(ValueError, match=problem):
+            rows.encode_camera(pixels, mode)
+
+
+decoders = {
+    "joint": JointRow.decode,
+    "base": BaseStateRow.decode,
+    "sensor": SensorRow.decode,
+    "twist": TwistRow.decode,
+    "actions": ActionsRow.decode,
+    "control": ControlPayload.decode,
+    "gains": rows.decode_gains,
+    "info": ActuatorInfo.decode,
+    "camera": lambda payload: rows.decode_camera(payload, "real", 2, 2),
+}
+
+
+@pytest.mark.parametrize("decode", decoders.values(), ids=decoders)
+@given(payload=st.binary(max_size=80))
+def test_any_bytes_are_read_or_refused(decode, payload: bytes) -> None:
+    with contextlib.suppress(ProtocolError):
+        decode(payload)
