@@ -283,8 +283,8 @@ class Region:
         return self._bytes[start : start + size]
 
     def _is_torn(self, sequence: int) -> bool:
-        # What was read belongs to publication `sequence` or the one after. The writer overwrites the slot of
-        # publication p as soon as it has counted p + n_buffers - 1. A decrease is a region started anew.
+        # What was read belongs to publication `sequence` or a later one. The writer begins to overwrite the slot of
+        # publication p once it has counted p + n_buffers - 1. A decrease is a region started anew.
         self._fence()
         return not 0 <= self._sequence[0] - sequence <= self.n_buffers - 2
 

@@ -1,0 +1,196 @@
+"""Names: look-up by name or alias, and which articulation a compiled name belongs to. No I/O.
+
+For the wrappers of both clients, whose maps of articulations, joints and so on are `NameMap`s.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
+from typing import Any, NoReturn, TypeVar, cast, overload
+
+__all__ = ["NameMap", "UnknownName", "owner_of", "split_prefix"]
+
+T = TypeVar("T")
+U = TypeVar("U")
+D = TypeVar("D")
+
+_LISTED = 20
+
+
+class UnknownName(KeyError):
+    """A name that a `NameMap` does not have, or an alias of several of its entries.
+
+    Attributes:
+        kind: What was looked for, for example `articulation`.
+        name: The name that was asked for.
+        matches: The keys an ambiguous alias could mean; empty otherwise.
+        known: All keys, in the map's order.
+        suggestions: Keys and aliases spelled alike, best first.
+    """
+
+    kind: str
+    name: object
+    matches: tuple[str, ...]
+    known: tuple[str, ...]
+    suggestions: tuple[str, ...]
+
+    def __init__(
+        self,
+        kind: str,
+        name: object,
+        matches: tuple[str, ...],
+        known: tuple[str, ...],
+        suggestions: tuple[str, ...],
+    ) -> None:
+        super().__init__(kind, name, matches, known, suggestions)
+        self.kind = kind
+        self.name = name
+        self.matches = matches
+        self.known = known
+        self.suggestions = suggestions
+
+    def __str__(self) -> str:
+        if self.matches:
+            return f"{self.kind} {self.name!r} is ambiguous: it could mean {_listed(self.matches, 'or')}."
+        text = f"no {self.kind} {self.name!r}."
+        if self.suggestions:
+            text += f" Did you mean {_listed(self.suggestions, 'or')}?"
+        return f"{text} Known: {_listed(self.known, 'and')}." if self.known else f"{text} There are none."
+
+
+def _listed(names: Sequence[str], conjunction: str) -> str:
+    shown = [repr(name) for name in names[:_LISTED]]
+    if len(names) > _LISTED:
+        return f"{', '.join(shown)} {conjunction} {len(names) - _LISTED} more"
+    return f" {conjunction} ".join([", ".join(shown[:-1]), shown[-1]]) if len(shown) > 1 else shown[0]
+
+
+class NameMap(dict[str, T]):
+    """A read-only dict of named things that also finds an entry by an alias, where the alias means one entry only.
+
+    `map[name]`, `map.get(name)` and `name in map` agree: an exact key first, else an alias. Length, iteration, `keys`,
+    `items` and comparison are those of a dict and know exact keys only. `copy()`, `|` and `dict(map)` make plain
+    dicts, which can be changed.
+
+    Args:
+        items: The entries by exact key.
+        aliases: Per alias the keys it stands for, for example a MJCF model name and its instances.
+        kind: What the entries are, for messages.
+
+    Raises:
+        ValueError: If an alias stands for a key that is not there.
+    """
+
+    kind: str
+    """What the entries are."""
+
+    def __init__(
+        self,
+        items: Mapping[str, T] | Iterable[tuple[str, T]] = (),
+        aliases: Mapping[str, Sequence[str]] | None = None,
+        kind: str = "entry",
+    ) -> None:
+        super().__init__(items)
+        self.kind = kind
+        self._aliases: dict[str, tuple[str, ...]] = {}
+        self._mapped: dict[Callable[[Any], Any], NameMap[Any]] = {}
+        for alias, keys in (aliases or {}).items():
+            for key in keys:
+                if not super().__contains__(key):
+                    raise ValueError(f"alias {alias!r} stands for {key!r}, which is no {kind} here")
+            if keys and not super().__contains__(alias):
+                self._aliases[alias] = tuple(dict.fromkeys(keys))
+
+    @property
+    def aliases(self) -> dict[str, tuple[str, ...]]:
+        """The keys that each alias stands for; aliases that are also keys are left out."""
+        return dict(self._aliases)
+
+    def _key(self, name: object) -> str | None:
+        """Return the key that `name` or its alias means, None when there is none or more than one."""
+        if super().__contains__(name):
+            return cast("str", name)
+        match self._aliases.get(cast("str", name)):
+            case (key,):
+                return key
+            case _:
+                return None
+
+    def __missing__(self, name: str) -> T:
+        key = self._key(name)
+        if key is None:
+            raise self._unknown(name)
+        return super().__getitem__(key)
+
+    def __contains__(self, name: object) -> bool:
+        return self._key(name) is not None
+
+    @overload
+    def get(self, key: str, default: None = None, /) -> T | None: ...
+    @overload
+    def get(self, key: str, default: T, /) -> T: ...
+    @overload
+    def get(self, key: str, default: D, /) -> T | D: ...
+    def get(self, key: str, default: Any = None, /) -> Any:
+        """Return the entry that `key` or its alias means, else `default`."""
+        found = self._key(key)
+        return default if found is None else super().__getitem__(found)
+
+    def mapped(self, fn: Callable[[T], U]) -> NameMap[U]:
+        """Return a map of `fn(value)` under the same keys and aliases.
+
+        The result is made once per function and lives, with `fn`, as long as this map: pass the same function each
+        time, and none that owns something to be collected earlier.
+        """
+        known = self._mapped.get(fn)
+        if known is None:
+            fresh = NameMap({key: fn(value) for key, value in self.items()}, self._aliases, self.kind)
+            known = self._mapped.setdefault(fn, fresh)
+        return known
+
+    def _unknown(self, name: object) -> UnknownName:
+        known = tuple(self)
+        matches = self._aliases.get(cast("str", name), ())
+        unique = [alias for alias, keys in self._aliases.items() if len(keys) == 1]
+        suggestions = difflib.get_close_matches(name, [*known, *unique]) if isinstance(name, str) else []
+        return UnknownName(self.kind, name, matches, known, tuple(suggestions))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return NameMap, (dict(self), self._aliases, self.kind)
+
+    def _refuse(self, *args: Any, **kwargs: Any) -> NoReturn:
+        raise TypeError(f"this map of {self.kind} names is read-only; dict(map) makes a copy to change")
+
+    # Any call is refused, so the parameters of the overridden methods do not matter.
+    __setitem__ = __delitem__ = __ior__ = update = setdefault = pop = popitem = clear = _refuse  # pyright: ignore[reportAssignmentType, reportIncompatibleMethodOverride]
+
+
+def owner_of(name: str, prefixes: AbstractSet[str]) -> str | None:
+    """Return the prefix that a compiled name `<prefix>_<local name>` carries, None when it carries none.
+
+    The longest wins: `robot_2_elbow` belongs to `robot_2`, not to `robot`, when both exist. Only names are compared;
+    a name that an unprefixed body happens to share with a prefix cannot be told apart here.
+    """
+    end = name.rfind("_", 0, len(name) - 1)
+    while end > 0:
+        if name[:end] in prefixes:
+            return name[:end]
+        end = name.rfind("_", 0, end)
+    return None
+
+
+def split_prefix(names: Iterable[str], prefixes: Collection[str]) -> list[tuple[str | None, str]]:
+    """Split compiled names into owner and local name, as `owner_of` does for one.
+
+    Args:
+        names: Compiled names.
+        prefixes: Articulation keys, without the trailing underscore.
+
+    Returns:
+        Per name, in order, the prefix and what follows its underscore; `(None, name)` for a name that carries none.
+    """
+    known = frozenset(prefixes)
+    owned = ((owner_of(name, known), name) for name in names)
+    return [(owner, name if owner is None else name[len(owner) + 1 :]) for owner, name in owned]
