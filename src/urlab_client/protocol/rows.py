@@ -124,13 +124,14 @@ _SCENE_KINDS: Mapping[str, TopicKind] = {kind.value: kind for kind in _SCENE_SIZ
 class Topic(Struct, frozen=True):
     """Address of a message on the publish/subscribe sockets.
 
-    An articulation may itself be called `scene`; `scene/<name>/xpos` (or `xquat`, `qpos`, `qvel`) is always read as
-    a scene row.
+    An articulation may itself be called `scene`; a topic that reads as `scene/<entity>/xpos` (or `xquat`, `qpos`,
+    `qvel`) is always a scene row.
 
     Attributes:
         kind: What the message carries.
         owner: Articulation key, or the entity of a scene row; empty for `state/full`.
-        name: Component name for joint, base state, sensor and camera topics, else empty.
+        name: Component name for joint, base state, sensor and camera topics, else empty. Here, as in the name of an
+            entity, `/` is part of the name: models made of attached parts have such names.
     """
 
     kind: TopicKind
@@ -149,13 +150,17 @@ class Topic(Struct, frozen=True):
         """Return the topic frame, with the trailing space that control, gains and camera topics carry.
 
         Raises:
-            ValueError: If a name is missing, superfluous, contains `/` or ends in a space.
+            ValueError: If a name is missing, superfluous or ends in a space, or an articulation key contains `/`.
         """
         if bool(self.owner) == (self.kind is TopicKind.STATE_FULL):
             raise ValueError(f"a {self.kind} topic needs {'no owner' if self.owner else 'an owner'}")
         if bool(self.name) != (self.kind in _OF_COMPONENT):
             raise ValueError(f"a {self.kind} topic needs {'no name' if self.name else 'a component name'}")
-        _check_names(self.owner, self.name)
+        if self.kind not in _SCENE_SIZES:
+            _check_key(self.owner)
+        for name in (self.owner, self.name):
+            if name.endswith(" "):
+                raise ValueError(f"{name!r} cannot stand in a topic: it ends in a space")
         return str(self).encode()
 
     @staticmethod
@@ -168,10 +173,9 @@ class Topic(Struct, frozen=True):
         return _parse_topic(bytes(frame))
 
 
-def _check_names(*names: str) -> None:
-    for name in names:
-        if "/" in name or name.endswith(" "):
-            raise ValueError(f"{name!r} cannot stand in a topic: it contains '/' or ends in a space")
+def _check_key(key: str) -> None:
+    if "/" in key:
+        raise ValueError(f"articulation key {key!r} cannot stand in a topic: it contains '/'")
 
 
 # A stream repeats a few hundred topics for ever.
@@ -196,9 +200,11 @@ def _parse_topic(frame: bytes) -> Topic:
 
 
 def _split_topic(text: str) -> Topic | None:
-    match text.split("/"):
-        case ["scene", entity, quantity] if entity and quantity in _SCENE_KINDS:
-            return Topic(_SCENE_KINDS[quantity], entity)
+    head, _, quantity = text.rpartition("/")
+    entity = head.removeprefix(f"{_SCENE}/")
+    if quantity in _SCENE_KINDS and entity and entity != head:
+        return Topic(_SCENE_KINDS[quantity], entity)
+    match text.split("/", 2):
         case [owner, kind] if owner and kind in _ARTICULATION_KINDS:
             return Topic(_ARTICULATION_KINDS[kind], owner)
         case [owner, kind, name] if owner and name and kind in _COMPONENT_KINDS:
@@ -216,9 +222,9 @@ def articulation_filter(key: str, kind: TopicKind | None = None) -> bytes:
     Raises:
         ValueError: If `key` cannot stand in a topic, or `kind` is not one that belongs to an articulation.
     """
-    _check_names(key)
+    _check_key(key)
     if not key:
-        raise ValueError("an articulation's key is not empty")
+        raise ValueError("an articulation key is never empty")
     if kind is None:
         return f"{key}/".encode()
     if kind in _OF_COMPONENT:
@@ -229,12 +235,7 @@ def articulation_filter(key: str, kind: TopicKind | None = None) -> bytes:
 
 
 def scene_filter(entity: str = "") -> bytes:
-    """Return the subscription for the scene rows of one entity, or of all.
-
-    Raises:
-        ValueError: If `entity` cannot stand in a topic.
-    """
-    _check_names(entity)
+    """Return the subscription for the scene rows of one entity, or of all."""
     return f"{_SCENE}/{entity}/".encode() if entity else f"{_SCENE}/".encode()
 
 
@@ -329,8 +330,9 @@ class BaseStateRow(Struct, frozen=True, eq=False):
     @classmethod
     def from_free_joint(cls, qpos: NDArray[np.float64], qvel: NDArray[np.float64]) -> BaseStateRow:
         """Make the row from the free joint's `qpos`, shape (7,) with quaternion (w, x, y, z), and `qvel`, (6,)."""
-        pose, velocity = _vector("qpos", _floats32(qpos), 7), _vector("qvel", _floats32(qvel), 6)
-        return cls(pose[:3].copy(), pose[[4, 5, 6, 3]], velocity[:3].copy(), velocity[3:].copy())
+        pose, velocity = _vector("qpos", np.asarray(qpos), 7), _vector("qvel", np.asarray(qvel), 6)
+        values = _floats32(np.concatenate((pose[:3], pose[4:], pose[3:4], velocity)))
+        return cls(values[:3], values[3:7], values[7:10], values[10:])
 
     @classmethod
     def decode(cls, payload: BytesLike, where: object = "") -> BaseStateRow:
@@ -342,12 +344,12 @@ class BaseStateRow(Struct, frozen=True, eq=False):
     def encode(self) -> bytes:
         """Return the 52 bytes of the row."""
         parts = (
-            _vector("position", _floats32(self.position), 3),
-            _vector("quat_xyzw", _floats32(self.quat_xyzw), 4),
-            _vector("linear_velocity", _floats32(self.linear_velocity), 3),
-            _vector("angular_velocity", _floats32(self.angular_velocity), 3),
+            _vector("position", np.asarray(self.position), 3),
+            _vector("quat_xyzw", np.asarray(self.quat_xyzw), 4),
+            _vector("linear_velocity", np.asarray(self.linear_velocity), 3),
+            _vector("angular_velocity", np.asarray(self.angular_velocity), 3),
         )
-        return b"".join(part.tobytes() for part in parts)
+        return _floats32(np.concatenate(parts)).tobytes()
 
 
 class SensorRow(Struct, frozen=True, eq=False):
