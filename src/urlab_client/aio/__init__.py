@@ -1,0 +1,22 @@
+"""The async core: `URLabClient` and everything it hands out."""
+
+from urlab_client.aio.articulation import URLabArticulation, URLabEntity
+from urlab_client.aio.cameras import URLabCameraView
+from urlab_client.aio.client import URLabClient
+from urlab_client.aio.controllers import URLabController, URLabPDController
+from urlab_client.aio.deadline import DEFAULT
+from urlab_client.aio.handles import Actuator, Body, Joint, Sensor
+
+__all__ = [
+    "DEFAULT",
+    "Actuator",
+    "Body",
+    "Joint",
+    "Sensor",
+    "URLabArticulation",
+    "URLabCameraView",
+    "URLabClient",
+    "URLabController",
+    "URLabEntity",
+    "URLabPDController",
+]

@@ -23,6 +23,7 @@ __all__ = [
     "Floats",
     "Needs",
     "Op",
+    "Quat",
     "QuatWXYZ",
     "QuatXYZW",
     "Reply",

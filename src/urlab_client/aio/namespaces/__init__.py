@@ -1,0 +1,1 @@
+"""The groups of ops on the client: `client.scene`, `client.sim`, …"""

@@ -1,0 +1,364 @@
+"""Dynamic bodies of the scene: plain entities, and articulations with joints, actuators and sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from urlab_client.aio.cameras import URLabCameraView
+from urlab_client.aio.controllers import URLabController, make_controller
+from urlab_client.aio.handles import Actuator, Body, Handles, Joint, Sensor, make_handles
+from urlab_client.aio.layout import ArticulationLayout
+from urlab_client.aio.records import ArticulationRecord, EntityRecord
+from urlab_client.aio.rotation import rotate, rotate_inverse
+from urlab_client.aio.session import Session
+from urlab_client.protocol.base import Floats
+from urlab_client.protocol.enums import ControlMode
+from urlab_client.protocol.errors import URLabError
+from urlab_client.protocol.messages.session import ControllerInfo
+from urlab_client.protocol.names import NameMap
+
+__all__ = ["URLabArticulation", "URLabEntity"]
+
+_DOWN = np.array([0.0, 0.0, -1.0])
+
+
+class URLabEntity:
+    """A dynamic body, or the root of an articulation.
+
+    State is that of the last reply. Arrays are fresh copies, yours to keep. Read from a thread other than the one
+    that steps, several values belong together only under `client._data_lock`.
+    """
+
+    def __init__(self, record: EntityRecord) -> None:
+        self._record = record
+
+    @property
+    def name(self) -> str:
+        """Key in `client.entities`."""
+        return self._record.name
+
+    @property
+    def body_id(self) -> int:
+        """Global MuJoCo id of the (root) body; -1 for an articulation without a local model."""
+        return self._record.body_id
+
+    @property
+    def has_free_base(self) -> bool:
+        """True when the (root) body has a free joint; False for an articulation without a local model."""
+        return self._record.has_free_base
+
+    @property
+    def free_joint(self) -> str | None:
+        """Compiled name of the free joint, or None."""
+        return self._record.free_joint
+
+    @property
+    def qpos_offset(self) -> int | None:
+        """Start of the 7 free-joint positions in `client.data.qpos`, or None without a free joint."""
+        return self._record.qpos_offset
+
+    @property
+    def qvel_offset(self) -> int | None:
+        """Start of the 6 free-joint velocities in `client.data.qvel`, or None without a free joint."""
+        return self._record.qvel_offset
+
+    @property
+    def root_pos_w(self) -> Floats:
+        """Position of the body frame's origin, shape (3,), metres, world frame."""
+        return self._pose()[0]
+
+    @property
+    def root_quat_w(self) -> Floats:
+        """Orientation (w, x, y, z), shape (4,), world frame."""
+        return self._pose()[1]
+
+    @property
+    def root_quat_xyzw(self) -> Floats:
+        """Orientation (x, y, z, w) as SciPy and ROS order it, shape (4,), world frame."""
+        return np.roll(self.root_quat_w, -1)
+
+    @property
+    def root_lin_vel_w(self) -> Floats:
+        """Velocity of the body frame's origin, shape (3,), m/s, world frame."""
+        with self._record.mirror.lock:
+            qvel = self._record.root_qvel()
+            return qvel[:3] if qvel is not None else self._derived_velocity()[3:]
+
+    @property
+    def root_lin_vel_b(self) -> Floats:
+        """Velocity of the body frame's origin, shape (3,), m/s, body frame."""
+        with self._record.mirror.lock:
+            return rotate_inverse(self.root_quat_w, self.root_lin_vel_w)
+
+    @property
+    def projected_gravity_b(self) -> Floats:
+        """Unit vector of gravity's direction, shape (3,), body frame; (0, 0, -1) when upright."""
+        with self._record.mirror.lock:
+            model = self._record.mirror.model
+            gravity = _DOWN if model is None else model.opt.gravity
+            strength = float(np.linalg.norm(gravity))
+            return rotate_inverse(self.root_quat_w, gravity / strength if strength > 0 else _DOWN)
+
+    def apply_xfrc(self, *, force: Sequence[float] = (0, 0, 0), torque: Sequence[float] = (0, 0, 0)) -> None:
+        """Buffer a wrench at the body's centre of mass for the next `step()`, which clears it.
+
+        Inert in puppet mode, and in live mode, where the server ignores wrenches.
+
+        Args:
+            force: (fx, fy, fz), N, world frame.
+            torque: (tx, ty, tz), N m, world frame.
+
+        Raises:
+            ValueError: A vector does not have three components.
+        """
+        self._record.wrenches[self._record.name] = _wrench(force, torque)
+
+    def _pose(self) -> tuple[Floats, Floats]:
+        record = self._record
+        with record.mirror.lock:
+            qpos = record.root_qpos()
+            if qpos is not None:
+                return qpos[:3], qpos[3:7]
+            if record.pose is not None:
+                return np.array(record.pose.xpos), np.array(record.pose.xquat)
+            pair = record.mirror.derived()
+            if pair is None:
+                raise self._needs_model("pose", "positions")
+            return pair[1].xpos[record.body_id].copy(), pair[1].xquat[record.body_id].copy()
+
+    def _derived_velocity(self) -> Floats:
+        velocity = self._record.mirror.body_velocity(self._record.body_id)
+        if velocity is None:
+            raise self._needs_model("velocity", "velocities")
+        return velocity
+
+    def _needs_model(self, what: str, source: str) -> URLabError:
+        return URLabError(
+            f"The {what} of {self.name!r} follows from joint {source}, which needs a local model.",
+            hint="Make the client with local_model=True and call discover() during play.",
+        )
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.name!r}>"
+
+
+class URLabArticulation(URLabEntity):
+    """A robot imported from MJCF.
+
+    Dictionaries are keyed by short names, without the articulation's prefix; compiled names and original MJCF names
+    are found, too. Without a local model only actuators and cameras are known.
+    """
+
+    _record: ArticulationRecord
+
+    def __init__(self, record: ArticulationRecord, session: Session) -> None:
+        super().__init__(record)
+        self._session = session
+        self._controller: tuple[ControllerInfo, URLabController] | None = None
+        self._handles: tuple[ArticulationLayout, Handles] | None = None
+        self._cameras: NameMap[URLabCameraView] = NameMap()
+
+    @property
+    def prefix(self) -> str:
+        """Articulation key: what its compiled names start with, before an underscore."""
+        return self._record.name
+
+    @property
+    def actor_id(self) -> str:
+        """Stable id given when it was spawned; empty if none."""
+        return self._record.info.actor_id
+
+    @property
+    def actuators(self) -> NameMap[Actuator]:
+        """Actuators in id order."""
+        return self._made().actuators
+
+    @property
+    def joints(self) -> NameMap[Joint]:
+        """Joints in id order."""
+        return self._made().joints
+
+    @property
+    def sensors(self) -> NameMap[Sensor]:
+        """Sensors in id order."""
+        return self._made().sensors
+
+    @property
+    def bodies(self) -> NameMap[Body]:
+        """Bodies in id order."""
+        return self._made().bodies
+
+    @property
+    def cameras(self) -> NameMap[URLabCameraView]:
+        """Cameras by name."""
+        topics = self._record.info.camera_topics
+        if any(name not in self._cameras or self._cameras[name].info is not info for name, info in topics.items()):
+            views = {name: self._cameras.get(name) or URLabCameraView(name, info) for name, info in topics.items()}
+            for name, info in topics.items():
+                views[name].info = info
+            self._cameras = NameMap(views, kind=f"camera of {self.prefix}")
+        return self._cameras
+
+    @property
+    def controller(self) -> URLabController | None:
+        """The controller, or None for an articulation whose set-points go straight to its actuators."""
+        info = self._record.controller
+        if info is None:
+            return None
+        if self._controller is None or self._controller[0] is not info:
+            self._controller = info, make_controller(self._session, self.prefix, info)
+        return self._controller[1]
+
+    @property
+    def control_mode(self) -> ControlMode:
+        """Whether the controller turns set-points into actuator signals. May be assigned before `step()`.
+
+        Raises:
+            ValueError: On assigning anything but `ue_controller` or `raw`.
+        """
+        return self._record.control_mode
+
+    @control_mode.setter
+    def control_mode(self, mode: ControlMode | str) -> None:
+        self._record.control_mode = ControlMode(mode)
+
+    @property
+    def ctrl_array(self) -> Floats:
+        """Set-points that the next step sends, shape (n_actuators,). A live view: write to it in place."""
+        return self._record.ctrl
+
+    @ctrl_array.setter
+    def ctrl_array(self, values: Sequence[float] | Floats) -> None:
+        self._record.ctrl[:] = values
+
+    @property
+    def last_applied_ctrl(self) -> Floats:
+        """`mjData.ctrl` as the server applied it last, after any controller, shape (n_actuators,)."""
+        return self._record.applied
+
+    @property
+    def act_array(self) -> Floats:
+        """Activation per actuator, shape (n_actuators,); 0 for stateless ones."""
+        return self._record.act
+
+    @property
+    def qpos_array(self) -> Floats:
+        """Joint positions, shape (nq,), in joint order: radians, metres, quaternions (w, x, y, z)."""
+        return self._record.qpos
+
+    @property
+    def qvel_array(self) -> Floats:
+        """Joint velocities, shape (nv,), in joint order: rad/s, m/s; of a free base linear world, angular body."""
+        return self._record.qvel
+
+    @property
+    def dof_qpos(self) -> Floats:
+        """Joint positions without the free base, shape (nq,) or (nq - 7,)."""
+        return self._record.qpos[7:] if self.has_free_base else self._record.qpos
+
+    @property
+    def dof_qvel(self) -> Floats:
+        """Joint velocities without the free base, shape (nv,) or (nv - 6,)."""
+        return self._record.qvel[6:] if self.has_free_base else self._record.qvel
+
+    @property
+    def twist_linear(self) -> Floats:
+        """Commanded linear velocity, shape (3,), m/s, base frame (ROS Twist)."""
+        twist = self._record.twist
+        return np.zeros(3) if twist is None else np.array(twist.linear)
+
+    @property
+    def twist_angular(self) -> Floats:
+        """Commanded angular velocity, shape (3,), rad/s, base frame (ROS Twist)."""
+        twist = self._record.twist
+        return np.zeros(3) if twist is None else np.array(twist.angular)
+
+    @property
+    def root_ang_vel_w(self) -> Floats:
+        """Angular velocity of the root, shape (3,), rad/s, world frame."""
+        with self._record.mirror.lock:
+            qvel = self._record.root_qvel()
+            return rotate(self.root_quat_w, qvel[3:6]) if qvel is not None else self._derived_velocity()[:3]
+
+    @property
+    def root_ang_vel_b(self) -> Floats:
+        """Angular velocity of the root, shape (3,), rad/s, body frame (as MuJoCo stores it)."""
+        with self._record.mirror.lock:
+            qvel = self._record.root_qvel()
+            return qvel[3:6] if qvel is not None else rotate_inverse(self.root_quat_w, self.root_ang_vel_w)
+
+    def set_ctrl(self, values: Mapping[str, float]) -> None:
+        """Set some set-points by actuator name; the others keep their last value.
+
+        Args:
+            values: Actuator name to set-point.
+
+        Raises:
+            KeyError: A name is unknown; nothing was set.
+        """
+        writes = [(self.actuators[name], value) for name, value in values.items()]
+        for actuator, value in writes:
+            actuator.set_control(value)
+
+    def get_ctrl(self) -> dict[str, float]:
+        """Return the set-points that the next step sends, by actuator name."""
+        return {name: actuator.value for name, actuator in self.actuators.items()}
+
+    def get_qpos(self) -> dict[str, float]:
+        """Return the first component of each joint's position, by joint name."""
+        values = self._record.qpos.tolist()
+        return {name: values[joint.qpos_local_offset] for name, joint in self.joints.items()}
+
+    def get_sensors(self) -> dict[str, Floats]:
+        """Return the last readings by sensor name, each a fresh array of shape (dim,)."""
+        return {name: np.asarray(reading) for name, reading in self._record.sensors.items()}
+
+    def resolve_joint(self, name: str) -> str | None:
+        """Return the live key of a joint given its live, compiled or original MJCF name, or None."""
+        joint = self.joints.get(name)
+        return None if joint is None else joint.name
+
+    def resolve_actuator(self, name: str) -> str | None:
+        """Return the live key of an actuator given its live, compiled or original MJCF name, or None."""
+        actuator = self.actuators.get(name)
+        return None if actuator is None else actuator.name
+
+    def apply_xfrc(
+        self, body: str = "", *, force: Sequence[float] = (0, 0, 0), torque: Sequence[float] = (0, 0, 0)
+    ) -> None:
+        """Buffer a wrench on one of its bodies for the next `step()`, which clears it.
+
+        It acts at the body's centre of mass during all sub-steps. Inert in puppet mode, and in live mode, where the
+        server ignores wrenches.
+
+        Args:
+            body: Short body name; the root body if empty.
+            force: (fx, fy, fz), N, world frame.
+            torque: (tx, ty, tz), N m, world frame.
+
+        Raises:
+            KeyError: The articulation has no such body.
+            ValueError: A vector does not have three components, or the body must be named.
+        """
+        bodies = self.bodies
+        if body and bodies:
+            body = bodies[body].name
+        elif not body:
+            body = next((name for name, handle in bodies.items() if handle.id == self.body_id), "")
+        if not body:
+            raise ValueError(f"{self.prefix}: name the body: without a local model its root is not known")
+        self._record.wrenches[body] = _wrench(force, torque)
+
+    def _made(self) -> Handles:
+        layout = self._record.layout
+        if self._handles is None or self._handles[0] is not layout:
+            self._handles = layout, make_handles(self._record)
+        return self._handles[1]
+
+
+def _wrench(force: Sequence[float], torque: Sequence[float]) -> list[float]:
+    if len(force) != 3 or len(torque) != 3:
+        raise ValueError(f"force and torque need three components each, got {len(force)} and {len(torque)}")
+    return [float(v) for v in (*force, *torque)]

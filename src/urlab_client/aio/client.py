@@ -1,0 +1,496 @@
+"""The typed client of a URLab server, for asyncio programs."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Mapping
+from threading import RLock
+from types import TracebackType
+from typing import TYPE_CHECKING, Self, TypeVar
+
+from urlab_client.aio.articulation import URLabArticulation, URLabEntity
+from urlab_client.aio.cameras import URLabCameraView
+from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.launch import SCHEME, LaunchedTransport
+from urlab_client.aio.mirror import model_names
+from urlab_client.aio.namespaces.debug import DebugNamespace
+from urlab_client.aio.namespaces.outliner import OutlinerNamespace
+from urlab_client.aio.namespaces.recording import RecordingNamespace, ReplayNamespace
+from urlab_client.aio.namespaces.runtime import RuntimeNamespace
+from urlab_client.aio.namespaces.scene import SceneNamespace
+from urlab_client.aio.namespaces.sim import SimNamespace
+from urlab_client.aio.namespaces.viewport import ViewportNamespace
+from urlab_client.aio.session import Session
+from urlab_client.aio.state import SimState
+from urlab_client.aio.transport.base import Transport as TransportProtocol
+from urlab_client.aio.transport.base import TransportStats
+from urlab_client.aio.transport.zmq import ZmqTransport
+from urlab_client.protocol.base import Reply, Request
+from urlab_client.protocol.codec import op_of
+from urlab_client.protocol.enums import CameraTiming, ObservationLevel, StepMode, Transport
+from urlab_client.protocol.errors import UnknownKeyframe, URLabError
+from urlab_client.protocol.messages.runtime import SetMode
+from urlab_client.protocol.messages.session import Meta as MetaRequest
+from urlab_client.protocol.messages.session import MetaOk, OpInfo, Reset, ResetOk, Step, StepOk
+from urlab_client.protocol.names import NameMap
+
+if TYPE_CHECKING:
+    import mujoco
+
+__all__ = ["SESSION_LEVEL", "SessionLevel", "URLabClient"]
+
+log = logging.getLogger("urlab_client.client")
+
+R = TypeVar("R", bound=Reply)
+
+_SYNC_CAMERA_S = 3.0  # the server waits up to 2 s + 1 s for each
+_REVERT_S = 1.0
+
+
+class SessionLevel(str):
+    """An observation level that stands for "as chosen in `discover()`"."""
+
+    __slots__ = ()
+
+
+SESSION_LEVEL = SessionLevel("standard")
+"""The level chosen in `discover()`, which is `standard` unless it was told otherwise."""
+
+
+class URLabClient:
+    """A session with one server, for use from one event loop.
+
+    Nothing is sent and nothing is started before the first call. Calls of several tasks go one at a time.
+
+    Args:
+        address: `tcp://host` or `ipc://path`, to which the ports are appended; `tcp://host:port` names the RPC port
+            itself. `sim://MODEL` starts a simulated server of its own in a child process and stops it on close.
+        step_mode: `auto`, `direct`, `puppet` or `live`.
+        step_port: RPC port.
+        state_port: State stream, used in live mode.
+        ctrl_port: Streaming control.
+        info_port: Actuator and camera descriptions.
+        mujoco_version_check: Raise `URLabVersionMismatch` when server and client MuJoCo builds differ; False warns and
+            works with a model compiled here.
+        local_model: Load the handshake's compiled model into `model` and `data`.
+        rcv_timeout_ms: Default deadline of a call in milliseconds; ops that take longer have longer ones.
+        auto_promote_step_mode: Let `discover()` switch the server to `direct` or `puppet` when `step_mode` says so.
+        transport: `zmq`, or `shm` on the same host.
+        shm_dir: Directory of the shared-memory regions, when it is not the one the server names.
+
+    Raises:
+        ValueError: The address or an option is malformed.
+    """
+
+    def __init__(
+        self,
+        address: str = "tcp://localhost",
+        *,
+        step_mode: str | StepMode = "auto",
+        step_port: int = 5559,
+        state_port: int = 5555,
+        ctrl_port: int = 5556,
+        info_port: int = 5557,
+        mujoco_version_check: bool = True,
+        local_model: bool = True,
+        rcv_timeout_ms: int = 5000,
+        auto_promote_step_mode: bool = True,
+        transport: str | Transport = "zmq",
+        shm_dir: str | None = None,
+    ) -> None:
+        if Transport(transport) is Transport.SHM or shm_dir is not None:
+            raise URLabError("Shared memory is not available in this version.", hint="Use transport='zmq'.")
+        if rcv_timeout_ms <= 0:
+            raise ValueError(f"rcv_timeout_ms must be above 0, got {rcv_timeout_ms}")
+        self._address = address
+        self._ports = {"state": state_port, "ctrl": ctrl_port, "info": info_port}
+        self._transport = _transport(address, step_port)
+        self._session = Session(self._transport, default_timeout=rcv_timeout_ms / 1000)
+        self._state = SimState(
+            self._session,
+            wanted_mode=StepMode(step_mode),
+            local_model=local_model,
+            check_version=mujoco_version_check,
+            promote=auto_promote_step_mode,
+        )
+        self._closed = False
+        self._scene = SceneNamespace(self._session)
+        self._sim = SimNamespace(self._session, self._state)
+        self._runtime = RuntimeNamespace(self._session, self._state)
+        self._outliner = OutlinerNamespace(self._session)
+        self._debug = DebugNamespace(self._session)
+        self._viewport = ViewportNamespace(self._session)
+        self._recording = RecordingNamespace(self._session)
+        self._replay = ReplayNamespace(self._session)
+
+    # Namespaces
+
+    @property
+    def scene(self) -> SceneNamespace:
+        """Editor-time authoring."""
+        return self._scene
+
+    @property
+    def sim(self) -> SimNamespace:
+        """Starting and stopping play."""
+        return self._sim
+
+    @property
+    def runtime(self) -> RuntimeNamespace:
+        """Live changes to the running simulation."""
+        return self._runtime
+
+    @property
+    def outliner(self) -> OutlinerNamespace:
+        """Looking at the world."""
+        return self._outliner
+
+    @property
+    def debug(self) -> DebugNamespace:
+        """Debug drawing."""
+        return self._debug
+
+    @property
+    def viewport(self) -> ViewportNamespace:
+        """The editor's perspective viewport."""
+        return self._viewport
+
+    @property
+    def recording(self) -> RecordingNamespace:
+        """Recording joint states."""
+        return self._recording
+
+    @property
+    def replay(self) -> ReplayNamespace:
+        """Playing recordings back."""
+        return self._replay
+
+    # Session state
+
+    @property
+    def address(self) -> str:
+        """The address the client was made with."""
+        return self._address
+
+    @property
+    def connected(self) -> bool:
+        """Whether a server is on the line right now."""
+        return self._transport.connected
+
+    @property
+    def transport_stats(self) -> TransportStats:
+        """Counters of requests, replies and connections."""
+        return self._transport.stats
+
+    @property
+    def session_id(self) -> str:
+        """RPC session id; empty before `discover()`."""
+        return self._session.session_id
+
+    @property
+    def urlab_version(self) -> str:
+        """Version of the server; empty before `discover()`."""
+        return "" if self._state.hello is None else self._state.hello.urlab_version
+
+    @property
+    def mujoco_version(self) -> str:
+        """MuJoCo version of the server; empty before `discover()`."""
+        return "" if self._state.hello is None else self._state.hello.mujoco_version
+
+    @property
+    def manager_present(self) -> bool:
+        """Whether a play session runs, as far as this client knows."""
+        return self._state.hello is not None and self._state.hello.manager_present
+
+    @property
+    def step_mode(self) -> StepMode:
+        """Step mode in force, as far as this client knows."""
+        return self._state.mode
+
+    @property
+    def model(self) -> mujoco.MjModel | None:
+        """The compiled model, or None before play or with local_model=False."""
+        return self._state.mirror.model
+
+    @property
+    def data(self) -> mujoco.MjData | None:
+        """Local state that mirrors the server's after each reply, or None without a model."""
+        return self._state.mirror.data
+
+    @property
+    def model_is_approximate(self) -> bool:
+        """True when the model was compiled here because the server runs another MuJoCo build."""
+        return self._state.mirror.approximate
+
+    @property
+    def articulations(self) -> NameMap[URLabArticulation]:
+        """Articulations by key. An actor id or a class name is found, too, where it means one of them."""
+        return self._state.articulations
+
+    @property
+    def articulations_by_id(self) -> dict[str, URLabArticulation]:
+        """Articulations that have an actor id, by that id."""
+        return self._state.articulations_by_id
+
+    @property
+    def entities(self) -> NameMap[URLabEntity]:
+        """Every dynamic body by name, articulations included."""
+        return self._state.entities
+
+    @property
+    def global_cameras(self) -> NameMap[URLabCameraView]:
+        """Scene-level cameras by name."""
+        return self._state.global_cameras
+
+    @property
+    def step_count(self) -> int:
+        """Steps since `discover()` or `reset()`, as the server counts; constant in live mode."""
+        return self._state.step_count
+
+    @property
+    def sim_time(self) -> float:
+        """Simulation time of the last reply, seconds."""
+        return self._state.sim_time
+
+    @property
+    def sim_time_sec(self) -> int:
+        """Whole seconds of the simulation time."""
+        return self._state.sim_time_sec
+
+    @property
+    def sim_time_nsec(self) -> int:
+        """Nanoseconds within the second of the simulation time."""
+        return self._state.sim_time_nsec
+
+    @property
+    def wall_time_sec(self) -> int:
+        """Whole seconds of the server's UTC clock when the last reply was built."""
+        return self._state.wall_time_sec
+
+    @property
+    def wall_time_nsec(self) -> int:
+        """Nanoseconds within the second of the server's UTC clock when the last reply was built."""
+        return self._state.wall_time_nsec
+
+    @property
+    def recv_wall_time_ns(self) -> int:
+        """This machine's UTC clock when the last reply arrived, nanoseconds."""
+        return self._state.recv_wall_time_ns
+
+    @property
+    def _data_lock(self) -> RLock:
+        """Reentrant lock to hold while reading state from a thread other than the one that steps."""
+        return self._state.mirror.lock
+
+    # Operations
+
+    async def discover(self, observations: str | ObservationLevel = "standard", *, timeout: Timeout = DEFAULT) -> None:
+        """Open a session, load the model, and build the wrappers of articulations, entities and cameras.
+
+        Safe to repeat: wrappers that still exist go on working. Takes the server over from any other client.
+
+        Args:
+            observations: `minimal` (qpos, qvel), `standard` (adds ctrl, act, sensors) or `full` (adds body poses and
+                actuator forces).
+            timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            URLabVersionMismatch: Client and server MuJoCo builds differ.
+            ServerUnreachable: Nothing answers at the address.
+        """
+        level = ObservationLevel(observations)
+        await self._state.open(level, timeout=timeout)
+
+    async def step(
+        self,
+        n_steps: int = 1,
+        *,
+        include_cameras: bool | Mapping[str, str | CameraTiming] = False,
+        observations: str | ObservationLevel = SESSION_LEVEL,
+        timeout: Timeout = DEFAULT,
+    ) -> StepOk:
+        """Advance physics as the step mode says, and take over the state.
+
+        In `direct` the server steps `n_steps` times with the set-points in each articulation's `ctrl_array`. In
+        `puppet` the local model steps `n_steps` times (0: not at all) and the result is pushed. In `live` set-points
+        are handed over and the present state is read; physics runs by itself.
+
+        Args:
+            n_steps: Physics steps.
+            include_cameras: True for the newest frame of every camera, or camera name to `sync` (rendered after the
+                step) or `latest`. Ignored in live mode.
+            observations: Level of this reply alone; default the level of the session.
+            timeout: Seconds to wait; None waits without limit.
+
+        Returns:
+            The state; the same has been taken over into articulations, entities, cameras and `data`.
+
+        Raises:
+            StepTimeout: The server did not finish within its 5 s; the steps are still queued there.
+            OutcomeUnknown: The connection broke: the steps may or may not have been taken.
+            KeyError: Unknown camera; nothing was sent.
+        """
+        state = self._state
+        level = state.level if isinstance(observations, SessionLevel) else ObservationLevel(observations)
+        cameras = self._cameras(include_cameras)
+        if timeout is DEFAULT and isinstance(cameras, dict):
+            waits = sum(timing == CameraTiming.SYNC for timing in cameras.values())
+            timeout = _SYNC_CAMERA_S * waits + (op_of(Step).timeout or 0.0) if waits else DEFAULT
+        if state.mode is StepMode.LIVE:
+            commands = {key: record.live_command() for key, record in state.records.items()}
+            reply = await self._session.call(Step(per_articulation=commands or None), timeout=timeout)
+            state.absorb(reply, "step")
+            return reply
+        request = self._puppet_request(n_steps) if state.mode is StepMode.PUPPET else self._direct_request(n_steps)
+        carried = state.buffered_wrenches()
+        request.include_cameras = cameras
+        if level != state.sent_level:
+            request.observations = level
+        state.sent_level = ""  # unknown to us until the server has answered
+        reply = await self._session.call(request, timeout=timeout)
+        state.sent_level = level
+        if state.mode is StepMode.DIRECT:
+            for record, wrenches in carried:
+                record.drop_wrenches(wrenches)
+        state.absorb(reply, "step", into_mirror=state.mode is not StepMode.PUPPET)
+        return reply
+
+    async def reset(
+        self,
+        keyframe_name: str | None = None,
+        seed: int | None = None,
+        per_articulation_qpos: Mapping[str, Mapping[str, float]] | None = None,
+        *,
+        timeout: Timeout = DEFAULT,
+    ) -> ResetOk:
+        """Reset the simulation and take over the state. Set-points stay.
+
+        Args:
+            keyframe_name: Keyframe to reset to. The short name is enough where one articulation has it.
+            seed: Remembered by the server; no effect on MuJoCo.
+            per_articulation_qpos: Articulation key to joint name to the first component of its position.
+            timeout: Seconds to wait; None waits without limit.
+
+        Returns:
+            The state, with `step` 0.
+
+        Raises:
+            UnknownKeyframe: No keyframe, or more than one, has this name; nothing was reset.
+            KeyError: Unknown articulation or joint; nothing was sent.
+        """
+        overrides = {
+            self.articulations[key].prefix: self._joint_values(key, values)
+            for key, values in (per_articulation_qpos or {}).items()
+        }
+        request = Reset(
+            keyframe_name=None if keyframe_name is None else self._keyframe(keyframe_name),
+            seed=seed,
+            per_articulation_qpos=overrides or None,
+        )
+        reply = await self._session.call(request, timeout=timeout)
+        self._state.absorb(reply, "reset")
+        return reply
+
+    async def call(self, request: Request[R], *, timeout: Timeout = DEFAULT) -> R:
+        """Send any request of `urlab_client.protocol.messages` and return its reply, without taking anything over.
+
+        Raises:
+            URLabRPCError: The server refused.
+        """
+        return await self._session.call(request, timeout=timeout)
+
+    async def meta(self, *, timeout: Timeout = DEFAULT) -> list[OpInfo]:
+        """List the ops that the server offers; needs no session."""
+        reply: MetaOk = await self._session.call(MetaRequest(), timeout=timeout)
+        return reply.ops
+
+    async def close(self) -> None:
+        """Take back a step mode that `discover()` promoted, and close the connection. Idempotent."""
+        if self._closed:
+            return
+        self._closed = True
+        promoted_from = self._state.promoted_from
+        try:
+            if promoted_from is not None and self.connected and self.manager_present:
+                with contextlib.suppress(URLabError):  # a courtesy: the server may have moved on
+                    await self._session.call(SetMode(mode=promoted_from), timeout=_REVERT_S)
+        finally:
+            await self._session.aclose()
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    def __repr__(self) -> str:
+        state = "closed" if self._closed else "connected" if self.connected else "not connected"
+        return f"<URLabClient {self._address} {state}>"
+
+    def _direct_request(self, n_steps: int) -> Step:
+        state = self._state
+        commands = {key: record.direct_command() for key, record in state.records.items()}
+        for name, record in state.entity_records.items():
+            if record.wrenches:
+                # Under its own name: the server tries the body's name alone after `<key>_<body>`.
+                commands[name] = record.wrench_command()
+        return Step(n_steps=n_steps, per_articulation=commands or None)
+
+    def _puppet_request(self, n_steps: int) -> Step:
+        mirror = self._state.mirror
+        model, data = mirror.model, mirror.data
+        if model is None or data is None:
+            raise URLabError(
+                "step: puppet mode integrates the local model, and there is none.",
+                op="step",
+                hint="Make the client with local_model=True and call discover() during play.",
+            )
+        with mirror.lock:
+            if n_steps > 0:
+                import mujoco  # noqa: PLC0415
+
+                mujoco.mj_step(model, data, n_steps)
+            return Step(qpos=data.qpos.copy(), qvel=data.qvel.copy(), ctrl=data.ctrl.copy(), time=data.time)
+
+    def _cameras(self, include: bool | Mapping[str, str | CameraTiming]) -> bool | dict[str, str | None]:
+        if isinstance(include, bool):
+            return include
+        for name in include:
+            if self._state.camera(name) is None:
+                known = [f"{art.prefix}/{camera}" for art in self.articulations.values() for camera in art.cameras]
+                raise KeyError(f"no camera {name!r}; there are: {', '.join(known) or 'none'}")
+        return {name: str(CameraTiming(timing)) for name, timing in include.items()}
+
+    def _joint_values(self, key: str, values: Mapping[str, float]) -> dict[str, float]:
+        joints = self.articulations[key].joints
+        return {(joints[name].name if joints else name): float(value) for name, value in values.items()}
+
+    def _keyframe(self, name: str) -> str:
+        """Return the compiled name; only that is known to the server."""
+        if self.model is None:
+            return name
+        compiled = [key for key in model_names(self.model, "key") if key]
+        if name in compiled:
+            return name
+        matches = [key for key in compiled if key in {f"{prefix}_{name}" for prefix in self.articulations}]
+        if len(matches) == 1:
+            return matches[0]
+        problem = (
+            f"{name!r} could mean {', '.join(matches)}"
+            if matches
+            else f"there is no {name!r}, only: {', '.join(compiled) or 'none'}"
+        )
+        raise UnknownKeyframe("unknown_keyframe", f"{problem}. Nothing was sent.", op="reset")
+
+
+def _transport(address: str, step_port: int) -> TransportProtocol:
+    if address.startswith(SCHEME):
+        return LaunchedTransport(address)
+    scheme, separator, rest = address.partition("://")
+    if not separator or scheme not in {"tcp", "ipc"} or not rest:
+        raise ValueError(f"{address!r} is no address; write tcp://HOST, ipc://PATH or sim://MODEL")
+    own_port = scheme == "tcp" and rest.rpartition(":")[2].isdigit()
+    return ZmqTransport(address if own_port else f"{address}:{step_port}")

@@ -1,0 +1,155 @@
+"""`sim://…` addresses: a simulated server in a child process, started when first needed and stopped with the client.
+
+The child is this package's own command line, so that the client needs no import of the server. It ends when its
+standard input closes: it cannot outlive the client, however that dies.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import sys
+from collections.abc import Sequence
+from urllib.parse import parse_qsl
+
+import msgspec
+from msgspec import Struct
+
+from urlab_client.aio.transport.base import TransportStats
+from urlab_client.aio.transport.zmq import ZmqTransport
+from urlab_client.protocol.base import Op
+from urlab_client.protocol.errors import ClientClosed, ServerUnreachable
+
+__all__ = ["SCHEME", "LaunchedTransport", "serve_arguments"]
+
+log = logging.getLogger("urlab_client.launch")
+
+SCHEME = "sim://"
+_START_S = 60.0
+_STOP_S = 2.0
+
+
+class _Ready(Struct):
+    """The line that `urlab serve --json` prints when clients can connect."""
+
+    address: str
+    step_port: int
+
+
+def serve_arguments(address: str) -> list[str]:
+    """Return the `urlab serve` arguments for a `sim://` address.
+
+    `sim://MODEL` names an MJCF file, a saved level or a bundled robot. `?model=…` adds another one, any other query
+    item is an option of `urlab serve`: `sim://arm?model=ball&mjcf-options&controller=arm=pd`.
+
+    Raises:
+        ValueError: No model is named.
+    """
+    model, _, query = address.removeprefix(SCHEME).partition("?")
+    if not model:
+        raise ValueError(f"{address!r} names no model; write for example sim://arm or sim:///path/to/robot.xml")
+    models, options = [model], list[str]()
+    for key, value in parse_qsl(query, keep_blank_values=True):
+        if key == "model":
+            models.append(value)
+        else:
+            options.append(f"--{key}={value}" if value else f"--{key}")
+    return [*models, *options]
+
+
+class LaunchedTransport:
+    """Transport to a simulated server of its own."""
+
+    def __init__(self, address: str) -> None:
+        self.stats = TransportStats()
+        self._address = address
+        self._arguments = serve_arguments(address)
+        self._process: asyncio.subprocess.Process | None = None
+        self._drain: asyncio.Task[None] | None = None
+        self._inner: ZmqTransport | None = None
+        self._closed = False
+
+    @property
+    def endpoint(self) -> str:
+        """The server's RPC endpoint once it runs, before that the address."""
+        return self._address if self._inner is None else self._inner.endpoint
+
+    @property
+    def connected(self) -> bool:
+        """Whether the server runs and is on the line."""
+        return self._inner is not None and self._inner.connected
+
+    async def request(self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None) -> bytes:
+        """See `Transport.request`. The first request also starts the server, which its deadline does not cover."""
+        if self._inner is None:
+            loop = asyncio.get_running_loop()
+            before = loop.time()
+            self._inner = await self._launch(op)
+            took = loop.time() - before
+            deadline = None if deadline is None else deadline + took
+            connect_by = None if connect_by is None else connect_by + took
+        return await self._inner.request(frame, op, deadline=deadline, connect_by=connect_by)
+
+    async def aclose(self) -> None:
+        """See `Transport.aclose`. Waits a bounded time for the server to end."""
+        if self._closed:
+            return
+        self._closed = True
+        if self._inner is not None:
+            await self._inner.aclose()
+        process = self._process
+        if process is None:
+            return
+        if process.stdin is not None:
+            process.stdin.close()
+        try:
+            async with asyncio.timeout(_STOP_S):
+                await process.wait()
+        except TimeoutError:
+            log.warning("%s: the server did not end within %g s and was killed", self._address, _STOP_S)
+            process.kill()
+            await process.wait()
+        if self._drain is not None:
+            await self._drain
+
+    async def _launch(self, op: Op) -> ZmqTransport:
+        if self._closed:
+            raise ClientClosed(f"The client of {self._address} is closed.", hint="Make a new client.")
+        command = [sys.executable, "-m", "urlab_client", "serve", *_DEFAULTS, *self._arguments]
+        process = await asyncio.create_subprocess_exec(
+            *command, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE
+        )
+        self._process = process
+        assert process.stdout is not None and process.stderr is not None  # noqa: PT018, S101  # both are pipes
+        try:
+            async with asyncio.timeout(_START_S):
+                line = await process.stdout.readline()
+                if not line:
+                    reason = (await process.stderr.read()).decode(errors="replace").strip()
+                    await process.wait()
+                    raise ServerUnreachable(
+                        f"{op.name}: no simulated server for {self._address}: {reason or 'it ended without a word'}",
+                        op=op.name,
+                    )
+        except TimeoutError:
+            process.kill()
+            raise ServerUnreachable(
+                f"{op.name}: the simulated server for {self._address} was not ready within {_START_S:g} s.", op=op.name
+            ) from None
+        ready = msgspec.json.decode(line, type=_Ready)
+        self._drain = asyncio.create_task(_log_lines(process.stderr), name="urlab-server-log")
+        transport = ZmqTransport(f"{ready.address}:{ready.step_port}")
+        transport.stats = self.stats
+        return transport
+
+
+_DEFAULTS: Sequence[str] = (
+    "--json", "--until-eof", "--play", "--no-shm",
+    "--step-port=0", "--state-port=0", "--ctrl-port=0", "--info-port=0", "--camera-port=0",
+)  # fmt: skip
+
+
+async def _log_lines(stream: asyncio.StreamReader) -> None:
+    """Keep the pipe empty, or the server would block on it."""
+    while line := await stream.readline():
+        log.info("server: %s", line.decode(errors="replace").rstrip())

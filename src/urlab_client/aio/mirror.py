@@ -1,0 +1,158 @@
+"""The local copy of the simulation: the handshake's compiled model and data that follow what the server sends.
+
+For the client's own use. MuJoCo is imported when a model is loaded, not before.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from urlab_client.protocol.base import Floats
+from urlab_client.protocol.errors import ProtocolError, URLabVersionMismatch
+from urlab_client.protocol.messages.session import HelloOk
+from urlab_client.protocol.types import SimOptions
+
+if TYPE_CHECKING:
+    import mujoco
+
+__all__ = ["Mirror", "model_names", "write_options"]
+
+log = logging.getLogger("urlab_client.mirror")
+
+_CHOICES = {
+    "integrator": ("mjtIntegrator", "mjINT_"),
+    "cone": ("mjtCone", "mjCONE_"),
+    "solver": ("mjtSolver", "mjSOL_"),
+}
+_NOT_IN_MJOPTION = frozenset({"enable_multiccd", "enable_sleep", "num_worker_threads", "max_worker_threads"})
+_NAME_ADDRESSES = {
+    "body": "name_bodyadr",
+    "joint": "name_jntadr",
+    "actuator": "name_actuatoradr",
+    "sensor": "name_sensoradr",
+    "key": "name_keyadr",
+}
+
+
+def model_names(model: mujoco.MjModel, kind: str) -> list[str]:
+    """Return the compiled names of all bodies, joints, actuators, sensors or keys, in id order."""
+    pool = model.names
+    addresses: list[int] = getattr(model, _NAME_ADDRESSES[kind]).tolist()
+    return [pool[start : pool.index(b"\0", start)].decode() for start in addresses]
+
+
+def write_options(opt: mujoco.MjOption, options: SimOptions) -> None:
+    """Write the options that are not None into a model's `mjOption`.
+
+    The raw masks come first, so that the named switches win, as on the server.
+    """
+    import mujoco  # noqa: PLC0415
+
+    for name in SimOptions.__struct_fields__:
+        value = getattr(options, name)
+        if value is None or name in _NOT_IN_MJOPTION:
+            continue
+        if name in _CHOICES:
+            value = getattr(getattr(mujoco, _CHOICES[name][0]), f"{_CHOICES[name][1]}{value.upper()}")
+        setattr(opt, name, value)
+    if options.enable_sleep is not None:
+        opt.enableflags = _switched(opt.enableflags, int(mujoco.mjtEnableBit.mjENBL_SLEEP), options.enable_sleep)
+    if options.enable_multiccd is not None:
+        bit = int(mujoco.mjtDisableBit.mjDSBL_MULTICCD)
+        opt.disableflags = _switched(opt.disableflags, bit, not options.enable_multiccd)
+
+
+def _switched(mask: int, bit: int, on: bool) -> int:
+    return mask | bit if on else mask & ~bit
+
+
+class Mirror:
+    """Local model and data, guarded by a reentrant lock.
+
+    Attributes:
+        lock: Held while data change; hold it to read several values that belong together from another thread.
+        model: The compiled model, or None without one.
+        data: State that mirrors the server's, or None without a model.
+        approximate: True when the model was compiled here from XML because the server runs another MuJoCo build.
+    """
+
+    def __init__(self) -> None:
+        self.lock = threading.RLock()
+        self.model: mujoco.MjModel | None = None
+        self.data: mujoco.MjData | None = None
+        self.approximate = False
+        self._stale = False
+
+    @staticmethod
+    def check_version(hello: HelloOk) -> URLabVersionMismatch | None:
+        """Return the error to raise when the server's compiled model cannot be loaded by this MuJoCo."""
+        import mujoco  # noqa: PLC0415
+
+        client = mujoco.mj_versionString()
+        same = hello.mujoco_version == client and hello.mujoco_version_int == mujoco.mj_version()
+        return None if same else URLabVersionMismatch(hello.mujoco_version, client)
+
+    def load(self, hello: HelloOk) -> None:
+        """Load the handshake's model. Blocking: run it off the event loop.
+
+        Raises:
+            ProtocolError: The bytes are not a model this MuJoCo can load.
+        """
+        import mujoco  # noqa: PLC0415
+
+        mismatch = self.check_version(hello)
+        try:
+            if mismatch is None and hello.mjb is not None:
+                model = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": hello.mjb})
+            elif hello.mjcf_compiled is not None:
+                model = mujoco.MjModel.from_xml_string(hello.mjcf_compiled, hello.vfs_assets or {})
+            else:
+                self.clear()
+                return
+        except (ValueError, mujoco.FatalError) as error:
+            raise ProtocolError(f"hello: the server's model cannot be loaded: {error}", op="hello") from error
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        with self.lock:
+            self.model, self.data = model, data
+            self.approximate = mismatch is not None
+            self._stale = False
+
+    def clear(self) -> None:
+        """Forget the model."""
+        with self.lock:
+            self.model = self.data = None
+            self.approximate = False
+
+    def mark_stale(self) -> None:
+        """Note that positions or velocities changed, so that derived quantities must be computed before use."""
+        self._stale = True
+
+    def derived(self) -> tuple[mujoco.MjModel, mujoco.MjData] | None:
+        """Return model and data with body poses and velocities computed for the present state. Call under the lock."""
+        if self.model is None or self.data is None:
+            return None
+        if self._stale:
+            import mujoco  # noqa: PLC0415
+
+            mujoco.mj_kinematics(self.model, self.data)
+            mujoco.mj_comPos(self.model, self.data)
+            mujoco.mj_comVel(self.model, self.data)
+            self._stale = False
+        return self.model, self.data
+
+    def body_velocity(self, body_id: int) -> Floats | None:
+        """Return (angular, linear) velocity of a body's frame origin, shape (6,), rad/s and m/s, world axes."""
+        with self.lock:
+            pair = self.derived()
+            if pair is None:
+                return None
+            import mujoco  # noqa: PLC0415
+
+            velocity = np.zeros(6)
+            mujoco.mj_objectVelocity(*pair, mujoco.mjtObj.mjOBJ_XBODY, body_id, velocity, 0)
+            return velocity

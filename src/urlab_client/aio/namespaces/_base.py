@@ -1,0 +1,79 @@
+"""What every namespace has in common, and how arguments become wire values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Literal, TypeVar, overload
+
+from msgspec import Struct
+
+from urlab_client.aio.deadline import Timeout
+from urlab_client.aio.session import Session
+from urlab_client.protocol.base import Quat, Reply, Request, Vec3
+
+__all__ = ["Namespace", "Vector", "as_quat", "as_vec3", "fill", "target_by"]
+
+R = TypeVar("R", bound=Reply)
+S = TypeVar("S", bound=Struct)
+
+Vector = Iterable[float]
+"""A tuple, list or array of numbers."""
+
+
+class Namespace:
+    """A group of ops on a client."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+
+    async def _call(self, request: Request[R], timeout: Timeout) -> R:
+        return await self._session.call(request, timeout=timeout)
+
+
+def fill(kind: type[S], reply: Reply) -> S:
+    """Make a `kind` from the fields of the same names of a reply."""
+    return kind(**{name: getattr(reply, name) for name in kind.__struct_fields__})
+
+
+def target_by(by_name: bool) -> Literal["actor_id", "actor_name"]:
+    """Return the wire's word for how a target is looked up."""
+    return "actor_name" if by_name else "actor_id"
+
+
+@overload
+def as_vec3(name: str, values: None) -> None: ...
+@overload
+def as_vec3(name: str, values: Vector) -> Vec3: ...
+def as_vec3(name: str, values: Vector | None) -> Vec3 | None:
+    """Return three numbers as a tuple, None for None.
+
+    Raises:
+        ValueError: There are more or fewer.
+    """
+    if values is None:
+        return None
+    x, y, z = _numbers(name, values, 3)
+    return x, y, z
+
+
+@overload
+def as_quat(name: str, values: None) -> None: ...
+@overload
+def as_quat(name: str, values: Vector) -> Quat: ...
+def as_quat(name: str, values: Vector | None) -> Quat | None:
+    """Return four numbers as a tuple, None for None.
+
+    Raises:
+        ValueError: There are more or fewer.
+    """
+    if values is None:
+        return None
+    a, b, c, d = _numbers(name, values, 4)
+    return a, b, c, d
+
+
+def _numbers(name: str, values: Vector, count: int) -> list[float]:
+    numbers = [float(value) for value in values]
+    if len(numbers) != count:
+        raise ValueError(f"{name} takes {count} numbers, got {len(numbers)}")
+    return numbers

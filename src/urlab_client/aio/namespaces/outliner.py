@@ -1,0 +1,78 @@
+"""`client.outliner`: looking at the world."""
+
+from __future__ import annotations
+
+from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.namespaces._ops import OutlinerOps
+from urlab_client.protocol.messages.outliner import ActorRow, FindActors, ListActors
+from urlab_client.protocol.types import ActorInfo
+
+__all__ = ["OutlinerNamespace"]
+
+_LIGHTS = frozenset({"DirectionalLight", "PointLight", "SpotLight", "RectLight", "SkyLight"})
+
+
+class OutlinerNamespace(OutlinerOps):
+    """Looking at the world, and preparing plain meshes for physics."""
+
+    async def list_actors(self, *, timeout: Timeout = DEFAULT) -> list[ActorInfo]:
+        """List the visible actors of the edited level.
+
+        Raises:
+            ListActorsFailed: There is no world to list.
+        """
+        return [_info(row) for row in (await self._call(ListActors(), timeout)).actors]
+
+    async def find_actors(
+        self,
+        *,
+        class_filter: str | None = None,
+        tag: str | None = None,
+        name_prefix: str | None = None,
+        in_pie: bool = False,
+        timeout: Timeout = DEFAULT,
+    ) -> list[ActorInfo]:
+        """List the actors that pass every given filter.
+
+        The plugin does not send the kind of an actor here: it is derived from the class name, and
+        `has_quick_convert` stays False.
+
+        Args:
+            class_filter: Class or parent class name, any letter case.
+            tag: Whole tag, any letter case.
+            name_prefix: Beginning of the engine actor name, any letter case.
+            in_pie: Search the play world when it runs.
+            timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            FindActorsFailed: There is no world to search.
+        """
+        request = FindActors(class_filter=class_filter, tag=tag, name_prefix=name_prefix, in_pie=in_pie)
+        return [_info(row) for row in (await self._call(request, timeout)).actors]
+
+
+def _info(row: ActorRow) -> ActorInfo:
+    quick = row.quick_convert
+    kind = row.actor_class
+    return ActorInfo(
+        name=row.name,
+        actor_class=kind,
+        actor_id=row.actor_id,
+        is_articulation=_given(row.is_articulation, kind.endswith("_C") or kind == "MjArticulation"),
+        has_quick_convert=_given(row.has_quick_convert, False),
+        location=row.location,
+        rotation_quat=row.rotation_quat,
+        is_static_mesh_actor=_given(row.is_static_mesh_actor, kind == "StaticMeshActor"),
+        is_light=_given(row.is_light, kind in _LIGHTS),
+        static=quick.static if quick else None,
+        complex_mesh=quick.complex_mesh if quick else None,
+        coacd_threshold=quick.coacd_threshold if quick else None,
+        driven_by_unreal=quick.driven_by_unreal if quick else None,
+        friction=quick.friction if quick else None,
+        label=row.label,
+        tags=tuple(row.tags or ()),
+    )
+
+
+def _given(sent: bool | None, derived: bool) -> bool:
+    return derived if sent is None else sent

@@ -1,0 +1,169 @@
+"""`client.recording` and `client.replay`."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.namespaces._base import Namespace, fill
+from urlab_client.aio.namespaces._ops import ReplayOps
+from urlab_client.aio.session import Session
+from urlab_client.protocol.messages.recording import (
+    RecordingClear,
+    RecordingSave,
+    RecordingStart,
+    RecordingStop,
+    ReplayLoad,
+    ReplaySetActive,
+    ReplayStart,
+    ReplayStop,
+)
+from urlab_client.protocol.types import RecordingHandle, RecordingSummary, ReplaySession, ReplayStatus
+
+__all__ = ["RecordingNamespace", "ReplayNamespace"]
+
+_FLOAT32_MAX = 3.4028234663852886e38  # what the server says for "no limit"
+
+
+class RecordingNamespace(Namespace):
+    """Recording joint states on the server. The properties follow this client's own calls."""
+
+    def __init__(self, session: Session) -> None:
+        super().__init__(session)
+        self._active = False
+        self._summary = RecordingSummary(0, 0.0)
+        self._last_saved: Path | None = None
+
+    @property
+    def is_active(self) -> bool:
+        """Whether a recording runs."""
+        return self._active
+
+    @property
+    def frame_count(self) -> int:
+        """Frames of the recording that was stopped last."""
+        return self._summary.frame_count
+
+    @property
+    def sim_duration(self) -> float:
+        """Seconds of simulation time of the recording that was stopped last."""
+        return self._summary.sim_duration_s
+
+    @property
+    def last_saved_path(self) -> Path | None:
+        """Where the last recording was saved, on the server's machine."""
+        return self._last_saved
+
+    async def start(
+        self, name: str | None = None, max_duration_s: float | None = None, *, timeout: Timeout = DEFAULT
+    ) -> RecordingHandle:
+        """Start recording.
+
+        Args:
+            name: Accepted; servers name the session themselves.
+            max_duration_s: Keep only the newest seconds of simulation time.
+            timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            RecordingAlreadyActive: A recording runs.
+        """
+        reply = await self._call(RecordingStart(name=name, max_duration_s=max_duration_s), timeout)
+        self._active = True
+        limit = reply.max_duration_s
+        return RecordingHandle(name=reply.name, max_duration_s=math.inf if limit >= _FLOAT32_MAX else limit)
+
+    async def stop(self, *, timeout: Timeout = DEFAULT) -> RecordingSummary:
+        """Stop recording.
+
+        Raises:
+            RecordingNotActive: No recording runs.
+        """
+        self._summary = fill(RecordingSummary, await self._call(RecordingStop(), timeout))
+        self._active = False
+        return self._summary
+
+    async def save(self, path: str | Path | None = None, *, timeout: Timeout = DEFAULT) -> Path:
+        """Write the active session to a JSON file on the server's machine and return its absolute path.
+
+        Args:
+            path: File name, in the server's replay directory; default `recording.json`.
+            timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            PathNotWritable: The file cannot be written, or there is nothing to save.
+        """
+        reply = await self._call(RecordingSave(path=None if path is None else str(path)), timeout)
+        self._last_saved = Path(reply.absolute_path)
+        return self._last_saved
+
+    async def clear(self, *, timeout: Timeout = DEFAULT) -> None:
+        """Forget the recorded frames."""
+        await self._call(RecordingClear(), timeout)
+        self._summary = RecordingSummary(0, 0.0)
+
+
+class ReplayNamespace(ReplayOps):
+    """Playing recordings back; needs step mode direct or puppet."""
+
+    def __init__(self, session: Session) -> None:
+        super().__init__(session)
+        self._session_name: str | None = None
+
+    @property
+    def active_session(self) -> str | None:
+        """Name of the session that this client made active last."""
+        return self._session_name
+
+    async def load(self, path: str | Path, *, timeout: Timeout = DEFAULT) -> ReplaySession:
+        """Load a recording from the server's replay directory and make it active.
+
+        Raises:
+            PathNotReadable: The recording is missing or is not one.
+        """
+        reply = await self._call(ReplayLoad(path=str(path)), timeout)
+        self._session_name = reply.name
+        return ReplaySession(name=reply.name)
+
+    async def set_active(self, name: str, *, timeout: Timeout = DEFAULT) -> None:
+        """Make a loaded session the active one.
+
+        Raises:
+            ReplaySessionNotFound: No session has this name.
+        """
+        await self._call(ReplaySetActive(name=name), timeout)
+        self._session_name = name
+
+    async def start(self, *, timeout: Timeout = DEFAULT) -> ReplayStatus:
+        """Play the active session.
+
+        Raises:
+            ReplayRequiresStepped: The step mode is live.
+        """
+        status = fill(ReplayStatus, await self._call(ReplayStart(), timeout))
+        self._session_name = status.active_session
+        return status
+
+    async def stop(self, *, timeout: Timeout = DEFAULT) -> None:
+        """Stop playing."""
+        await self._call(ReplayStop(), timeout)
+
+    async def play(self, path_or_name: str | Path, *, loop: bool = False, timeout: Timeout = DEFAULT) -> ReplaySession:
+        """Play a loaded session by name, or load a recording and play it.
+
+        Args:
+            path_or_name: Name of a loaded session, else a file of the server's replay directory.
+            loop: Accepted; servers play sessions in a loop until stopped.
+            timeout: Seconds to wait for each op; None waits without limit.
+
+        Raises:
+            PathNotReadable: It is neither a session nor a recording.
+            ReplayRequiresStepped: The step mode is live.
+        """
+        name = str(path_or_name)
+        if name in await self.list_sessions(timeout=timeout):
+            await self.set_active(name, timeout=timeout)
+        else:
+            name = (await self.load(name, timeout=timeout)).name
+        await self.start(timeout=timeout)
+        return ReplaySession(name=name)

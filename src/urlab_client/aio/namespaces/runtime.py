@@ -1,0 +1,125 @@
+"""`client.runtime`: live changes to the running simulation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.namespaces._base import Vector, fill, target_by
+from urlab_client.aio.namespaces._ops import RuntimeOps
+from urlab_client.aio.session import Session
+from urlab_client.aio.state import SimState
+from urlab_client.protocol.enums import StepMode
+from urlab_client.protocol.messages.runtime import ContactFilter, GetContacts, SetMode, SetQpos, SetSimOptions
+from urlab_client.protocol.messages.session import Forward, ForwardOk
+from urlab_client.protocol.types import ContactsResult, SimOptions
+
+__all__ = ["RuntimeNamespace"]
+
+
+class RuntimeNamespace(RuntimeOps):
+    """Live changes to the running simulation; every op needs a play session."""
+
+    def __init__(self, session: Session, state: SimState) -> None:
+        super().__init__(session)
+        self._state = state
+
+    async def set_qpos(self, target: str, qpos: Vector, *, by_name: bool = False, timeout: Timeout = DEFAULT) -> None:
+        """Write joint positions of an articulation, run `mj_forward`, and mirror the result into `client.data`.
+
+        Velocities and time stay.
+
+        Args:
+            target: Actor id, or the articulation key with `by_name`.
+            qpos: All joint positions in joint order, or 7 values for a free base alone: xyz, quaternion (w, x, y, z).
+            by_name: Look `target` up by the articulation key.
+            timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            UnknownArticulation: No articulation has this key or actor id.
+            DimMismatch: The number of values does not fit.
+        """
+        values = np.asarray(tuple(qpos), dtype=np.float64)
+        reply = await self._call(SetQpos(target=target, qpos=values, target_by=target_by(by_name)), timeout)
+        self._state.mirror_qpos(reply.actor_name, reply.qpos)
+
+    async def get_contacts(
+        self,
+        *,
+        body1: str | None = None,
+        body2: str | None = None,
+        geom1: str | None = None,
+        geom2: str | None = None,
+        max_contacts: int = 64,
+        timeout: Timeout = DEFAULT,
+    ) -> ContactsResult:
+        """Snapshot the active contacts.
+
+        Filters are exact compiled names, combined with AND. The server compares `body1` and `geom1` with the first
+        geom of a contact and `body2` and `geom2` with the second; a swapped pair does not match.
+
+        Args:
+            body1: Body of the first geom.
+            body2: Body of the second geom.
+            geom1: First geom.
+            geom2: Second geom.
+            max_contacts: Return at most so many.
+            timeout: Seconds to wait; None waits without limit.
+        """
+        names = ContactFilter(body1=body1, body2=body2, geom1=geom1, geom2=geom2)
+        reply = await self._call(
+            GetContacts(max_contacts=max_contacts, filter=None if names == ContactFilter() else names), timeout
+        )
+        return fill(ContactsResult, reply)
+
+    async def set_sim_options(self, *, timeout: Timeout = DEFAULT, **opts: Any) -> SimOptions:
+        """Change fields of `mjOption`, mirror them into `client.model.opt`, and return all that are in force.
+
+        Args:
+            timeout: Seconds to wait; None waits without limit.
+            **opts: Fields of `SimOptions` by name, for example `timestep=0.001, gravity=(0, 0, -1.62)`.
+
+        Raises:
+            TypeError: An unknown option, or one of the wrong type; nothing was sent.
+            BadValue: Unknown integrator, cone or solver.
+        """
+        unknown = sorted(set(opts) - set(SimOptions.__struct_fields__))
+        if unknown:
+            known = ", ".join(SimOptions.__struct_fields__)
+            raise TypeError(f"set_sim_options: unknown option {', '.join(unknown)}; it takes {known}")
+        options = msgspec.convert(opts, SimOptions)
+        reply = await self._call(SetSimOptions(options=options), timeout)
+        self._state.mirror_options(reply.options)
+        return reply.options
+
+    async def set_mode(self, mode: StepMode | str, *, timeout: Timeout = DEFAULT) -> StepMode:
+        """Switch the step mode and return the one in force. Any mode but live un-pauses physics.
+
+        Args:
+            mode: `direct`, `puppet`, `live`; `auto` means live.
+            timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            ValueError: Unknown mode; nothing was sent.
+            ModeLocked: The project pins the mode.
+        """
+        wanted = StepMode(mode)
+        # On the wire `auto` is a mode in which every step times out.
+        request = SetMode(mode=StepMode.LIVE if wanted is StepMode.AUTO else wanted)
+        reply = await self._call(request, timeout)
+        self._state.mode = StepMode(reply.current_mode)
+        self._state.wanted_mode = self._state.mode
+        return self._state.mode
+
+    async def forward(self, *, timeout: Timeout = DEFAULT) -> ForwardOk:
+        """Run `mj_forward` on the server and take over the state: kinematics and dynamics, no integration.
+
+        Returns:
+            The state; time and step counter are unchanged.
+        """
+        reply = await self._call(Forward(), timeout)
+        self._state.absorb(reply, "forward")
+        return reply

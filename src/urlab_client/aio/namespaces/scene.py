@@ -1,0 +1,343 @@
+"""`client.scene`: editor-time authoring of levels and actors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.namespaces._base import Vector, as_quat, as_vec3, target_by
+from urlab_client.aio.namespaces._ops import SceneOps
+from urlab_client.protocol.base import Quat, Vec3
+from urlab_client.protocol.errors import CreateLevelFailed
+from urlab_client.protocol.messages.outliner import ListActors
+from urlab_client.protocol.messages.scene import (
+    DuplicateActor,
+    ImportXml,
+    Snapshot,
+    SnapshotRow,
+    SpawnActor,
+    SpawnGrid,
+    SpawnLight,
+)
+from urlab_client.protocol.types import (
+    SceneActor,
+    SceneSnapshot,
+    URLabAsset,
+    URLabBlueprint,
+    URLabLightHandle,
+    URLabSpawnHandle,
+)
+
+__all__ = ["SceneNamespace"]
+
+_IDENTITY: Quat = (0.0, 0.0, 0.0, 1.0)
+
+
+class SceneNamespace(SceneOps):
+    """Editor-time authoring. Edits during play show after the next start of play."""
+
+    async def import_xml(
+        self, xml_path: str, *, force_reimport: bool = False, timeout: Timeout = DEFAULT
+    ) -> URLabBlueprint:
+        """Turn an MJCF file on the server's machine into a blueprint for `spawn_actor`.
+
+        Args:
+            xml_path: Absolute path of the MJCF file.
+            force_reimport: Replace an existing blueprint of the same file stem.
+            timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            ImportFailed: The file is missing or was rejected, or the old blueprint could not be removed.
+        """
+        reply = await self._call(ImportXml(path=str(xml_path), force_reimport=force_reimport), timeout)
+        return URLabBlueprint(
+            class_path=reply.blueprint_class_path,
+            short_name=reply.blueprint_short_name,
+            imported_now=reply.imported_now,
+        )
+
+    async def spawn_actor(
+        self,
+        blueprint: URLabBlueprint | str,
+        actor_id: str,
+        *,
+        location: Vector = (0.0, 0.0, 0.0),
+        rotation_quat: Vector | None = None,
+        rotation_euler: Vector | None = None,
+        scale: Vector = (1.0, 1.0, 1.0),
+        timeout: Timeout = DEFAULT,
+    ) -> URLabSpawnHandle:
+        """Place an instance of a blueprint in the edited level, or move the one that carries the id.
+
+        Args:
+            blueprint: What `import_xml` returned, or a package or class path.
+            actor_id: Stable id; empty always places a new actor.
+            location: Position in the world frame, metres.
+            rotation_quat: Unit quaternion (x, y, z, w), MuJoCo's world frame; wins over `rotation_euler`.
+            rotation_euler: (roll, pitch, yaw) in degrees: Rz(yaw) Ry(-pitch) Rx(-roll) in MuJoCo's frame.
+            scale: Scale factors.
+            timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            SpawnFailed: The class cannot be spawned, or the id belongs to an actor of another class.
+        """
+        place = as_vec3("location", location)
+        request = SpawnActor(
+            blueprint=_class_path(blueprint),
+            actor_id=actor_id,
+            location=place,
+            rotation_quat=as_quat("rotation_quat", rotation_quat),
+            rotation_euler=as_vec3("rotation_euler", rotation_euler),
+            scale=as_vec3("scale", scale),
+        )
+        reply = await self._call(request, timeout)
+        # The plugin's own echo of the location is wrong by a factor of 100 and the sign of y.
+        return URLabSpawnHandle(
+            actor_id=reply.actor_id,
+            actor_name=reply.actor_name,
+            actor_path=reply.actor_path,
+            blueprint_class_path=reply.blueprint_class_path,
+            location=place,
+            rotation_quat=reply.rotation_quat,
+            was_existing=reply.was_existing,
+            requires_pie_restart=reply.requires_pie_restart,
+        )
+
+    async def spawn_light(
+        self,
+        kind: str = "directional",
+        actor_id: str = "",
+        *,
+        location: Vector = (0.0, 0.0, 0.0),
+        rotation_euler: Vector = (0.0, 0.0, 0.0),
+        intensity: float = 5000.0,
+        color: Vector = (1.0, 1.0, 1.0),
+        timeout: Timeout = DEFAULT,
+    ) -> URLabLightHandle:
+        """Place a light; each call adds one. It shines along its local +x.
+
+        Args:
+            kind: `directional`, `point` or `spot`.
+            actor_id: Stable id; not checked for reuse.
+            location: Position in the world frame, metres.
+            rotation_euler: (roll, pitch, yaw) in degrees, Unreal's frame.
+            intensity: In Unreal's unit for that kind of light.
+            color: Red, green, blue in [0, 1].
+            timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            SpawnFailed: Unknown kind.
+        """
+        euler = as_vec3("rotation_euler", rotation_euler)
+        request = SpawnLight(
+            kind=kind,
+            actor_id=actor_id,
+            location=as_vec3("location", location),
+            rotation_euler=euler,
+            intensity=float(intensity),
+            color=as_vec3("color", color),
+        )
+        reply = await self._call(request, timeout)
+        return URLabLightHandle(
+            actor_id=reply.actor_id,
+            actor_name=reply.actor_name,
+            actor_path=reply.actor_path,
+            kind=reply.kind,
+            intensity=reply.intensity,
+            color=reply.color,
+            location=reply.location,
+            rotation_euler=reply.rotation_euler or euler,
+            requires_pie_restart=reply.requires_pie_restart,
+        )
+
+    async def snapshot(self, *, timeout: Timeout = DEFAULT) -> SceneSnapshot:
+        """Describe every visible actor, with articulation metadata; the play world when it runs.
+
+        Raises:
+            SnapshotFailed: There is no world to describe.
+        """
+        reply = await self._call(Snapshot(), timeout)
+        return SceneSnapshot(
+            actors=[_scene_actor(row) for row in reply.actors], in_pie=reply.in_pie, level_path=reply.level_path
+        )
+
+    async def duplicate_actor(
+        self,
+        target: str,
+        new_actor_id: str,
+        *,
+        by_name: bool = False,
+        location: Vector | None = None,
+        timeout: Timeout = DEFAULT,
+    ) -> URLabSpawnHandle:
+        """Spawn another instance of an actor's class with the same rotation and scale.
+
+        The plugin reports neither pose nor flags of the copy; they are read from the actor list.
+
+        Args:
+            target: Actor id, or the engine's actor name with `by_name`.
+            new_actor_id: Id of the copy; one that exists moves that actor.
+            by_name: Look `target` up by the engine's actor name.
+            location: Position of the copy in the world frame, metres; default 1 m along x from the source.
+            timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            DuplicateFailed: No actor matches, or the new id belongs to an actor of another class.
+        """
+        before = await self._call(ListActors(), timeout)
+        request = DuplicateActor(
+            target=target,
+            new_actor_id=new_actor_id,
+            target_by=target_by(by_name),
+            location=as_vec3("location", location),
+        )
+        reply = await self._call(request, timeout)
+        after = await self._call(ListActors(), timeout)
+        copy = next((row for row in after.actors if row.name == reply.actor_name), None)
+        return URLabSpawnHandle(
+            actor_id=reply.actor_id,
+            actor_name=reply.actor_name,
+            actor_path=reply.actor_path,
+            blueprint_class_path=reply.blueprint_class_path,
+            location=request.location or (copy.location if copy else (0.0, 0.0, 0.0)),
+            rotation_quat=copy.rotation_quat if copy else _IDENTITY,
+            was_existing=any(row.name == reply.actor_name for row in before.actors),
+            requires_pie_restart=after.in_pie,
+        )
+
+    async def spawn_grid(
+        self,
+        blueprint: URLabBlueprint | str,
+        base_actor_id: str,
+        count_x: int,
+        count_y: int,
+        *,
+        spacing: Vector = (1.0, 1.0, 0.0),
+        origin: Vector = (0.0, 0.0, 0.0),
+        rotation_quat: Vector | None = None,
+        rotation_euler: Vector | None = None,
+        scale: Vector = (1.0, 1.0, 1.0),
+        timeout: Timeout = DEFAULT,
+    ) -> dict[str, URLabSpawnHandle]:
+        """Place a grid of actors in one request and return their handles by actor id.
+
+        Cell (i, j) stands at origin + (i spacing[0], j spacing[1], 0) and has the id `<base>_<i>_<j>`.
+
+        Args:
+            blueprint: What `import_xml` returned, or a package or class path.
+            base_actor_id: Beginning of the ids.
+            count_x: Cells along x.
+            count_y: Cells along y; at most 1024 cells together.
+            spacing: Distance between cells, metres; the third number is ignored.
+            origin: Position of cell (0, 0) in the world frame, metres.
+            rotation_quat: Unit quaternion (x, y, z, w), MuJoCo's world frame; wins over `rotation_euler`.
+            rotation_euler: (roll, pitch, yaw) in degrees: Rz(yaw) Ry(-pitch) Rx(-roll) in MuJoCo's frame.
+            scale: Scale factors.
+            timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            InvalidCount: A count is not above zero.
+            TooManyCells: More than 1024 cells.
+            SpawnFailed: A cell could not be placed; the plugin keeps the cells placed before it.
+        """
+        rotation = as_quat("rotation_quat", rotation_quat)
+        request = SpawnGrid(
+            blueprint=_class_path(blueprint),
+            base_actor_id=base_actor_id,
+            count_x=count_x,
+            count_y=count_y,
+            spacing=as_vec3("spacing", spacing),
+            origin=as_vec3("origin", origin),
+            rotation_quat=rotation,
+            rotation_euler=as_vec3("rotation_euler", rotation_euler),
+            scale=as_vec3("scale", scale),
+        )
+        reply = await self._call(request, timeout)
+        return {
+            cell.actor_id: URLabSpawnHandle(
+                actor_id=cell.actor_id,
+                actor_name=cell.actor_name,
+                actor_path=cell.actor_path,
+                blueprint_class_path=reply.blueprint_class_path,
+                location=cell.location,
+                rotation_quat=rotation or _quat_of_euler(request.rotation_euler),
+                was_existing=cell.was_existing,
+                requires_pie_restart=reply.requires_pie_restart,
+            )
+            for cell in reply.actors
+        }
+
+    async def apply_scene(
+        self, level_name: str, assets: Iterable[URLabAsset], *, save: bool = True, timeout: Timeout = DEFAULT
+    ) -> dict[str, URLabSpawnHandle]:
+        """Bring a level into a described state: load or create it, import each MJCF once, place each asset, save.
+
+        Safe to repeat: an actor whose id exists is moved, not spawned again.
+
+        Args:
+            level_name: Short name or `/Game/` path.
+            assets: What to place.
+            save: Save the level afterwards.
+            timeout: Seconds to wait for each of the ops; None waits without limit.
+
+        Returns:
+            Handles by actor id.
+
+        Raises:
+            ValueError: Two assets share an actor id; nothing was done.
+            URLabRPCError: From the op that failed; what was placed before it stays.
+        """
+        wanted = list(assets)
+        ids = [asset.actor_id for asset in wanted]
+        twice = sorted({i for i in ids if ids.count(i) > 1})
+        if twice:
+            raise ValueError(f"actor ids must differ, these are used twice: {', '.join(twice)}")
+        try:
+            await self.create_level(level_name, timeout=timeout)
+        except CreateLevelFailed:
+            await self.load_level(level_name, timeout=timeout)
+        await self.ensure_manager(timeout=timeout)
+        blueprints = {
+            xml: await self.import_xml(xml, timeout=timeout) for xml in dict.fromkeys(asset.xml for asset in wanted)
+        }
+        handles = {
+            asset.actor_id: await self.spawn_actor(
+                blueprints[asset.xml],
+                asset.actor_id,
+                location=asset.location,
+                rotation_quat=asset.rotation_quat,
+                rotation_euler=asset.rotation_euler,
+                scale=asset.scale,
+                timeout=timeout,
+            )
+            for asset in wanted
+        }
+        if save:
+            await self.save_level(timeout=timeout)
+        return handles
+
+
+def _class_path(blueprint: URLabBlueprint | str) -> str:
+    return blueprint if isinstance(blueprint, str) else blueprint.class_path
+
+
+def _scene_actor(row: SnapshotRow) -> SceneActor:
+    block = row.urlab
+    return SceneActor(
+        name=row.name,
+        label=row.label,
+        actor_class=row.actor_class,
+        actor_id=row.actor_id,
+        location=row.location,
+        rotation_quat=row.rotation_quat,
+        tags=tuple(row.tags),
+        is_articulation=block is not None,
+        joints=tuple(block.joints) if block else (),
+        actuators=tuple(block.actuators) if block else (),
+        sensors=tuple(block.sensors) if block else (),
+        cameras=tuple(block.cameras) if block else (),
+    )
+
+
+def _quat_of_euler(euler: Vec3 | None) -> Quat:
+    return _IDENTITY

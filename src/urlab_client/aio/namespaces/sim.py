@@ -1,0 +1,82 @@
+"""`client.sim`: the life cycle of a play session."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.namespaces._base import Namespace
+from urlab_client.aio.session import Session
+from urlab_client.aio.state import SimState
+from urlab_client.protocol.enums import PIEState
+from urlab_client.protocol.errors import URLabPIEError
+from urlab_client.protocol.messages.session import HelloOk
+from urlab_client.protocol.messages.sim import BeginPie, PieStatus, StopPie
+from urlab_client.protocol.types import PIEStartResult, PIEStatus
+
+__all__ = ["SimNamespace"]
+
+_SLACK_S = 15.0  # the server may take 10 s to reach its game thread before its own timeout starts
+
+
+class SimNamespace(Namespace):
+    """Starting and stopping play."""
+
+    def __init__(self, session: Session, state: SimState) -> None:
+        super().__init__(session)
+        self._state = state
+
+    async def start(
+        self,
+        level_path: str | None = None,
+        *,
+        timeout_s: float = 30.0,
+        raise_on_failure: bool = True,
+        timeout: Timeout = DEFAULT,
+    ) -> PIEStartResult:
+        """Start play, wait until the model is compiled, and take over the handshake of the new play world.
+
+        Without `level_path`, a healthy session goes on and play is not restarted. Afterwards the step mode that the
+        client was made with is in force again; in live mode physics starts paused.
+
+        Args:
+            level_path: Level to open first, a full `/Game/` path.
+            timeout_s: Seconds that the server waits for the compile.
+            raise_on_failure: Raise unless play is ready; else return the result in any state.
+            timeout: Seconds to wait for the answer; default a little longer than the server itself waits.
+
+        Raises:
+            URLabPIEError: Play did not become ready; its message carries the compile log.
+        """
+        seconds = timeout_s + _SLACK_S if timeout is DEFAULT else timeout
+        reply = await self._call(BeginPie(level_path=level_path, timeout_s=timeout_s), seconds)
+        state = PIEState(reply.state)
+        payload = reply.handshake_payload
+        result = PIEStartResult(state=state, compile_error=reply.compile_error)
+        if payload is not None:
+            await self._state.adopt(payload, timeout=timeout)
+            result.handshake_payload = _plain(payload)
+        if raise_on_failure and not result.is_ready:
+            explanation = reply.compile_error or f"no compiled model within {timeout_s:g} s"
+            raise URLabPIEError(code=str(state), message=explanation, state=state)
+        return result
+
+    async def stop(self, *, timeout: Timeout = DEFAULT) -> None:
+        """End play; a success without one. The session goes on, authoring works.
+
+        Raises:
+            GameThreadTimeout: The editor did not react; often a modal dialog is open.
+        """
+        await self._call(StopPie(), timeout)
+        self._state.on_play_ended()
+
+    async def status(self, *, timeout: Timeout = DEFAULT) -> PIEStatus:
+        """Read the state of play."""
+        reply = await self._call(PieStatus(), timeout)
+        return PIEStatus(state=PIEState(reply.state), compile_error=reply.compile_error, sim_time=reply.sim_time)
+
+
+def _plain(hello: HelloOk) -> dict[str, Any]:
+    return msgspec.to_builtins(hello)

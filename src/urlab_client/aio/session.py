@@ -1,0 +1,122 @@
+"""One RPC session: stamps requests, keeps them one at a time, bounds them in time and decodes the answers."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TypeVar
+
+from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.transport.base import Transport
+from urlab_client.protocol.base import Op, Reply, Request
+from urlab_client.protocol.codec import check_request, decode_reply, encode_request, op_of
+from urlab_client.protocol.errors import URLabTimeoutError
+from urlab_client.protocol.messages.session import Hello, HelloOk
+
+__all__ = ["Session"]
+
+log = logging.getLogger("urlab_client.session")
+
+R = TypeVar("R", bound=Reply)
+
+
+class Session:
+    """A session with one server.
+
+    The server answers one request at a time anyway, and a second request must not be queued behind a first that
+    may fail: so requests wait for their turn here, where waiting is visible and cancellable.
+    """
+
+    def __init__(self, transport: Transport, *, default_timeout: float | None, json: bool = False) -> None:
+        self.session_id = ""
+        self._transport = transport
+        self._default_timeout = default_timeout
+        self._json = json
+        self._turn = asyncio.Lock()
+        self._queued = 0
+
+    @property
+    def transport(self) -> Transport:
+        """What carries the requests."""
+        return self._transport
+
+    async def call(self, request: Request[R], *, timeout: Timeout = DEFAULT) -> R:
+        """Send a request and return its reply.
+
+        Args:
+            request: Any request struct of `urlab_client.protocol.messages`.
+            timeout: Seconds for queueing, sending and the reply; None waits.
+
+        Raises:
+            URLabRPCError: The server refused.
+            URLabConnectionError: The server cannot be reached, or the connection broke.
+            URLabTimeoutError: No reply in time.
+            TypeError, ValueError: The request is malformed; nothing was sent.
+        """
+        op = op_of(request)
+        loop = asyncio.get_running_loop()
+        now = loop.time()
+        seconds = self._seconds(op) if timeout is DEFAULT else timeout
+        deadline = None if seconds is None else now + seconds
+        if self._turn.locked() or self._queued:
+            await self._wait_turn(op, deadline)
+        else:
+            await self._turn.acquire()
+        try:
+            frame = encode_request(request, self.session_id, json=self._json)
+            if not op.hot and not self._json:
+                check_request(request, frame)
+            answer = await self._transport.request(
+                frame, op, deadline=deadline, connect_by=self._connect_by(now, deadline, timeout)
+            )
+        finally:
+            self._turn.release()
+        if log.isEnabledFor(logging.DEBUG):
+            log.debug(
+                "%s: %d bytes out, %d back in %.3f ms", op.name, len(frame), len(answer), 1e3 * (loop.time() - now)
+            )
+        return decode_reply(op, op_reply(request, op), answer)
+
+    async def hello(self, request: Hello, *, timeout: Timeout = DEFAULT) -> HelloOk:
+        """Open a session; the one before it becomes invalid, here and for any other client."""
+        if self._json:
+            request.encoding = "json"
+        self.session_id = ""
+        reply = await self.call(request, timeout=timeout)
+        self.session_id = reply.session_id
+        return reply
+
+    async def aclose(self) -> None:
+        """Release the transport; calls that wait fail with `ClientClosed`."""
+        await self._transport.aclose()
+
+    def _seconds(self, op: Op) -> float | None:
+        if self._default_timeout is None or op.timeout is None:
+            return self._default_timeout
+        return max(op.timeout, self._default_timeout)
+
+    def _connect_by(self, now: float, deadline: float | None, timeout: Timeout) -> float | None:
+        # A slow op may take long to answer; whether a server is there at all shows much sooner.
+        if timeout is not DEFAULT or self._default_timeout is None:
+            return deadline
+        by = now + self._default_timeout
+        return by if deadline is None else min(by, deadline)
+
+    async def _wait_turn(self, op: Op, deadline: float | None) -> None:
+        self._queued += 1
+        try:
+            async with asyncio.timeout_at(deadline):
+                await self._turn.acquire()
+        except TimeoutError:
+            raise URLabTimeoutError(
+                f"{op.name}: another call held {self._transport.endpoint} until the deadline. Nothing was sent.",
+                op=op.name,
+                hint="Calls of one client go one at a time; use a second client or a longer timeout.",
+            ) from None
+        finally:
+            self._queued -= 1
+
+
+def op_reply(request: Request[R], op: Op) -> type[R]:
+    """Return the reply struct of a request, typed: the registry knows it, type checkers know it from the request."""
+    return op.reply  # type: ignore[return-value]  # Op cannot carry R: the registry holds ops of every R

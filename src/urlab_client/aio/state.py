@@ -1,0 +1,308 @@
+"""What the client knows of the simulation: the handshake, the local model, and the state of the last reply.
+
+The client and its namespaces share one `SimState`; users see it through the attributes of `URLabClient`.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import time
+import warnings
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import anyio.to_thread
+import numpy as np
+
+from urlab_client.aio.articulation import URLabArticulation, URLabEntity
+from urlab_client.aio.cameras import URLabCameraView
+from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.layout import FREE, ArticulationLayout, articulation_layouts
+from urlab_client.aio.mirror import Mirror, model_names, write_options
+from urlab_client.aio.records import ArticulationRecord, EntityRecord, Wrenches
+from urlab_client.aio.session import Session
+from urlab_client.protocol.base import Floats
+from urlab_client.protocol.enums import StepMode
+from urlab_client.protocol.errors import ProtocolError
+from urlab_client.protocol.messages.runtime import SetMode
+from urlab_client.protocol.messages.session import (
+    ArticulationInfo,
+    CameraFrame,
+    EntityInfo,
+    EntityState,
+    Hello,
+    HelloOk,
+    StateReply,
+    StepOk,
+)
+from urlab_client.protocol.names import NameMap, owner_of
+from urlab_client.protocol.rows import Pixels, decode_camera
+from urlab_client.protocol.types import SimOptions
+
+if TYPE_CHECKING:
+    import mujoco
+
+__all__ = ["SimState"]
+
+log = logging.getLogger("urlab_client.client")
+
+# Unreal's actor names: class, then a number or a generated id.
+_ENGINE_NAME = re.compile(r"(?P<stem>.+)_C_(?:\d+|UAID_\w+)")
+
+
+class SimState:
+    """Everything that `discover()` and the replies after it say.
+
+    Attributes:
+        session: The RPC session.
+        mirror: Local model and data.
+        mode: Step mode in force, as far as this client knows.
+        wanted_mode: Step mode the user asked for.
+        promoted_from: Mode to go back to on close, after a promotion of our own.
+        level: Observation level of the session.
+        sent_level: Observation level the server has, which an earlier step may have changed.
+        hello: The last handshake, without the model's bytes.
+        articulations: Articulations by key.
+        entities: Every dynamic body by name, articulations included.
+        global_cameras: Scene-level cameras.
+        step_count: Steps since the last handshake or reset.
+        sim_time: Simulation time of the last reply, seconds.
+    """
+
+    def __init__(
+        self, session: Session, *, wanted_mode: StepMode, local_model: bool, check_version: bool, promote: bool
+    ) -> None:
+        self.session = session
+        self.mirror = Mirror()
+        self.wanted_mode = wanted_mode
+        self.mode = StepMode.LIVE
+        self.promoted_from: StepMode | None = None
+        self.level = "standard"
+        self.sent_level = "standard"
+        self.hello: HelloOk | None = None
+        self.articulations: NameMap[URLabArticulation] = NameMap(kind="articulation")
+        self.articulations_by_id: dict[str, URLabArticulation] = {}
+        self.entities: NameMap[URLabEntity] = NameMap(kind="entity")
+        self.global_cameras: NameMap[URLabCameraView] = NameMap(kind="camera")
+        self.step_count = 0
+        self.sim_time = 0.0
+        self.sim_time_sec = self.sim_time_nsec = 0
+        self.wall_time_sec = self.wall_time_nsec = 0
+        self.recv_wall_time_ns = 0
+        self._local_model = local_model
+        self._check_version = check_version
+        self._promote = promote
+        self._records: dict[str, ArticulationRecord] = {}
+        self._entity_records: dict[str, EntityRecord] = {}
+
+    @property
+    def records(self) -> Mapping[str, ArticulationRecord]:
+        """Records of the articulations, by key."""
+        return self._records
+
+    @property
+    def entity_records(self) -> Mapping[str, EntityRecord]:
+        """Records of the plain entities, by name."""
+        return self._entity_records
+
+    def buffered_wrenches(self) -> list[tuple[EntityRecord, Wrenches]]:
+        """Return what a direct step is about to carry."""
+        records: list[EntityRecord] = [*self._records.values(), *self._entity_records.values()]
+        return [(record, dict(record.wrenches)) for record in records if record.wrenches]
+
+    async def open(self, observations: str, *, timeout: Timeout = DEFAULT) -> HelloOk:
+        """Open a session and take over what the server says."""
+        hello = await self.session.hello(Hello(observations=observations), timeout=timeout)
+        self.level = self.sent_level = observations
+        if self._local_model and hello.mjb is not None:
+            mismatch = self.mirror.check_version(hello)
+            if mismatch is not None:
+                if self._check_version:
+                    raise mismatch
+                warnings.warn(
+                    f"{mismatch.args[0]} The local model is compiled here from XML and only approximates the server's.",
+                    stacklevel=2,
+                )
+                request = Hello(observations=observations, include_assets=True)
+                hello = await self.session.hello(request, timeout=timeout)
+        await self.adopt(hello, timeout=timeout)
+        return hello
+
+    async def adopt(self, hello: HelloOk, *, timeout: Timeout = DEFAULT) -> None:
+        """Take over a handshake: load its model, bind the wrappers, bring the server into the wanted step mode."""
+        if self._local_model:
+            await anyio.to_thread.run_sync(self.mirror.load, hello)
+        # The model is loaded; its bytes, several times its size, are not needed any more.
+        hello.mjb = hello.mjb_base64 = hello.mjcf_compiled = hello.vfs_assets = None
+        with self.mirror.lock:
+            self.hello = hello
+            self._bind_articulations(hello.articulations)
+            self._bind_entities(hello.entities or {})
+            cameras = hello.global_cameras or {}
+            self.global_cameras = NameMap({n: URLabCameraView(n, info) for n, info in cameras.items()}, kind="camera")
+            self.step_count = 0
+        if not hello.manager_present:
+            self.mode = StepMode.LIVE
+        elif self._promote and self.wanted_mode in (StepMode.DIRECT, StepMode.PUPPET):
+            reply = await self.session.call(SetMode(mode=self.wanted_mode), timeout=timeout)
+            self.mode = StepMode(reply.current_mode)
+            if reply.previous_mode != reply.current_mode:
+                self.promoted_from = StepMode(reply.previous_mode)
+        else:
+            self.mode = StepMode.LIVE if self.wanted_mode is StepMode.AUTO else self.wanted_mode
+        log.info(
+            "session with %s, MuJoCo %s: %d articulations, mode %s",
+            hello.urlab_version, hello.mujoco_version, len(self.articulations), self.mode,
+        )  # fmt: skip
+
+    def _bind_articulations(self, infos: list[ArticulationInfo]) -> None:
+        model = self.mirror.model
+        keys = [info.prefix for info in infos]
+        layouts = articulation_layouts(model, keys) if model is not None else {}
+        wrappers: dict[str, URLabArticulation] = {}
+        aliases: dict[str, list[str]] = {}
+        for info in infos:
+            key = info.prefix
+            layout = layouts.get(key) or ArticulationLayout()
+            record = self._records.get(key)
+            if record is None:
+                record = self._records[key] = ArticulationRecord(self.mirror, info, layout)
+            else:
+                record.bind(info, layout)
+            wrappers[key] = self.articulations.get(key) or URLabArticulation(record, self.session)
+            found = _ENGINE_NAME.fullmatch(key)
+            for alias in {info.actor_id, found["stem"] if found else ""} - {""}:
+                aliases.setdefault(alias, []).append(key)
+        self._records = {key: self._records[key] for key in keys}
+        self.articulations = NameMap(wrappers, aliases, kind="articulation")
+        self.articulations_by_id = {art.actor_id: art for art in wrappers.values() if art.actor_id}
+
+    def _bind_entities(self, infos: dict[str, EntityInfo]) -> None:
+        model = self.mirror.model
+        if not infos and model is not None:
+            infos = _entities_of(model, frozenset(self._records))
+        plain: dict[str, URLabEntity] = {}
+        records: dict[str, EntityRecord] = {}
+        for name, info in infos.items():
+            record = self._entity_records.get(name) or EntityRecord(self.mirror, name)
+            record.bind_entity(info)
+            records[name] = record
+            known = self.entities.get(name)
+            plain[name] = known if known is not None and type(known) is URLabEntity else URLabEntity(record)
+        self._entity_records = records
+        self.entities = NameMap({**self.articulations, **plain}, kind="entity")
+
+    def absorb(self, reply: StateReply, op: str, *, into_mirror: bool = True) -> None:
+        """Take over the state in a reply, whole or not at all.
+
+        Args:
+            reply: The reply.
+            op: Op that it answers, for messages.
+            into_mirror: Also write it into the local data; not after a puppet step, whose state came from there.
+
+        Raises:
+            ProtocolError: Something in it does not fit the model or the cameras; nothing was taken over.
+        """
+        received = time.time_ns()
+        pairs = [(self._records[key], s) for key, s in reply.per_articulation.items() if key in self._records]
+        for record, state in pairs:
+            record.check(state, op)
+        entities: Mapping[str, EntityState] = {}
+        frames: list[tuple[URLabCameraView, Pixels]] = []
+        if isinstance(reply, StepOk):
+            entities = reply.entities or {}
+            frames = [(view, _pixels(view, frame)) for view, frame in self._frames(reply.cameras or {})]
+        with self.mirror.lock:
+            for record, state in pairs:
+                record.absorb(state)
+                if into_mirror:
+                    record.write_mirror(state)
+            for name, entity in entities.items():
+                if name in self._entity_records:
+                    self._entity_records[name].absorb_pose(entity)
+            for view, pixels in frames:
+                view.latest_frame, view.sim_time = pixels, reply.time
+            if into_mirror and self.mirror.data is not None:
+                self.mirror.data.time = reply.time
+            self.mirror.mark_stale()
+            self._absorb_clocks(reply, received)
+
+    def _absorb_clocks(self, reply: StateReply, received: int) -> None:
+        self.step_count = reply.step
+        self.sim_time = reply.time
+        self.recv_wall_time_ns = received
+        if reply.sim_time is not None:
+            self.sim_time_sec, self.sim_time_nsec = reply.sim_time.sec, reply.sim_time.nsec
+        if reply.wall_time is not None:
+            self.wall_time_sec, self.wall_time_nsec = reply.wall_time.sec, reply.wall_time.nsec
+
+    def mirror_qpos(self, key: str, qpos: Floats) -> None:
+        """Take over the leading joint positions of an articulation that `set_qpos` wrote."""
+        record = self._records.get(key)
+        if record is None:
+            return
+        with self.mirror.lock:
+            record.qpos = np.concatenate([qpos, record.qpos[len(qpos) :]])
+            if self.mirror.data is not None:
+                self.mirror.data.qpos[record.layout.qpos_adr[: len(qpos)]] = qpos
+            self.mirror.mark_stale()
+
+    def mirror_options(self, options: SimOptions) -> None:
+        """Take over the options that `set_sim_options` echoed."""
+        if self.mirror.model is None:
+            return
+        with self.mirror.lock:
+            write_options(self.mirror.model.opt, options)
+
+    def on_play_ended(self) -> None:
+        """Note that the play session is gone: the server is back in live mode, without articulations."""
+        self.mode = StepMode.LIVE
+        self.promoted_from = None
+        if self.hello is not None:
+            self.hello.manager_present = False
+
+    def _frames(self, cameras: Mapping[str, CameraFrame]) -> list[tuple[URLabCameraView, CameraFrame]]:
+        found: list[tuple[URLabCameraView, CameraFrame]] = []
+        for name, frame in cameras.items():
+            view = self.camera(name)
+            if view is None:
+                raise ProtocolError(f"step: a frame of camera {name!r}, which the handshake does not list.", op="step")
+            found.append((view, frame))
+        return found
+
+    def camera(self, name: str) -> URLabCameraView | None:
+        """Return the camera that the wire calls `<articulation>/<camera>` or just `<camera>`, or None."""
+        prefix, slash, short = name.rpartition("/")
+        if slash:
+            art = self.articulations.get(prefix)
+            return None if art is None else art.cameras.get(short)
+        # As on the server, the articulation listed last wins when several have a camera of that name.
+        owners = [art for art in self.articulations.values() if name in art.cameras]
+        return owners[-1].cameras[name] if owners else self.global_cameras.get(name)
+
+
+def _pixels(view: URLabCameraView, frame: CameraFrame) -> Pixels:
+    return decode_camera(frame.data, view.mode, frame.width, frame.height, where=view.name).pixels
+
+
+def _entities_of(model: mujoco.MjModel, keys: frozenset[str]) -> dict[str, EntityInfo]:
+    """Find the dynamic bodies of no articulation: the plugin lists none, but they are in the model."""
+    bodies, joints = model_names(model, "body"), model_names(model, "joint")
+    found: dict[str, EntityInfo] = {}
+    for body_id, name in enumerate(bodies):
+        if body_id == 0 or not name or owner_of(name, keys) is not None:
+            continue
+        joint = int(model.body_jntadr[body_id])
+        if joint >= 0 and model.jnt_type[joint] == FREE:
+            found[name] = EntityInfo(
+                id=body_id,
+                has_free_base=True,
+                free_joint=joints[joint] or None,
+                free_joint_id=joint,
+                qpos_offset=int(model.jnt_qposadr[joint]),
+                qvel_offset=int(model.jnt_dofadr[joint]),
+            )
+        elif model.body_mocapid[body_id] >= 0:
+            found[name] = EntityInfo(id=body_id, has_free_base=False)
+    return found

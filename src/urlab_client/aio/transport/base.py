@@ -1,0 +1,65 @@
+"""What a session needs from a transport."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from msgspec import Struct
+
+from urlab_client.protocol.base import Op
+
+__all__ = ["Transport", "TransportStats"]
+
+
+class TransportStats(Struct):
+    """Counters of one client's requests.
+
+    Attributes:
+        sent: Requests handed to the transport.
+        received: Replies matched to a request.
+        late: Replies that came after their request had given up; dropped.
+        connects: Connections made; more than one means the server was lost and found again.
+    """
+
+    sent: int = 0
+    received: int = 0
+    late: int = 0
+    connects: int = 0
+
+
+class Transport(Protocol):
+    """One request at a time goes out, one reply comes back. Used from one event loop."""
+
+    stats: TransportStats
+
+    @property
+    def endpoint(self) -> str:
+        """Where requests go, for messages."""
+        ...
+
+    @property
+    def connected(self) -> bool:
+        """Whether a server is on the line."""
+        ...
+
+    async def request(self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None) -> bytes:
+        """Send `frame` and return the reply's bytes.
+
+        Args:
+            frame: The encoded request.
+            op: Its op: named in errors, and decides what a lost reply means.
+            deadline: Loop time at which to give up; None waits.
+            connect_by: Loop time by which a connection must stand; None waits.
+
+        Raises:
+            ServerUnreachable: No connection by `connect_by`; nothing was sent.
+            URLabTimeoutError: Sent, but no reply by `deadline`.
+            ConnectionLost: The connection broke after sending; the op changes nothing.
+            OutcomeUnknown: The connection broke after sending; the op may have been executed.
+            ClientClosed: The client was closed.
+        """
+        ...
+
+    async def aclose(self) -> None:
+        """Fail what is waiting and release everything. Idempotent."""
+        ...

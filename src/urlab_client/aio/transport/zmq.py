@@ -1,0 +1,288 @@
+"""Requests over a ZeroMQ DEALER socket, driven by the caller's asyncio loop without a thread of our own.
+
+The server's REP socket echoes the envelope, so each request carries an id: a reply that comes after its request gave
+up is recognised and dropped, and the next request works. Replies complete futures from the reader callback; nothing
+ever cancels a receive, which could lose a frame.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, cast
+
+import zmq
+from zmq.utils.monitor import recv_monitor_message
+
+from urlab_client.aio.transport.base import TransportStats
+from urlab_client.protocol.base import Op, Timing
+from urlab_client.protocol.errors import (
+    ClientClosed,
+    ConnectionLost,
+    OutcomeUnknown,
+    ServerUnreachable,
+    URLabError,
+    URLabTimeoutError,
+)
+
+__all__ = ["ZmqTransport"]
+
+log = logging.getLogger("urlab_client.transport")
+
+_HEARTBEAT_MS = 1000
+_SILENCE_MS = 3000  # three missed heartbeats: answered by the peer's I/O thread even while its worker is busy
+_RECONNECT_MS = 50
+_RECONNECT_MAX_MS = 1000
+
+_WATCHED = (
+    zmq.Event.CONNECTED
+    | zmq.Event.CONNECT_RETRIED
+    | zmq.Event.DISCONNECTED
+    | zmq.Event.HANDSHAKE_SUCCEEDED
+    | zmq.Event.HANDSHAKE_FAILED_AUTH
+    | zmq.Event.HANDSHAKE_FAILED_NO_DETAIL
+    | zmq.Event.HANDSHAKE_FAILED_PROTOCOL
+)
+_HANDSHAKE_FAILURES = (
+    zmq.Event.HANDSHAKE_FAILED_AUTH,
+    zmq.Event.HANDSHAKE_FAILED_NO_DETAIL,
+    zmq.Event.HANDSHAKE_FAILED_PROTOCOL,
+)
+
+
+@dataclass(slots=True)
+class _Sent:
+    """A request on the wire."""
+
+    op: Op
+    reply: asyncio.Future[bytes]
+
+
+class ZmqTransport:
+    """Transport over one DEALER socket; connects when first used and reconnects by itself."""
+
+    stats: TransportStats
+
+    def __init__(self, endpoint: str) -> None:
+        self.stats = TransportStats()
+        self._endpoint = endpoint
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._context: zmq.Context[zmq.Socket[bytes]] | None = None
+        self._socket: zmq.Socket[bytes] | None = None
+        self._monitor: zmq.Socket[bytes] | None = None
+        self._sent: dict[bytes, _Sent] = {}
+        self._waiting: set[asyncio.Future[None]] = set()
+        self._last_id = 0
+        self._connected = False
+        self._closed = False
+        self._obstacle = "the host does not answer"
+
+    @property
+    def endpoint(self) -> str:
+        """The server's RPC endpoint."""
+        return self._endpoint
+
+    @property
+    def connected(self) -> bool:
+        """Whether a server is on the line."""
+        return self._connected
+
+    async def request(self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None) -> bytes:
+        """See `Transport.request`."""
+        loop, socket = self._open()
+        while True:
+            if not self._connected:
+                await self._wait_connected(loop, op, connect_by)
+            self._last_id += 1
+            key = self._last_id.to_bytes(8, "big")
+            try:
+                socket.send_multipart((key, b"", frame), zmq.NOBLOCK)
+            except zmq.Again:
+                # The line went down and the event that says so has not been read yet.
+                self._connected = False
+                continue
+            break
+        started = loop.time()
+        entry = _Sent(op, loop.create_future())
+        self._sent[key] = entry
+        self.stats.sent += 1
+        timer = None if deadline is None else loop.call_at(deadline, self._expire, entry, deadline - started)
+        # Sending may have consumed the descriptor's edge, so look for what arrived meanwhile.
+        if cast("int", socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
+            loop.call_soon(self._on_readable)
+        try:
+            return await entry.reply
+        finally:
+            if timer is not None:
+                timer.cancel()
+            self._sent.pop(key, None)
+
+    async def aclose(self) -> None:
+        """See `Transport.aclose`."""
+        if self._closed:
+            return
+        self._closed = True
+        self._connected = False
+        closed = ClientClosed(f"The client of {self._endpoint} was closed.", hint="Make a new client.")
+        self._fail_sent(lambda _: closed)
+        for waiter in self._waiting:
+            if not waiter.done():
+                waiter.set_exception(closed)
+        if self._loop is None or self._socket is None or self._monitor is None or self._context is None:
+            return
+        self._loop.remove_reader(self._socket)
+        self._loop.remove_reader(self._monitor)
+        self._socket.disable_monitor()
+        self._monitor.close(linger=0)
+        self._socket.close(linger=0)
+        self._context.term()
+
+    def _open(self) -> tuple[asyncio.AbstractEventLoop, zmq.Socket[bytes]]:
+        if self._closed:
+            raise ClientClosed(f"The client of {self._endpoint} is closed.", hint="Make a new client.")
+        loop = asyncio.get_running_loop()
+        if self._socket is not None:
+            if loop is not self._loop:
+                raise URLabError(
+                    "This client belongs to another event loop.", hint="Make one client per loop, or use the façade."
+                )
+            return loop, self._socket
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        socket = context.socket(zmq.DEALER)
+        socket.linger = 0
+        # A request must not wait in a queue for a server that is gone: it would reach the next one.
+        socket.immediate = True
+        socket.heartbeat_ivl = _HEARTBEAT_MS
+        socket.heartbeat_timeout = _SILENCE_MS
+        socket.heartbeat_ttl = _SILENCE_MS
+        socket.reconnect_ivl = _RECONNECT_MS
+        socket.reconnect_ivl_max = _RECONNECT_MAX_MS
+        monitor = socket.get_monitor_socket(_WATCHED)
+        try:
+            loop.add_reader(monitor, self._on_event)
+            loop.add_reader(socket, self._on_readable)
+            socket.connect(self._endpoint)
+        except (NotImplementedError, zmq.ZMQError) as error:
+            socket.disable_monitor()
+            monitor.close(linger=0)
+            socket.close(linger=0)
+            context.term()
+            if isinstance(error, NotImplementedError):
+                raise URLabError(
+                    f"{type(loop).__name__} cannot watch sockets.",
+                    hint="Run the client on a selector event loop, or use the blocking client, which brings its own.",
+                ) from error
+            raise ValueError(f"{self._endpoint!r} is not an address ZeroMQ can connect to: {error}") from error
+        self._loop, self._context, self._socket, self._monitor = loop, context, socket, monitor
+        loop.call_soon(self._on_event)
+        return loop, socket
+
+    async def _wait_connected(self, loop: asyncio.AbstractEventLoop, op: Op, connect_by: float | None) -> None:
+        waiter: asyncio.Future[None] = loop.create_future()
+        started = loop.time()
+        self._waiting.add(waiter)
+
+        def give_up() -> None:
+            if not waiter.done():
+                waiter.set_exception(
+                    ServerUnreachable(
+                        f"{op.name}: no connection to {self._endpoint} within "
+                        f"{_ms(loop.time() - started)}: {self._obstacle}. Nothing was sent.",
+                        op=op.name,
+                        hint="Is the editor (with URLab's bridge) or `urlab serve` running there, on this port?",
+                    )
+                )
+
+        timer = None if connect_by is None else loop.call_at(connect_by, give_up)
+        try:
+            await waiter
+        finally:
+            if timer is not None:
+                timer.cancel()
+            self._waiting.discard(waiter)
+
+    def _expire(self, entry: _Sent, seconds: float) -> None:
+        if entry.reply.done():
+            return
+        executed = "" if entry.op.effect is Timing.READ else " The request was sent and may still be executed."
+        entry.reply.set_exception(
+            URLabTimeoutError(
+                f"{entry.op.name}: no reply from {self._endpoint} within {_ms(seconds)}.{executed}",
+                op=entry.op.name,
+                hint="The server is on the line but busy or blocked; allow more time with timeout=…",
+            )
+        )
+
+    def _on_readable(self) -> None:
+        socket = self._socket
+        if socket is None or self._closed:
+            return
+        # The descriptor is edge-triggered: read until nothing is left.
+        while cast("int", socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
+            try:
+                frames = socket.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            self._deliver(frames)
+
+    def _deliver(self, frames: list[bytes]) -> None:
+        entry = self._sent.get(frames[0]) if len(frames) == 3 else None
+        if entry is None or entry.reply.done():
+            self.stats.late += 1
+            log.debug("%s: dropped a reply that nobody waits for any more", self._endpoint)
+            return
+        self.stats.received += 1
+        entry.reply.set_result(frames[2])
+
+    def _on_event(self) -> None:
+        while self._monitor is not None and not self._closed:
+            try:
+                message = cast("dict[str, Any]", recv_monitor_message(self._monitor, zmq.NOBLOCK))
+            except zmq.Again:
+                return
+            self._note(zmq.Event(message["event"]))
+
+    def _note(self, event: zmq.Event) -> None:
+        if event is zmq.Event.HANDSHAKE_SUCCEEDED:
+            self._connected = True
+            self.stats.connects += 1
+            log.info("connected to %s", self._endpoint)
+            for waiter in self._waiting:
+                if not waiter.done():
+                    waiter.set_result(None)
+        elif event is zmq.Event.DISCONNECTED:
+            self._lose()
+        elif event is zmq.Event.CONNECT_RETRIED:
+            self._obstacle = "connection refused"
+        elif event is zmq.Event.CONNECTED:
+            self._obstacle = "something accepts the connection but does not speak ZeroMQ"
+        elif event in _HANDSHAKE_FAILURES:
+            self._obstacle = "the ZeroMQ handshake failed"
+
+    def _lose(self) -> None:
+        self._on_readable()  # what arrived before the line broke still counts
+        if self._connected:
+            log.info("lost %s; reconnecting", self._endpoint)
+        self._connected = False
+        self._obstacle = "the connection was lost and not restored"
+        self._fail_sent(self._lost)
+
+    def _lost(self, entry: _Sent) -> URLabError:
+        name = entry.op.name
+        text = f"{name}: the connection to {self._endpoint} was lost after the request was sent."
+        if entry.op.effect is Timing.READ:
+            return ConnectionLost(text, op=name, hint="The op changes nothing: it can be sent again.")
+        return OutcomeUnknown(
+            text, op=name, hint="Whether it was executed is unknown: call discover() and look at the state."
+        )
+
+    def _fail_sent(self, error: Callable[[_Sent], URLabError]) -> None:
+        for entry in self._sent.values():
+            if not entry.reply.done():
+                entry.reply.set_exception(error(entry))
+
+
+def _ms(seconds: float) -> str:
+    return f"{seconds * 1000:.0f} ms"
