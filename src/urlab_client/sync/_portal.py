@@ -16,14 +16,15 @@ import warnings
 import weakref
 from collections.abc import Callable, Coroutine
 from types import TracebackType
-from typing import Any, Generic, TypeVar, cast, overload
+from typing import Any, Generic, Protocol, TypeVar, cast, overload
 
 from urlab_client.protocol.errors import ClientClosed, ForkedError, URLabError, URLabRPCError
 from urlab_client.protocol.names import NameMap
 
-__all__ = ["GRACE", "Facade", "FacadeRoot", "Portal"]
+__all__ = ["GRACE", "Facade", "FacadeRoot", "Portal", "aio_of"]
 
 T = TypeVar("T")
+A_co = TypeVar("A_co", covariant=True)
 F = TypeVar("F", bound="Facade")
 
 GRACE = 1.0
@@ -426,6 +427,16 @@ class Facade:
             f"{type(self).__name__} cannot be pickled or copied: it belongs to a connection of this process. "
             "Make a client where it is needed."
         )
+
+
+class _Twin(Protocol[A_co]):
+    @property
+    def _aio(self) -> A_co: ...
+
+
+def aio_of(twin: _Twin[A_co]) -> A_co:
+    """Return the async object that a façade object stands for."""
+    return twin._aio  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
 
 
 class FacadeRoot(Facade):

@@ -1,0 +1,5 @@
+"""The namespaces."""
+
+from toylab.aio.namespaces.scene import Scene
+
+__all__ = ["Scene"]
