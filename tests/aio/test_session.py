@@ -1,0 +1,263 @@
+"""Deadlines, lost servers and cancellation: after each of them the client tells what happened and goes on working."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from typing import Any
+
+import pytest
+
+from urlab_client.aio import URLabClient
+from urlab_client.protocol.errors import (
+    ClientClosed,
+    ConnectionLost,
+    OutcomeUnknown,
+    ProtocolError,
+    ServerUnreachable,
+    SessionTakenOver,
+    URLabRPCError,
+    URLabTimeoutError,
+)
+from urlab_client.protocol.messages.session import Step
+
+PAUSED = {"op": "set_paused_ok", "paused": True}
+LEVEL = {"op": "current_level_ok", "level_path": "/Game/Levels/lab"}
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+async def test_refused_names_address_and_stage() -> None:
+    port = free_port()
+    async with URLabClient("tcp://127.0.0.1", step_port=port, rcv_timeout_ms=300) as client:
+        with pytest.raises(
+            ServerUnreachable, match=rf"tcp://127.0.0.1:{port} within \d+ ms: connection refused"
+        ) as info:
+            await client.discover()
+    assert isinstance(info.value, ConnectionError)
+    assert info.value.op == "hello"
+    assert "urlab serve" in str(info.value)
+
+
+async def test_something_else_listens_there() -> None:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen()
+        port = listener.getsockname()[1]
+        async with URLabClient("tcp://127.0.0.1", step_port=port, rcv_timeout_ms=300) as client:
+            with pytest.raises(ServerUnreachable, match="does not speak ZeroMQ"):
+                await client.discover()
+
+
+async def test_a_port_in_the_address_is_the_rpc_port(scripted: Any) -> None:
+    async with URLabClient(f"tcp://127.0.0.1:{scripted.port}", local_model=False) as client:
+        await client.discover()
+        assert client.session_id == "11111111-2222-3333-4444-555555555555"
+        assert client.connected
+
+
+async def test_client_started_before_the_server_connects_when_it_comes(scripted: Any) -> None:
+    port = scripted.port
+    scripted.close()
+    async with URLabClient("tcp://127.0.0.1", step_port=port, local_model=False) as client:
+        call = asyncio.create_task(client.discover())
+        await asyncio.to_thread(_refused, port)
+        reborn = type(scripted)(port)
+        try:
+            await call
+        finally:
+            reborn.close()
+    assert client.session_id
+
+
+def _refused(port: int) -> None:
+    with socket.socket() as probe, pytest.raises(ConnectionRefusedError):
+        probe.connect(("127.0.0.1", port))
+
+
+async def test_silence_is_a_timeout_and_the_late_reply_is_dropped(client: Any, scripted: Any) -> None:
+    await client.discover()
+    with pytest.raises(URLabTimeoutError, match=r"set_paused: no reply from .* within 50 ms.*may still be executed"):
+        await client.runtime.set_paused(True, timeout=0.05)
+    scripted.release({"op": "set_paused_ok", "paused": False})
+    scripted.on("set_paused", PAUSED)
+    assert await client.runtime.set_paused(True) is True
+    scripted.on("current_level", LEVEL)
+    assert await client.scene.current_level() == "/Game/Levels/lab"
+    assert client.transport_stats.late == 1
+
+
+async def test_default_timeout_comes_from_the_client(client: Any) -> None:
+    await client.discover()
+    with pytest.raises(URLabTimeoutError, match="within 500 ms"):
+        await client.runtime.set_paused(True)
+
+
+async def test_cancelled_call_leaves_the_client_usable(client: Any, scripted: Any) -> None:
+    await client.discover()
+    call = asyncio.create_task(client.runtime.set_paused(True))
+    await asyncio.to_thread(scripted.held.get, timeout=5)
+    call.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await call
+    scripted.on("set_paused", PAUSED)
+    assert await client.runtime.set_paused(True) is True
+
+
+async def test_users_own_timeout_works(client: Any, scripted: Any) -> None:
+    await client.discover()
+    with pytest.raises(TimeoutError):
+        async with asyncio.timeout(0.05):
+            await client.runtime.set_paused(True, timeout=None)
+    scripted.on("set_paused", PAUSED)
+    assert await client.runtime.set_paused(True) is True
+
+
+async def test_calls_of_several_tasks_go_one_at_a_time(client: Any, scripted: Any) -> None:
+    scripted.on("set_sim_speed", lambda request: {"op": "set_sim_speed_ok", "percent": request["percent"]})
+    await client.discover()
+    speeds = [float(percent) for percent in range(5, 55)]
+    assert await asyncio.gather(*(client.runtime.set_sim_speed(percent) for percent in speeds)) == speeds
+
+
+async def test_a_queued_call_times_out_without_being_sent(client: Any, scripted: Any) -> None:
+    await client.discover()
+    scripted.request()
+    first = asyncio.create_task(client.runtime.set_paused(True, timeout=None))
+    await asyncio.to_thread(scripted.request)
+    with pytest.raises(URLabTimeoutError, match=r"current_level: another call held .* Nothing was sent"):
+        await client.scene.current_level(timeout=0.05)
+    scripted.release(PAUSED)
+    assert await first is True
+    assert scripted.seen.empty()
+
+
+@pytest.mark.parametrize(
+    ("call", "error"),
+    [
+        (lambda c: c.call(Step(), timeout=5), OutcomeUnknown),
+        (lambda c: c.runtime.set_paused(True, timeout=5), OutcomeUnknown),
+        (lambda c: c.scene.current_level(timeout=5), ConnectionLost),
+    ],
+)
+async def test_a_server_that_dies_mid_call(client: Any, scripted: Any, call: Any, error: type[Exception]) -> None:
+    await client.discover()
+    scripted.request()
+    pending = asyncio.create_task(call(client))
+    await asyncio.to_thread(scripted.request)
+    await asyncio.to_thread(scripted.close)
+    with pytest.raises(error, match="was lost after the request was sent"):
+        await pending
+    assert not client.connected
+
+
+async def test_a_restarted_server_is_found_again(client: Any, scripted: Any) -> None:
+    await client.discover()
+    await asyncio.to_thread(scripted.close)
+    reborn = type(scripted)(scripted.port)
+    try:
+        await client.discover(timeout=5)
+        assert client.transport_stats.connects == 2
+    finally:
+        await asyncio.to_thread(reborn.close)
+
+
+async def test_an_expired_session_says_so_and_discover_recovers(client: Any, scripted: Any) -> None:
+    await client.discover()
+    scripted.on("set_paused", {"op": "error", "code": "session_expired", "message": "unknown session"})
+    with pytest.raises(SessionTakenOver, match=r"discover\(\)") as info:
+        await client.runtime.set_paused(True)
+    assert isinstance(info.value, URLabRPCError)
+    assert isinstance(info.value, ConnectionError)
+    assert info.value.code == "session_expired"
+    await client.discover()
+    scripted.on("set_paused", PAUSED)
+    assert await client.runtime.set_paused(True) is True
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        b"",
+        b"\xc1",
+        b"\x93\x01\x02\x03",
+        b"{",
+        LEVEL,
+        {"op": "set_paused_ok"},
+        {"op": "set_paused_ok", "paused": "maybe"},
+    ],
+)
+async def test_a_nonsensical_answer_is_a_protocol_error(client: Any, scripted: Any, answer: Any) -> None:
+    await client.discover()
+    scripted.on("set_paused", answer)
+    with pytest.raises(ProtocolError, match="set_paused: the server's answer is not a valid set_paused_ok"):
+        await client.runtime.set_paused(True)
+    scripted.on("set_paused", PAUSED)
+    assert await client.runtime.set_paused(True) is True
+
+
+async def test_unknown_error_codes_stay_plain_rpc_errors(client: Any, scripted: Any) -> None:
+    await client.discover()
+    scripted.on("set_paused", {"op": "error", "code": "brand_new", "message": "from the future"})
+    with pytest.raises(URLabRPCError, match="set_paused: brand_new: from the future") as info:
+        await client.runtime.set_paused(True)
+    assert type(info.value) is URLabRPCError
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda c: c.runtime.set_sim_speed("fast"), TypeError, "set_sim_speed: percent: expected `float`, got `str`"),
+        (lambda c: c.scene.spawn_actor("b", "a", location=(1, 2)), ValueError, "location takes 3 numbers, got 2"),
+        (lambda c: c.runtime.set_mode("fast"), ValueError, "fast"),
+        (lambda c: c.runtime.set_sim_options(timestp=1), TypeError, "unknown option timestp"),
+    ],
+)
+async def test_mistakes_are_refused_before_anything_is_sent(
+    client: Any, scripted: Any, call: Any, error: type[Exception], message: str
+) -> None:
+    await client.discover()
+    scripted.request()
+    with pytest.raises(error, match=message):
+        await call(client)
+    scripted.on("current_level", LEVEL)
+    await client.scene.current_level()
+    assert scripted.request()["op"] == "current_level"
+
+
+async def test_closing_fails_what_waits_and_everything_after(client: Any, scripted: Any) -> None:
+    await client.discover()
+    scripted.request()
+    pending = asyncio.create_task(client.runtime.set_paused(True))
+    await asyncio.to_thread(scripted.request)
+    await client.close()
+    await client.close()
+    with pytest.raises(ClientClosed):
+        await pending
+    with pytest.raises(ClientClosed):
+        await client.discover()
+
+
+async def test_many_clients_share_a_loop(scripted: Any) -> None:
+    scripted.on("current_level", LEVEL)
+    clients = [URLabClient("tcp://127.0.0.1", step_port=scripted.port, local_model=False) for _ in range(8)]
+    levels = await asyncio.gather(*(client.scene.current_level() for client in clients))
+    assert levels == ["/Game/Levels/lab"] * 8
+    await asyncio.gather(*(client.close() for client in clients))
+
+
+@pytest.mark.parametrize("address", ["localhost", "http://x", "tcp://", "sim://"])
+def test_malformed_addresses_are_refused(address: str) -> None:
+    with pytest.raises(ValueError, match=r"tcp://HOST|names no model"):
+        URLabClient(address)
+
+
+async def test_a_client_stays_with_its_loop(scripted: Any) -> None:
+    async with URLabClient("tcp://127.0.0.1", step_port=scripted.port, local_model=False) as client:
+        await client.discover()
+        with pytest.raises(Exception, match="another event loop"):
+            await asyncio.to_thread(asyncio.run, client.discover())
