@@ -1,0 +1,59 @@
+"""The one session of a server: its id, the encoding of replies and the observation level.
+
+For the dispatcher and the handlers. It outlives play sessions and level changes, ends with the server or with the next
+`hello`, and never by time.
+"""
+
+from __future__ import annotations
+
+import uuid
+
+from urlab_client.protocol.enums import ObservationLevel
+
+__all__ = ["Session"]
+
+
+class Session:
+    """What the server remembers between requests, apart from the world.
+
+    Attributes:
+        id: Active session id, a lower-case GUID; empty before the first `hello`.
+        json: Whether replies are JSON instead of msgpack, whoever asks.
+        level: Observation level of replies that carry state.
+    """
+
+    __slots__ = ("id", "json", "level")
+
+    def __init__(self) -> None:
+        self.id = ""
+        self.json = False
+        self.level = ObservationLevel.STANDARD
+
+    def open(self, *, observations: str | None, encoding: str | None) -> str:
+        """Start a new session, which ends the previous one, and return its id.
+
+        Args:
+            observations: Level name in any case, where an unknown one means standard; None keeps the level.
+            encoding: `json` in any case for JSON replies; anything else means msgpack.
+        """
+        self.id = str(uuid.uuid4())
+        self.json = encoding is not None and encoding.lower() == "json"
+        if observations is not None:
+            self.level = _level(observations) or ObservationLevel.STANDARD
+        return self.id
+
+    def accepts(self, session_id: str) -> bool:
+        """Whether a request with this id belongs to the active session."""
+        return session_id != "" and session_id == self.id
+
+    def adopt_level(self, observations: str | None) -> None:
+        """Take over the level named in a step, for this and later replies; unknown names change nothing."""
+        if observations is not None:
+            self.level = _level(observations) or self.level
+
+
+def _level(name: str) -> ObservationLevel | None:
+    try:
+        return ObservationLevel(name.lower())
+    except ValueError:
+        return None
