@@ -16,6 +16,7 @@ from typing import Any, TypeVar, cast
 import msgspec
 import numpy as np
 from msgspec import Struct
+from msgspec.structs import force_setattr
 
 from urlab_client.protocol.base import Op, Reply, Request
 from urlab_client.protocol.errors import ProtocolError, rpc_error
@@ -220,7 +221,7 @@ def _widener(struct: type[Struct]) -> Widener | None:
         for name, widen in plan:
             item = getattr(value, name)
             if item is not None:
-                setattr(value, name, widen(item))
+                force_setattr(value, name, widen(item))  # public types in replies are frozen
         return value
 
     return apply

@@ -37,7 +37,7 @@ __all__ = [
 ]
 
 
-class ErrorReply(Reply, tag="error", kw_only=True):
+class ErrorReply(Reply, tag="error", kw_only=True, omit_defaults=True):
     """The server refused a request."""
 
     code: Annotated[str, doc("Short stable code.")]

@@ -1,0 +1,285 @@
+"""Requests and replies as bytes: golden frames, the plugin's number rules, JSON, and what is refused."""
+
+from __future__ import annotations
+
+import re
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from vectors import load
+
+from urlab_client.protocol.base import Op, Reply, Request
+from urlab_client.protocol.codec import check_request, decode_reply, encode_reply, encode_request
+from urlab_client.protocol.errors import (
+    PathNotWritable,
+    ProtocolError,
+    SessionTakenOver,
+    URLabError,
+    WrongTransport,
+)
+from urlab_client.protocol.messages.recording import RecordingSaveOk
+from urlab_client.protocol.messages.runtime import SetModeOk, SetPausedOk, SetSimSpeed
+from urlab_client.protocol.messages.session import (
+    ArticulationCommand,
+    ArticulationState,
+    BodyPose,
+    Clock,
+    EntityState,
+    ErrorReply,
+    HelloOk,
+    Step,
+    StepOk,
+    TwistState,
+)
+from urlab_client.protocol.registry import OPS
+
+OPS_BY_NAME = sorted(OPS)
+
+
+def numbers_of(frame: bytes) -> list[object]:
+    """All numbers in a msgpack frame, with the types they travel as."""
+
+    def walk(value: object) -> list[object]:
+        if isinstance(value, dict):
+            return [n for item in value.values() for n in walk(item)]
+        if isinstance(value, list):
+            return [n for item in value for n in walk(item)]
+        return [] if isinstance(value, bool) or not isinstance(value, (int, float)) else [value]
+
+    return walk(msgspec.msgpack.decode(frame))
+
+
+def sample(kind: object) -> object:
+    """A plausible plain value of a field type."""
+    info = msgspec.inspect.type_info(kind) if not isinstance(kind, msgspec.inspect.Type) else kind
+    match info:
+        case msgspec.inspect.Metadata(type=inner):
+            return sample(inner)
+        case msgspec.inspect.UnionType(types=types):
+            return sample(next(t for t in types if not isinstance(t, msgspec.inspect.NoneType)))
+        case msgspec.inspect.StrType():
+            return "text"
+        case msgspec.inspect.LiteralType(values=values):
+            return values[0]
+        case msgspec.inspect.BoolType():
+            return True
+        case msgspec.inspect.IntType():
+            return 3
+        case msgspec.inspect.FloatType():
+            return 0.5
+        case msgspec.inspect.BytesType():
+            return b"\x00\xffbytes"
+        case msgspec.inspect.CustomType():
+            return np.array([0.25, -1.0])
+        case msgspec.inspect.TupleType(item_types=items):
+            return tuple(sample(item) for item in items)
+        case msgspec.inspect.ListType(item_type=item):
+            return [sample(item)]
+        case msgspec.inspect.DictType(value_type=item):
+            return {"key": sample(item)}
+        case msgspec.inspect.StructType(cls=cls):
+            return filled(cls)
+        case msgspec.inspect.AnyType():
+            return {"nested": 1}
+        case _:
+            raise AssertionError(info)
+
+
+def filled(cls: type[msgspec.Struct]) -> msgspec.Struct:
+    fields = {f.name: f.type for f in msgspec.structs.fields(cls)}
+    # A node of a tree has no children here, or it would never end.
+    return cls(**{name: [] if name == "children" else sample(kind) for name, kind in fields.items()})
+
+
+@pytest.mark.parametrize("name", OPS_BY_NAME)
+@pytest.mark.parametrize("json", [False, True])
+def test_every_reply_survives_the_wire(name: str, json: bool) -> None:
+    op = OPS[name]
+    reply = filled(op.reply)
+    plain = msgspec.to_builtins(reply, enc_hook=lambda a: a.tolist(), builtin_types=(bytes,))
+    frame = encode_reply(reply, json=json)
+    decoded = decode_reply(op, op.reply, frame)
+    assert type(decoded) is op.reply
+    assert msgspec.to_builtins(decoded, enc_hook=lambda a: a.tolist(), builtin_types=(bytes,)) == plain
+
+
+@pytest.mark.parametrize("name", OPS_BY_NAME)
+def test_every_number_of_every_reply_is_a_float64(name: str) -> None:
+    numbers = numbers_of(encode_reply(filled(OPS[name].reply)))
+    assert all(type(number) is float for number in numbers)
+
+
+@pytest.mark.parametrize("name", OPS_BY_NAME)
+def test_every_request_passes_its_own_check(name: str) -> None:
+    request = filled(OPS[name].request)
+    assert isinstance(request, Request)
+    frame = encode_request(request, "sid")
+    check_request(request, frame)
+    plain = msgspec.msgpack.decode(frame)
+    assert plain["op"] == name
+    assert plain["session_id"] == "sid"
+
+
+def test_defaults_do_not_travel() -> None:
+    assert msgspec.msgpack.decode(encode_request(Step(), "sid")) == {"op": "step", "session_id": "sid"}
+
+
+@pytest.mark.parametrize("vector", ["rpc_req_step_ints", "rpc_req_step_floats"])
+def test_golden_step_requests_mean_what_we_send(vector: str) -> None:
+    golden = msgspec.msgpack.decode(load(vector).data)
+    ours = Step(n_steps=10, per_articulation={"g1": ArticulationCommand(ctrl=[0.5, -0.25])})
+    sent = msgspec.msgpack.decode(encode_request(ours, golden["session_id"]))
+    golden.pop("observations", None)
+    assert sent == golden
+
+
+def test_golden_float32_request() -> None:
+    golden = msgspec.msgpack.decode(load("rpc_req_float32").data, type=SetSimSpeed)
+    assert golden.percent == 25.0
+
+
+def test_golden_replies() -> None:
+    paused = load("rpc_rep_set_paused_ok").data
+    assert decode_reply(OPS["set_paused"], SetPausedOk, paused).paused is True
+    assert encode_reply(SetPausedOk(paused=True)) == paused
+    mode = load("rpc_rep_set_mode_ok").data
+    assert decode_reply(OPS["set_mode"], SetModeOk, mode).current_mode == "direct"
+    assert encode_reply(SetModeOk(previous_mode="live", current_mode="direct")) == mode
+    error = load("rpc_rep_wrong_transport")
+    decoded = error.decoded
+    assert encode_reply(ErrorReply(code=decoded["code"], message=decoded["message"])) == error.data
+
+
+@pytest.mark.parametrize(
+    ("vector", "error"), [("rpc_rep_wrong_transport", WrongTransport), ("rpc_rep_session_expired", SessionTakenOver)]
+)
+def test_golden_refusals_become_typed_errors(vector: str, error: type[URLabError]) -> None:
+    with pytest.raises(error, match=re.escape(load(vector).decoded["message"])):
+        decode_reply(OPS["step"], StepOk, load(vector).data)
+
+
+def test_golden_camera_block() -> None:
+    vector = load("rpc_rep_camera_block")
+    reply = {"op": "step_ok", "time": 0.0, "step": 0.0, "per_articulation": {}}
+    plain = msgspec.msgpack.decode(vector.data)
+    reply["cameras"] = plain.get("cameras", plain)
+    decoded = decode_reply(OPS["step"], StepOk, msgspec.msgpack.encode(reply))
+    assert decoded.cameras is not None
+    (frame,) = decoded.cameras.values()
+    assert (frame.width, frame.height, frame.dtype) == (2, 2, "bgra8")
+    assert frame.data.hex() == vector.decoded["head"]["data_hex"]
+
+
+def test_a_failed_save_says_where_although_the_plugin_sends_no_message() -> None:
+    frame = msgspec.msgpack.encode({"op": "error", "code": "path_not_writable", "absolute_path": "/p/r.json"})
+    with pytest.raises(PathNotWritable, match="/p/r.json"):
+        decode_reply(OPS["recording_save"], RecordingSaveOk, frame)
+
+
+def test_the_viewport_answers_under_the_name_of_another_op() -> None:
+    op = OPS["set_viewport_mode"]
+    frame = msgspec.msgpack.encode({"op": "set_mode_ok", "mode": "Lit"})
+    assert decode_reply(op, op.reply, frame).mode == "Lit"  # type: ignore[attr-defined]
+
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+vectors = st.lists(finite, max_size=40)
+points = st.tuples(finite, finite, finite)
+quats = st.tuples(finite, finite, finite, finite)
+states = st.builds(
+    lambda qpos, qvel, ctrl, sensors, bodies, actions: ArticulationState(
+        qpos=np.array(qpos),
+        qvel=np.array(qvel),
+        ctrl=None if ctrl is None else np.array(ctrl),
+        sensors=sensors,
+        bodies=bodies,
+        twist=TwistState(linear=(0.5, 0, 0), angular=(0, 0, 1)),
+        actions=actions,
+    ),
+    vectors,
+    vectors,
+    st.none() | vectors,
+    st.none() | st.dictionaries(st.text(), vectors, max_size=4),
+    st.none() | st.dictionaries(st.text(), st.builds(BodyPose, xpos=points, xquat=quats), max_size=3),
+    st.integers(0, 1023),
+)
+
+
+@given(
+    time=finite,
+    step=st.integers(0, 2**53),
+    per_articulation=st.dictionaries(st.text(max_size=8), states, max_size=3),
+    entities=st.none() | st.dictionaries(st.text(), st.builds(EntityState, xpos=points, xquat=quats), max_size=2),
+)
+def test_state_survives_the_wire_bit_for_bit(
+    time: float, step: int, per_articulation: dict[str, ArticulationState], entities: dict[str, EntityState] | None
+) -> None:
+    reply = StepOk(
+        time=time, step=step, per_articulation=per_articulation, entities=entities, sim_time=Clock(sec=1, nsec=2)
+    )
+    expected = msgspec.to_builtins(reply, enc_hook=lambda a: a.tolist())
+    decoded = decode_reply(OPS["step"], StepOk, encode_reply(reply))
+    assert msgspec.to_builtins(decoded, enc_hook=lambda a: a.tolist()) == expected
+    assert isinstance(decoded.step, int)
+    assert all(state.qpos.dtype == np.float64 for state in decoded.per_articulation.values())
+
+
+@given(st.binary(max_size=200))
+def test_garbage_is_a_protocol_error_and_nothing_else(frame: bytes) -> None:
+    with pytest.raises(ProtocolError) as info:
+        decode_reply(OPS["step"], StepOk, frame)
+    assert info.value.raw == frame
+
+
+@given(st.integers(0, 600), st.integers(0, 255))
+def test_a_flipped_byte_never_escapes_as_another_error(position: int, value: int) -> None:
+    state = ArticulationState(qpos=np.arange(30.0), qvel=np.arange(29.0))
+    frame = bytearray(encode_reply(StepOk(time=1, step=2, per_articulation={"robot": state})))
+    frame[position % len(frame)] = value
+    try:
+        decoded: Reply = decode_reply(OPS["step"], StepOk, bytes(frame))
+    except URLabError:
+        return
+    assert isinstance(decoded, StepOk)
+
+
+def test_deeply_nested_garbage_is_a_protocol_error() -> None:
+    with pytest.raises(ProtocolError):
+        decode_reply(OPS["step"], StepOk, b"\x81\xa1x" * 100_000 + b"\xc0")
+
+
+def test_unknown_fields_of_a_newer_server_are_ignored() -> None:
+    frame = msgspec.msgpack.encode({"op": "set_paused_ok", "paused": False, "replay": {"current_frame": 3.0}})
+    assert decode_reply(OPS["set_paused"], SetPausedOk, frame).paused is False
+
+
+def test_json_requests_are_ascii() -> None:
+    frame = encode_request(OPS["create_level"].request(name="Übung 😀"), "sid", json=True)  # type: ignore[call-arg]
+    assert frame.isascii()
+    assert msgspec.json.decode(frame)["name"] == "Übung 😀"
+
+
+def test_json_spells_binary_as_base64() -> None:
+    hello = HelloOk(
+        session_id="s",
+        urlab_version="urlab/0.1",
+        mujoco_version_int=1,
+        mujoco_version="1",
+        manager_present=True,
+        mjb=b"\x00\x01",
+        vfs_assets={"a.stl": b"\x02"},
+        articulations=[],
+    )
+    plain = msgspec.json.decode(encode_reply(hello, json=True))
+    assert plain["mjb__b64__"] == "AAE="
+    assert "mjb" not in plain
+    assert plain["vfs_assets"] == {"a.stl__b64__": "Ag=="}
+
+
+def test_an_oversize_request_is_refused() -> None:
+    op: Op = OPS["set_overlay_text"]
+    with pytest.raises(ValueError, match=r"set_overlay_text: a request of .* exceeds"):
+        encode_request(op.request(text="x" * (65 * 1024 * 1024)), "sid")  # type: ignore[call-arg]

@@ -1,0 +1,90 @@
+"""The op declarations refuse at import what a reader or a tool would trip over later."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import pytest
+
+from urlab_client.protocol.base import Needs, Op, Reply, Request, doc
+from urlab_client.protocol.errors import RPC_ERRORS, URLabRPCError, rpc_error
+from urlab_client.protocol.registry import ENVELOPE_ERRORS, OPS, registry
+
+
+class PokeOk(Reply, tag="poke_ok", kw_only=True):
+    """Poked."""
+
+
+class Poke(Request[PokeOk], tag="poke", kw_only=True):
+    """Poke it."""
+
+    where: Annotated[str, doc("Where.")]
+
+
+class Poked(Reply, tag="poked", kw_only=True):
+    """Wrongly named."""
+
+
+class PokeAgain(Request[Poked], tag="poke_again", kw_only=True):
+    """Poke it again."""
+
+
+class Undescribed(Request[PokeOk], tag="undescribed", kw_only=True):
+    """Has a field that nobody explained."""
+
+    where: str
+
+
+class Undocumented(Request[PokeOk], tag="undocumented", kw_only=True):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("ops", "complaint"),
+    [
+        ((Op(request=Poke), Op(request=Poke)), "'poke' is declared twice"),
+        ((Op(request=PokeAgain),), "does not end in _ok"),
+        ((Op(request=Undescribed),), "Undescribed.where: no description"),
+        ((Op(request=Undocumented),), "Undocumented: no docstring"),
+        ((Op(request=Poke, errors=("no_such_code",)),), "undeclared error codes"),
+        ((Op(request=Poke, undeclared=("depth",)),), "not required fields"),
+    ],
+)
+def test_a_faulty_declaration_fails(ops: tuple[Op, ...], complaint: str) -> None:
+    with pytest.raises(TypeError, match=complaint):
+        registry(*ops)
+
+
+def test_a_good_one_carries_everything() -> None:
+    op = registry(Op(request=Poke, ns="arm"))["poke"]
+    assert (op.method, op.required, op.declared_reply, op.reply, op.needs) == (
+        "poke",
+        ("where",),
+        ("op:string",),
+        PokeOk,
+        Needs.EDITOR,
+    )
+
+
+def test_the_wire_has_64_ops() -> None:
+    assert len(OPS) == 64
+    assert sum(op.needs is Needs.EDITOR for op in OPS.values()) == 38
+
+
+def test_every_code_of_the_envelope_has_its_class() -> None:
+    for code in ENVELOPE_ERRORS:
+        assert type(rpc_error(code, "why")) is RPC_ERRORS[code]
+
+
+def test_every_error_class_is_documented_and_pickles() -> None:
+    import pickle
+
+    for code, cls in RPC_ERRORS.items():
+        assert cls.__doc__
+        error = pickle.loads(pickle.dumps(rpc_error(code, "why", op="step")))
+        assert (type(error), error.code, error.message, error.op) == (cls, code, "why", "step")
+        assert str(error) == str(rpc_error(code, "why", op="step"))
+
+
+def test_an_unlisted_code_is_a_plain_rpc_error() -> None:
+    assert type(rpc_error("brand_new", "")) is URLabRPCError
