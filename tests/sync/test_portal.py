@@ -230,6 +230,26 @@ class TestClose:
             portal.call(coro)
         assert coro.cr_frame is None
 
+    def test_a_thread_that_inherits_the_ended_ones_number_is_not_mistaken_for_it(self) -> None:
+        portal = Portal()
+        number = portal.call(io_thread()).ident
+        portal.close()
+        refusals: dict[int, type[BaseException]] = {}
+
+        def call() -> None:
+            try:
+                portal.call(answer())
+            except URLabError as error:
+                refusals[threading.get_ident()] = type(error)
+
+        for _ in range(100):
+            thread = threading.Thread(target=call)
+            thread.start()
+            thread.join()
+            if number in refusals:
+                break
+        assert set(refusals.values()) == {ClientClosed}
+
     def test_before_any_call_starts_no_thread(self) -> None:
         before = threading.active_count()
         portal = Portal()
@@ -272,17 +292,12 @@ class TestClose:
         monkeypatch.setattr(_portal, "GRACE", 0.05)
         portal = Portal()
         entered = threading.Event()
-        let_go: list[Callable[[], object]] = []
 
         async def stubborn() -> None:
-            free = asyncio.Event()
-            let_go.append(free.set)
             entered.set()
-            while not free.is_set():
-                try:
-                    await free.wait()
-                except asyncio.CancelledError:
-                    asyncio.get_running_loop().call_later(0.2, free.set)
+            while True:
+                with contextlib.suppress(asyncio.CancelledError):
+                    await asyncio.Event().wait()
 
         with ThreadPoolExecutor(1) as pool:
             future = pool.submit(portal.call, stubborn())

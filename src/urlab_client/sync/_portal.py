@@ -98,7 +98,8 @@ class _IOThread:
     @property
     def is_current(self) -> bool:
         """Whether the caller runs on this thread."""
-        return threading.get_ident() == self._thread.ident
+        # A thread's number is given to another one once it has ended.
+        return threading.get_ident() == self._thread.ident and self._thread.is_alive()
 
     @property
     def stopping(self) -> bool:
@@ -121,7 +122,7 @@ class _IOThread:
         if not under_way:
             job.coro.close()
         elif not job.wait(GRACE):
-            _log.warning("%s goes on %g s after it was interrupted", job.coro.__qualname__, GRACE)
+            _log.warning("%s goes on %g s after it was interrupted", getattr(job.coro, "__qualname__", job.coro), GRACE)
 
     def stop(self) -> None:
         """Wind the loop down and join the thread, in bounded time, from any thread."""
