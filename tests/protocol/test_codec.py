@@ -175,7 +175,7 @@ def test_golden_camera_block() -> None:
 
 def test_a_failed_save_says_where_although_the_plugin_sends_no_message() -> None:
     frame = msgspec.msgpack.encode({"op": "error", "code": "path_not_writable", "absolute_path": "/p/r.json"})
-    with pytest.raises(PathNotWritable, match="/p/r.json"):
+    with pytest.raises(PathNotWritable, match=r"/p/r\.json"):
         decode_reply(OPS["recording_save"], RecordingSaveOk, frame)
 
 

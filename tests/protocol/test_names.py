@@ -149,38 +149,6 @@ class TestIsADict:
             assert twin.kind == "articulation"
 
 
-class TestMapped:
-    def test_aliases_and_kind_carry_over(self) -> None:
-        texts = two_robots_and_an_arm().mapped(str)
-        assert texts == {"robot_C_0": "1", "robot_C_1": "2", "arm_C_0": "3"}
-        assert texts["arm"] == "3"
-        with pytest.raises(KeyError, match="articulation 'robot' is ambiguous"):
-            texts["robot"]
-
-    def test_once_per_function(self) -> None:
-        arts = two_robots_and_an_arm()
-        assert arts.mapped(str) is arts.mapped(str)
-        assert arts.mapped(float) is not arts.mapped(str)
-        assert two_robots_and_an_arm().mapped(str) is not arts.mapped(str)
-
-    def test_values_keep_their_identity(self) -> None:
-        arts = two_robots_and_an_arm()
-
-        class Wrapper:
-            def __init__(self, value: int) -> None:
-                self.value = value
-
-        assert arts.mapped(Wrapper)["arm"] is arts.mapped(Wrapper)["arm_C_0"]
-
-    def test_bound_methods_count_as_the_same_function(self) -> None:
-        class Portal:
-            def wrap(self, value: int) -> list[int]:
-                return [value]
-
-        arts, portal = two_robots_and_an_arm(), Portal()
-        assert arts.mapped(portal.wrap) is arts.mapped(portal.wrap)
-
-
 class TestPrefixes:
     def test_the_longest_prefix_wins(self) -> None:
         prefixes = {"robot", "robot_2"}

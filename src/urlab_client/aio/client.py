@@ -1,4 +1,4 @@
-"""The typed client of a URLab server, for asyncio programs."""
+"""The typed client of a URLab server."""
 
 from __future__ import annotations
 
@@ -59,9 +59,9 @@ SESSION_LEVEL = SessionLevel("standard")
 
 
 class URLabClient:
-    """A session with one server, for use from one event loop.
+    """A session with one server.
 
-    Nothing is sent and nothing is started before the first call. Calls of several tasks go one at a time.
+    Nothing is sent and nothing is started before the first call. Concurrent calls go one at a time.
 
     Args:
         address: `tcp://host` or `ipc://path`, to which the ports are appended; `tcp://host:port` names the RPC port

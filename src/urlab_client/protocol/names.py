@@ -6,14 +6,13 @@ For the wrappers of both clients, whose maps of articulations, joints and so on 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from typing import Any, NoReturn, TypeVar, cast, overload
 
 __all__ = ["NameMap", "UnknownName", "owner_of", "split_prefix"]
 
 T = TypeVar("T")
-U = TypeVar("U")
 D = TypeVar("D")
 
 _LISTED = 20
@@ -95,7 +94,6 @@ class NameMap(dict[str, T]):
         super().__init__(items)
         self.kind = kind
         self._aliases: dict[str, tuple[str, ...]] = {}
-        self._mapped: dict[Callable[[Any], Any], NameMap[Any]] = {}
         for alias, keys in (aliases or {}).items():
             for key in keys:
                 if not super().__contains__(key):
@@ -137,18 +135,6 @@ class NameMap(dict[str, T]):
         """Return the entry that `key` or its alias means, else `default`."""
         found = self._key(key)
         return default if found is None else super().__getitem__(found)
-
-    def mapped(self, fn: Callable[[T], U]) -> NameMap[U]:
-        """Return a map of `fn(value)` under the same keys and aliases.
-
-        The result is made once per function and lives, with `fn`, as long as this map: pass the same function each
-        time, and none that owns something to be collected earlier.
-        """
-        known = self._mapped.get(fn)
-        if known is None:
-            fresh = NameMap({key: fn(value) for key, value in self.items()}, self._aliases, self.kind)
-            known = self._mapped.setdefault(fn, fresh)
-        return known
 
     def _unknown(self, name: object) -> UnknownName:
         known = tuple(self)

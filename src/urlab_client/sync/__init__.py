@@ -1,0 +1,22 @@
+"""The blocking façade: the async core's API without `await`, for scripts and notebooks."""
+
+from urlab_client.aio.deadline import DEFAULT
+from urlab_client.aio.handles import Actuator, Body, Joint, Sensor
+from urlab_client.sync.articulation import URLabArticulation, URLabEntity
+from urlab_client.sync.cameras import URLabCameraView
+from urlab_client.sync.client import URLabClient
+from urlab_client.sync.controllers import URLabController, URLabPDController
+
+__all__ = [
+    "DEFAULT",
+    "Actuator",
+    "Body",
+    "Joint",
+    "Sensor",
+    "URLabArticulation",
+    "URLabCameraView",
+    "URLabClient",
+    "URLabController",
+    "URLabEntity",
+    "URLabPDController",
+]

@@ -409,7 +409,7 @@ class Facade:
     def _map(self, name: str, cls: type[F], source: NameMap[Any]) -> NameMap[F]:
         """Return the twins of the entries of `source`, as the same map as long as property `name` has this `source`.
 
-        Remembered here, not by `NameMap.mapped`: the loop's tasks keep `source` alive, which must not keep the twins.
+        Remembered here, not in the map: the loop's tasks keep `source` alive, which must not keep the twins.
         """
         known, twins = self._maps.get(name, (None, None))
         if twins is None or known is not source:

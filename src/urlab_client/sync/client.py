@@ -37,9 +37,9 @@ R = TypeVar("R", bound=Reply)
 
 
 class URLabClient(FacadeRoot, twin=aio.URLabClient):
-    """A session with one server, for use from one event loop.
+    """A session with one server.
 
-    Nothing is sent and nothing is started before the first call. Calls of several tasks go one at a time.
+    Nothing is sent and nothing is started before the first call. Concurrent calls go one at a time.
 
     Args:
         address: `tcp://host` or `ipc://path`, to which the ports are appended; `tcp://host:port` names the RPC port
