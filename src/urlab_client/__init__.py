@@ -40,6 +40,7 @@ from urlab_client.protocol.types import (
     ActorInfo,
     BlueprintInfo,
     CameraPose,
+    ClientConfig,
     Contact,
     ContactsResult,
     KeyframeInfo,
@@ -72,6 +73,8 @@ from urlab_client.sync import (
     URLabPDController,
 )
 
+__version__: str
+
 
 def __getattr__(name: str) -> Any:
     # Reading the installed metadata costs milliseconds that most programs need not pay.
@@ -95,6 +98,7 @@ __all__ = [
     "CameraPose",
     "CameraTiming",
     "ClientClosed",
+    "ClientConfig",
     "ConcurrentReadError",
     "ConnectionLost",
     "Contact",

@@ -12,6 +12,7 @@ import pytest
 import zmq
 
 from urlab_client.aio import URLabClient
+from urlab_client.protocol.registry import OPS
 
 HELLO = {
     "op": "hello_ok",
@@ -21,6 +22,15 @@ HELLO = {
     "mujoco_version": "3.10.0",
     "manager_present": False,
     "articulations": [],
+}
+
+META = {
+    "op": "meta_ok",
+    "ops": [
+        {"name": op.name, "category": str(op.needs), "namespace": op.ns}
+        for op in OPS.values()
+        if op.name not in {"hello", "meta"}
+    ],
 }
 
 Answer = Callable[[dict[str, Any]], "dict[str, Any] | bytes | None"]
@@ -36,7 +46,7 @@ class ScriptedServer:
 
     def __init__(self, port: int = 0) -> None:
         self.seen: queue.Queue[dict[str, Any]] = queue.Queue()
-        self.answers: dict[str, Answer] = {"hello": lambda _: HELLO}
+        self.answers: dict[str, Answer] = {"hello": lambda _: HELLO, "meta": lambda _: META}
         self.held: queue.Queue[list[bytes]] = queue.Queue()
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.ROUTER)

@@ -31,6 +31,11 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
+async def discovered(client: Any, scripted: Any) -> None:
+    await client.discover()
+    assert [scripted.request()["op"] for _ in range(2)] == ["hello", "meta"]
+
+
 async def test_refused_names_address_and_stage() -> None:
     port = free_port()
     async with URLabClient("tcp://127.0.0.1", step_port=port, rcv_timeout_ms=300) as client:
@@ -125,8 +130,7 @@ async def test_calls_of_several_tasks_go_one_at_a_time(client: Any, scripted: An
 
 
 async def test_a_queued_call_times_out_without_being_sent(client: Any, scripted: Any) -> None:
-    await client.discover()
-    scripted.request()
+    await discovered(client, scripted)
     first = asyncio.create_task(client.runtime.set_paused(True, timeout=None))
     await asyncio.to_thread(scripted.request)
     with pytest.raises(URLabTimeoutError, match=r"current_level: another call held .* Nothing was sent"):
@@ -145,8 +149,7 @@ async def test_a_queued_call_times_out_without_being_sent(client: Any, scripted:
     ],
 )
 async def test_a_server_that_dies_mid_call(client: Any, scripted: Any, call: Any, error: type[Exception]) -> None:
-    await client.discover()
-    scripted.request()
+    await discovered(client, scripted)
     pending = asyncio.create_task(call(client))
     await asyncio.to_thread(scripted.request)
     await asyncio.to_thread(scripted.close)
@@ -220,8 +223,7 @@ async def test_unknown_error_codes_stay_plain_rpc_errors(client: Any, scripted: 
 async def test_mistakes_are_refused_before_anything_is_sent(
     client: Any, scripted: Any, call: Any, error: type[Exception], message: str
 ) -> None:
-    await client.discover()
-    scripted.request()
+    await discovered(client, scripted)
     with pytest.raises(error, match=message):
         await call(client)
     scripted.on("current_level", LEVEL)
@@ -230,8 +232,7 @@ async def test_mistakes_are_refused_before_anything_is_sent(
 
 
 async def test_closing_fails_what_waits_and_everything_after(client: Any, scripted: Any) -> None:
-    await client.discover()
-    scripted.request()
+    await discovered(client, scripted)
     pending = asyncio.create_task(client.runtime.set_paused(True))
     await asyncio.to_thread(scripted.request)
     await client.close()

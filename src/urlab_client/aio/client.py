@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import warnings
 from collections.abc import Mapping
 from threading import RLock
 from types import TracebackType
-from typing import TYPE_CHECKING, Self, TypeVar
+from typing import TYPE_CHECKING, NoReturn, Self, TypeVar
 
 from urlab_client.aio.articulation import URLabArticulation, URLabEntity
 from urlab_client.aio.cameras import URLabCameraView
@@ -34,6 +35,7 @@ from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.protocol.messages.session import Meta as MetaRequest
 from urlab_client.protocol.messages.session import MetaOk, OpInfo, Reset, ResetOk, Step, StepOk
 from urlab_client.protocol.names import NameMap
+from urlab_client.protocol.types import ClientConfig
 
 if TYPE_CHECKING:
     import mujoco
@@ -78,6 +80,7 @@ class URLabClient:
         auto_promote_step_mode: Let `discover()` switch the server to `direct` or `puppet` when `step_mode` says so.
         transport: `zmq`, or `shm` on the same host.
         shm_dir: Directory of the shared-memory regions, when it is not the one the server names.
+        encoding: `msgpack`, or `json` to make traffic readable while debugging.
 
     Raises:
         ValueError: The address or an option is malformed.
@@ -98,15 +101,31 @@ class URLabClient:
         auto_promote_step_mode: bool = True,
         transport: str | Transport = "zmq",
         shm_dir: str | None = None,
+        encoding: str = "msgpack",
     ) -> None:
+        self._config = ClientConfig(
+            address=address,
+            step_mode=StepMode(step_mode),
+            step_port=step_port,
+            state_port=state_port,
+            ctrl_port=ctrl_port,
+            info_port=info_port,
+            mujoco_version_check=mujoco_version_check,
+            local_model=local_model,
+            rcv_timeout_ms=rcv_timeout_ms,
+            auto_promote_step_mode=auto_promote_step_mode,
+            transport=Transport(transport),
+            shm_dir=shm_dir,
+            encoding=encoding,
+        )
+        if encoding not in {"msgpack", "json"}:
+            raise ValueError(f"encoding is msgpack or json, not {encoding!r}")
         if Transport(transport) is Transport.SHM or shm_dir is not None:
             raise URLabError("Shared memory is not available in this version.", hint="Use transport='zmq'.")
         if rcv_timeout_ms <= 0:
             raise ValueError(f"rcv_timeout_ms must be above 0, got {rcv_timeout_ms}")
-        self._address = address
-        self._ports = {"state": state_port, "ctrl": ctrl_port, "info": info_port}
         self._transport = _transport(address, step_port)
-        self._session = Session(self._transport, default_timeout=rcv_timeout_ms / 1000)
+        self._session = Session(self._transport, default_timeout=rcv_timeout_ms / 1000, json=encoding == "json")
         self._state = SimState(
             self._session,
             wanted_mode=StepMode(step_mode),
@@ -171,7 +190,12 @@ class URLabClient:
     @property
     def address(self) -> str:
         """The address the client was made with."""
-        return self._address
+        return self._config.address
+
+    @property
+    def config(self) -> ClientConfig:
+        """What the client was made with: picklable and JSON-able, so that an equal client can be made elsewhere."""
+        return self._config
 
     @property
     def connected(self) -> bool:
@@ -428,7 +452,13 @@ class URLabClient:
 
     def __repr__(self) -> str:
         state = "closed" if self._closed else "connected" if self.connected else "not connected"
-        return f"<URLabClient {self._address} {state}>"
+        return f"<URLabClient {self.address} {state}>"
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "URLabClient cannot be pickled: it belongs to a connection of this process. "
+            "Send client.config, and make a client from it: URLabClient(**config.options())."
+        )
 
     def _direct_request(self, n_steps: int) -> Step:
         state = self._state
@@ -448,7 +478,11 @@ class URLabClient:
                 op="step",
                 hint="Make the client with local_model=True and call discover() during play.",
             )
+        if self._state.buffered_wrenches():
+            warnings.warn("apply_xfrc() is inert in puppet mode: write client.data.xfrc_applied instead.", stacklevel=3)
         with mirror.lock:
+            for record in self._state.records.values():
+                record.write_set_points()
             if n_steps > 0:
                 import mujoco  # noqa: PLC0415
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,6 +29,7 @@ _CHOICES = {
     "cone": ("mjtCone", "mjCONE_"),
     "solver": ("mjtSolver", "mjSOL_"),
 }
+_HEADER_BYTES = 20  # five 32-bit integers
 _NOT_IN_MJOPTION = frozenset({"enable_multiccd", "enable_sleep", "num_worker_threads", "max_worker_threads"})
 _NAME_ADDRESSES = {
     "body": "name_bodyadr",
@@ -43,6 +45,17 @@ def model_names(model: mujoco.MjModel, kind: str) -> list[str]:
     pool = model.names
     addresses: list[int] = getattr(model, _NAME_ADDRESSES[kind]).tolist()
     return [pool[start : pool.index(b"\0", start)].decode() for start in addresses]
+
+
+@cache
+def _mjb_header() -> bytes:
+    """Return the first bytes of any model this MuJoCo saves: magic, number size, layout and version."""
+    import mujoco  # noqa: PLC0415
+
+    empty = mujoco.MjModel.from_xml_string("<mujoco/>")
+    buffer = np.zeros(mujoco.mj_sizeModel(empty), dtype=np.uint8)
+    mujoco.mj_saveModel(empty, None, buffer)
+    return buffer[:_HEADER_BYTES].tobytes()
 
 
 def write_options(opt: mujoco.MjOption, options: SimOptions) -> None:
@@ -89,11 +102,16 @@ class Mirror:
 
     @staticmethod
     def check_version(hello: HelloOk) -> URLabVersionMismatch | None:
-        """Return the error to raise when the server's compiled model cannot be loaded by this MuJoCo."""
+        """Return the error to raise when the server's compiled model cannot be loaded by this MuJoCo.
+
+        Development builds share version numbers while their models differ, so the model's own header counts as well.
+        """
         import mujoco  # noqa: PLC0415
 
         client = mujoco.mj_versionString()
         same = hello.mujoco_version == client and hello.mujoco_version_int == mujoco.mj_version()
+        if same and hello.mjb is not None:
+            same = hello.mjb[:_HEADER_BYTES] == _mjb_header()
         return None if same else URLabVersionMismatch(hello.mujoco_version, client)
 
     def load(self, hello: HelloOk) -> None:

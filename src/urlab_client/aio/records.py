@@ -128,6 +128,7 @@ class ArticulationRecord(EntityRecord):
         self.controller: ControllerInfo | None = None
         self.control_mode = ControlMode.RAW
         self.ctrl: Floats = np.zeros(0)
+        self._written_ctrl: Floats = np.zeros(0)
         self.bind(info, layout)
 
     def bind(self, info: ArticulationInfo, layout: ArticulationLayout) -> None:
@@ -136,6 +137,7 @@ class ArticulationRecord(EntityRecord):
         self.info, self.layout = info, layout
         if len(self.ctrl) != n_ctrl:
             self.ctrl = np.zeros(n_ctrl)
+            self._written_ctrl = np.zeros(n_ctrl)
         self._bind_controller(info.controller)
         self._bind_root()
         data = self.mirror.data
@@ -228,6 +230,16 @@ class ArticulationRecord(EntityRecord):
             data.ctrl[layout.ctrl_adr] = state.ctrl
         if state.act is not None and len(layout.act_adr):
             data.act[layout.act_adr] = state.act[layout.act_from]
+
+    def write_set_points(self) -> None:
+        """Write set-points that changed since the last time into the mirror's `ctrl`, for a puppet step.
+
+        Those that did not change are left alone: in puppet mode `client.data.ctrl` is the user's to write.
+        """
+        data = self.mirror.data
+        if data is not None and not np.array_equal(self.ctrl, self._written_ctrl):
+            data.ctrl[self.layout.ctrl_adr] = self.ctrl
+            self._written_ctrl = self.ctrl.copy()
 
     def live_command(self) -> ArticulationCommand:
         """Return what a live step tells the articulation: the server ignores anything but `ctrl`."""

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections.abc import Callable
 from typing import TypeVar
 
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.transport.base import Transport
-from urlab_client.protocol.base import Op, Reply, Request
+from urlab_client.protocol.base import Needs, Op, Reply, Request
 from urlab_client.protocol.codec import check_request, decode_reply, encode_request, op_of
-from urlab_client.protocol.errors import URLabTimeoutError
-from urlab_client.protocol.messages.session import Hello, HelloOk
+from urlab_client.protocol.errors import UnknownOp, URLabRPCError, URLabTimeoutError
+from urlab_client.protocol.messages.session import Hello, HelloOk, Meta
 
 __all__ = ["Session"]
 
@@ -25,10 +26,17 @@ class Session:
 
     The server answers one request at a time anyway, and a second request must not be queued behind a first that
     may fail: so requests wait for their turn here, where waiting is visible and cancellable.
+
+    Attributes:
+        session_id: Id of the open session; empty without one.
+        offered: Ops the server lists, or None before it was asked.
+        on_refusal: Told of each refusal before it is raised.
     """
 
     def __init__(self, transport: Transport, *, default_timeout: float | None, json: bool = False) -> None:
         self.session_id = ""
+        self.offered: frozenset[str] | None = None
+        self.on_refusal: Callable[[URLabRPCError], None] | None = None
         self._transport = transport
         self._default_timeout = default_timeout
         self._json = json
@@ -54,6 +62,8 @@ class Session:
             TypeError, ValueError: The request is malformed; nothing was sent.
         """
         op = op_of(request)
+        if self.offered is not None and op.needs is not Needs.NOTHING and op.name not in self.offered:
+            raise UnknownOp("unknown_op", "this server does not offer it. Nothing was sent.", op=op.name)
         loop = asyncio.get_running_loop()
         now = loop.time()
         seconds = self._seconds(op) if timeout is DEFAULT else timeout
@@ -75,7 +85,12 @@ class Session:
             log.debug(
                 "%s: %d bytes out, %d back in %.3f ms", op.name, len(frame), len(answer), 1e3 * (loop.time() - now)
             )
-        return decode_reply(op, op_reply(request, op), answer)
+        try:
+            return decode_reply(op, op_reply(request, op), answer)
+        except URLabRPCError as refusal:
+            if self.on_refusal is not None:
+                self.on_refusal(refusal)
+            raise
 
     async def hello(self, request: Hello, *, timeout: Timeout = DEFAULT) -> HelloOk:
         """Open a session; the one before it becomes invalid, here and for any other client."""
@@ -84,6 +99,8 @@ class Session:
         self.session_id = ""
         reply = await self.call(request, timeout=timeout)
         self.session_id = reply.session_id
+        # A packaged build lacks the editor's ops, an older server lacks newer ones.
+        self.offered = frozenset(op.name for op in (await self.call(Meta(), timeout=timeout)).ops)
         return reply
 
     async def aclose(self) -> None:

@@ -24,7 +24,7 @@ from urlab_client.aio.records import ArticulationRecord, EntityRecord, Wrenches
 from urlab_client.aio.session import Session
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.errors import ProtocolError
+from urlab_client.protocol.errors import NoActiveManager, ProtocolError, URLabRPCError
 from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.protocol.messages.session import (
     ArticulationInfo,
@@ -92,6 +92,7 @@ class SimState:
         self.recv_wall_time_ns = 0
         self._local_model = local_model
         self._check_version = check_version
+        session.on_refusal = self._note_refusal
         self._promote = promote
         self._records: dict[str, ArticulationRecord] = {}
         self._entity_records: dict[str, EntityRecord] = {}
@@ -254,6 +255,10 @@ class SimState:
             return
         with self.mirror.lock:
             write_options(self.mirror.model.opt, options)
+
+    def _note_refusal(self, refusal: URLabRPCError) -> None:
+        if isinstance(refusal, NoActiveManager):
+            self.on_play_ended()  # somebody else stopped play
 
     def on_play_ended(self) -> None:
         """Note that the play session is gone: the server is back in live mode, without articulations."""

@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, TypeVar
 
 from msgspec import Struct
+from msgspec.structs import asdict
 
-from urlab_client.protocol.enums import PIEState
+from urlab_client.protocol.enums import PIEState, StepMode, Transport
 
 __all__ = [
     "ActorBounds",
@@ -15,6 +16,7 @@ __all__ = [
     "ActorInfo",
     "BlueprintInfo",
     "CameraPose",
+    "ClientConfig",
     "Contact",
     "ContactsResult",
     "KeyframeInfo",
@@ -45,6 +47,28 @@ class HasArticulations(Protocol[A_co]):
 
     @property
     def articulations_by_id(self) -> Mapping[str, A_co]: ...
+
+
+class ClientConfig(Struct, frozen=True, kw_only=True):
+    """The arguments a client was made with; see `URLabClient` for their meaning."""
+
+    address: str = "tcp://localhost"
+    step_mode: StepMode = StepMode.AUTO
+    step_port: int = 5559
+    state_port: int = 5555
+    ctrl_port: int = 5556
+    info_port: int = 5557
+    mujoco_version_check: bool = True
+    local_model: bool = True
+    rcv_timeout_ms: int = 5000
+    auto_promote_step_mode: bool = True
+    transport: Transport = Transport.ZMQ
+    shm_dir: str | None = None
+    encoding: str = "msgpack"
+
+    def options(self) -> dict[str, Any]:
+        """Return the constructor's arguments: `URLabClient(**config.options())`."""
+        return asdict(self)
 
 
 class URLabAsset(Struct):

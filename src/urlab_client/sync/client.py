@@ -17,6 +17,7 @@ from urlab_client.protocol.base import Reply, Request
 from urlab_client.protocol.enums import CameraTiming, ObservationLevel, StepMode, Transport
 from urlab_client.protocol.messages.session import OpInfo, ResetOk, StepOk
 from urlab_client.protocol.names import NameMap
+from urlab_client.protocol.types import ClientConfig
 from urlab_client.sync._portal import FacadeRoot
 from urlab_client.sync.articulation import URLabArticulation, URLabEntity
 from urlab_client.sync.cameras import URLabCameraView
@@ -56,6 +57,7 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
         auto_promote_step_mode: Let `discover()` switch the server to `direct` or `puppet` when `step_mode` says so.
         transport: `zmq`, or `shm` on the same host.
         shm_dir: Directory of the shared-memory regions, when it is not the one the server names.
+        encoding: `msgpack`, or `json` to make traffic readable while debugging.
 
     Raises:
         ValueError: The address or an option is malformed.
@@ -79,6 +81,7 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
         auto_promote_step_mode: bool = True,
         transport: str | Transport = "zmq",
         shm_dir: str | None = None,
+        encoding: str = "msgpack",
     ) -> None:
         super().__init__(
             aio.URLabClient(
@@ -94,6 +97,7 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
                 auto_promote_step_mode=auto_promote_step_mode,
                 transport=transport,
                 shm_dir=shm_dir,
+                encoding=encoding,
             )
         )
 
@@ -141,6 +145,11 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
     def address(self) -> str:
         """The address the client was made with."""
         return self._aio.address
+
+    @property
+    def config(self) -> ClientConfig:
+        """What the client was made with: picklable and JSON-able, so that an equal client can be made elsewhere."""
+        return self._aio.config
 
     @property
     def connected(self) -> bool:

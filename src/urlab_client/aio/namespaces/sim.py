@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+import asyncio
+from collections.abc import Callable
 
 import msgspec
 
@@ -12,12 +13,13 @@ from urlab_client.aio.session import Session
 from urlab_client.aio.state import SimState
 from urlab_client.protocol.enums import PIEState
 from urlab_client.protocol.errors import URLabPIEError
-from urlab_client.protocol.messages.session import HelloOk
-from urlab_client.protocol.messages.sim import BeginPie, PieStatus, StopPie
+from urlab_client.protocol.messages.sim import BeginPie, BeginPieOk, PieStatus, StopPie
 from urlab_client.protocol.types import PIEStartResult, PIEStatus
 
 __all__ = ["SimNamespace"]
 
+_POLL_S = 0.25
+_SLICE_S = 2.0
 _SLACK_S = 15.0  # the server may take 10 s to reach its game thread before its own timeout starts
 
 
@@ -34,6 +36,7 @@ class SimNamespace(Namespace):
         *,
         timeout_s: float = 30.0,
         raise_on_failure: bool = True,
+        on_progress: Callable[[PIEStatus], object] | None = None,
         timeout: Timeout = DEFAULT,
     ) -> PIEStartResult:
         """Start play, wait until the model is compiled, and take over the handshake of the new play world.
@@ -43,25 +46,44 @@ class SimNamespace(Namespace):
 
         Args:
             level_path: Level to open first, a full `/Game/` path.
-            timeout_s: Seconds that the server waits for the compile.
+            timeout_s: Seconds to wait for the compile.
             raise_on_failure: Raise unless play is ready; else return the result in any state.
-            timeout: Seconds to wait for the answer; default a little longer than the server itself waits.
+            on_progress: Called with the state about every quarter of a second while the model compiles.
+            timeout: Seconds to wait for each answer of the server; None waits without limit.
 
         Raises:
             URLabPIEError: Play did not become ready; its message carries the compile log.
         """
-        seconds = timeout_s + _SLACK_S if timeout is DEFAULT else timeout
-        reply = await self._call(BeginPie(level_path=level_path, timeout_s=timeout_s), seconds)
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + timeout_s
+        # In slices: while the server waits for the compile it answers nobody, this client included.
+        reply = await self._begin(level_path, min(timeout_s, _SLICE_S), timeout)
+        while reply.state == PIEState.TIMEOUT and not reply.compile_error and loop.time() < deadline:
+            status = await self.status(timeout=timeout)
+            if on_progress is not None:
+                on_progress(status)
+            if status.state is PIEState.COMPILING:
+                await asyncio.sleep(min(_POLL_S, max(0.0, deadline - loop.time())))
+            elif status.state is PIEState.OFF:
+                break
+            else:
+                reply = await self._begin(None, min(max(0.0, deadline - loop.time()), _SLICE_S), timeout)
         state = PIEState(reply.state)
         payload = reply.handshake_payload
         result = PIEStartResult(state=state, compile_error=reply.compile_error)
         if payload is not None:
             await self._state.adopt(payload, timeout=timeout)
-            result.handshake_payload = _plain(payload)
+            result.handshake_payload = msgspec.to_builtins(payload)
         if raise_on_failure and not result.is_ready:
-            explanation = reply.compile_error or f"no compiled model within {timeout_s:g} s"
+            explanation = reply.compile_error or (
+                f"no compiled model within {timeout_s:g} s; does the level have a manager (scene.ensure_manager())?"
+            )
             raise URLabPIEError(code=str(state), message=explanation, state=state)
         return result
+
+    async def _begin(self, level_path: str | None, timeout_s: float, timeout: Timeout) -> BeginPieOk:
+        seconds = timeout_s + _SLACK_S if timeout is DEFAULT else timeout
+        return await self._call(BeginPie(level_path=level_path, timeout_s=timeout_s), seconds)
 
     async def stop(self, *, timeout: Timeout = DEFAULT) -> None:
         """End play; a success without one. The session goes on, authoring works.
@@ -76,7 +98,3 @@ class SimNamespace(Namespace):
         """Read the state of play."""
         reply = await self._call(PieStatus(), timeout)
         return PIEStatus(state=PIEState(reply.state), compile_error=reply.compile_error, sim_time=reply.sim_time)
-
-
-def _plain(hello: HelloOk) -> dict[str, Any]:
-    return msgspec.to_builtins(hello)

@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.namespaces import sim as aio
 from urlab_client.protocol.types import PIEStartResult, PIEStatus
@@ -24,6 +26,7 @@ class SimNamespace(Facade, twin=aio.SimNamespace):
         *,
         timeout_s: float = 30.0,
         raise_on_failure: bool = True,
+        on_progress: Callable[[PIEStatus], object] | None = None,
         timeout: Timeout = DEFAULT,
     ) -> PIEStartResult:
         """Start play, wait until the model is compiled, and take over the handshake of the new play world.
@@ -33,15 +36,22 @@ class SimNamespace(Facade, twin=aio.SimNamespace):
 
         Args:
             level_path: Level to open first, a full `/Game/` path.
-            timeout_s: Seconds that the server waits for the compile.
+            timeout_s: Seconds to wait for the compile.
             raise_on_failure: Raise unless play is ready; else return the result in any state.
-            timeout: Seconds to wait for the answer; default a little longer than the server itself waits.
+            on_progress: Called with the state about every quarter of a second while the model compiles.
+            timeout: Seconds to wait for each answer of the server; None waits without limit.
 
         Raises:
             URLabPIEError: Play did not become ready; its message carries the compile log.
         """
         return self._portal.call(
-            self._aio.start(level_path, timeout_s=timeout_s, raise_on_failure=raise_on_failure, timeout=timeout)
+            self._aio.start(
+                level_path,
+                timeout_s=timeout_s,
+                raise_on_failure=raise_on_failure,
+                on_progress=on_progress,
+                timeout=timeout,
+            )
         )
 
     def stop(self, *, timeout: Timeout = DEFAULT) -> None:

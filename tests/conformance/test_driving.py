@@ -1,0 +1,388 @@
+"""Driving robots in direct mode: what a script does, over the wire, in both flavours."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from urlab_client import SessionTakenOver, UnknownKeyframe, UnknownName, URLabError
+from urlab_client.enums import ControlMode, StepMode
+from urlab_client.server import SimulatedServer
+
+MODELS = ["humanoid.xml", "ant.xml", "walker2d_v5.xml", "pusher_v5.xml"]
+
+
+@pytest.mark.parametrize("model", MODELS)
+async def test_physics_is_bitwise_what_mj_step_gives(connect: Any, asset: Any, model: str) -> None:
+    steps = 1000 if model == "humanoid.xml" else 200
+    with SimulatedServer(asset(model), play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        (art,) = client.articulations.values()
+        local = mujoco.MjData(client.model)
+        mujoco.mj_forward(client.model, local)
+        rng = np.random.default_rng(7)
+        for _ in range(steps):
+            # Set-points travel as float32, as in the plugin.
+            art.ctrl_array[:] = rng.uniform(-0.4, 0.4, len(art.ctrl_array)).astype(np.float32)
+            local.ctrl[:] = art.ctrl_array
+            mujoco.mj_step(client.model, local)
+            await client.step()
+        assert np.array_equal(client.data.qpos, local.qpos)
+        assert np.array_equal(client.data.qvel, local.qvel)
+        assert np.array_equal(client.data.ctrl, local.ctrl)
+        assert client.sim_time == local.time
+        assert client.step_count == steps
+
+
+async def test_several_substeps_equal_single_ones(connect: Any, asset: Any) -> None:
+    with SimulatedServer(asset("ant.xml"), play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        (art,) = client.articulations.values()
+        art.ctrl_array[:] = 0.25
+        await client.step(50)
+        together = art.qpos_array
+        await client.reset()
+        for _ in range(50):
+            await client.step()
+        assert np.array_equal(art.qpos_array, together)
+
+
+async def test_two_of_the_same_robot_are_two_robots(connect: Any, asset: Any) -> None:
+    with SimulatedServer(asset("ant.xml"), asset("ant.xml"), play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        assert len(client.articulations) == 2
+        first, second = client.articulations.values()
+        assert set(first.joints) == set(second.joints)
+        assert not {j.id for j in first.joints.values()} & {j.id for j in second.joints.values()}
+        first.set_ctrl(dict.fromkeys(first.actuators, 0.5))
+        await client.step(20)
+        assert np.allclose(first.last_applied_ctrl, 0.5)
+        assert np.allclose(second.last_applied_ctrl, 0.0)
+        assert not np.array_equal(first.dof_qpos, second.dof_qpos)
+
+
+async def test_a_robot_beside_free_objects(connect: Any) -> None:
+    with SimulatedServer("arm", "ball", "pallet", play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        assert {art.actor_id for art in client.articulations.values()} == {"arm", "ball", "pallet"}
+        assert set(client.articulations) <= set(client.entities)
+        ball = client.articulations_by_id["ball"]
+        assert ball.has_free_base
+        assert not client.articulations_by_id["arm"].has_free_base
+        height = ball.root_pos_w[2]
+        await client.step(20)
+        assert ball.root_pos_w[2] < height
+        assert ball.root_lin_vel_w[2] < 0
+        assert np.allclose(ball.projected_gravity_b, [0, 0, -1])
+        free = slice(ball.qpos_offset, ball.qpos_offset + 7)
+        assert np.array_equal(client.data.qpos[free], ball.qpos_array)
+
+
+async def test_a_wrench_acts_for_one_step_only(connect: Any) -> None:
+    with SimulatedServer("ball", play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        (ball,) = client.articulations.values()
+        weight = float(client.model.body_mass[ball.body_id]) * 9.81
+        ball.apply_xfrc(force=(0, 0, weight))
+        height = ball.root_pos_w[2]
+        await client.step(50)
+        assert ball.root_pos_w[2] == pytest.approx(height, abs=1e-6)
+        await client.step(50)
+        assert ball.root_pos_w[2] < height - 1e-3
+
+
+async def test_a_wrench_survives_a_failed_step(connect: Any) -> None:
+    with SimulatedServer("ball", play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        (ball,) = client.articulations.values()
+        ball.apply_xfrc(force=(0, 0, 2 * 9.81))
+        usurper = connect(server)
+        await usurper.discover()
+        with pytest.raises(SessionTakenOver):
+            await client.step()
+        await client.discover()
+        await client.step(50)
+        assert ball.root_lin_vel_w[2] > 0
+
+
+async def test_state_of_a_root_that_is_not_free(connect: Any, asset: Any) -> None:
+    with SimulatedServer(asset("walker2d_v5.xml"), play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        (walker,) = client.articulations.values()
+        walker.ctrl_array[:] = 0.3
+        await client.step(40)
+        local = mujoco.MjData(client.model)
+        local.qpos[:], local.qvel[:] = client.data.qpos, client.data.qvel
+        mujoco.mj_forward(client.model, local)
+        velocity = np.zeros(6)
+        mujoco.mj_objectVelocity(client.model, local, mujoco.mjtObj.mjOBJ_XBODY, walker.body_id, velocity, 0)
+        assert np.allclose(walker.root_pos_w, local.xpos[walker.body_id])
+        assert np.allclose(walker.root_quat_w, local.xquat[walker.body_id])
+        assert np.allclose(walker.root_lin_vel_w, velocity[3:])
+        assert np.allclose(walker.root_ang_vel_w, velocity[:3])
+
+
+async def test_root_frames_of_a_free_base_agree_with_mujoco(connect: Any) -> None:
+    with SimulatedServer("quadruped", play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover(observations="full")
+        (robot,) = client.articulations.values()
+        robot.apply_xfrc(force=(40, 25, 10), torque=(3, -4, 5))
+        await client.step(30)
+        local = mujoco.MjData(client.model)
+        local.qpos[:], local.qvel[:] = client.data.qpos, client.data.qvel
+        mujoco.mj_forward(client.model, local)
+        world, body = np.zeros(6), np.zeros(6)
+        mujoco.mj_objectVelocity(client.model, local, mujoco.mjtObj.mjOBJ_XBODY, robot.body_id, world, 0)
+        mujoco.mj_objectVelocity(client.model, local, mujoco.mjtObj.mjOBJ_XBODY, robot.body_id, body, 1)
+        assert np.allclose(robot.root_lin_vel_w, world[3:])
+        assert np.allclose(robot.root_ang_vel_w, world[:3])
+        assert np.allclose(robot.root_lin_vel_b, body[3:])
+        assert np.allclose(robot.root_ang_vel_b, body[:3])
+        rotation = local.xmat[robot.body_id].reshape(3, 3)
+        assert np.allclose(robot.projected_gravity_b, rotation.T @ [0, 0, -1])
+        assert np.allclose(np.roll(robot.root_quat_xyzw, 1), robot.root_quat_w)
+
+
+async def test_handles_describe_the_compiled_model(connect: Any) -> None:
+    with SimulatedServer("arm", play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        (arm,) = client.articulations.values()
+        model = client.model
+        for name, joint in arm.joints.items():
+            assert model.joint(joint.id).name == f"{arm.prefix}_{name}"
+            assert joint.qpos_offset == model.jnt_qposadr[joint.id]
+            assert arm.qpos_array[joint.qpos_local_offset] == client.data.qpos[joint.qpos_offset]
+            assert (joint.range is not None) == bool(model.jnt_limited[joint.id])
+        for name, actuator in arm.actuators.items():
+            assert model.actuator(actuator.id).name == f"{arm.prefix}_{name}"
+            assert actuator.joint is None or actuator.joint in arm.joints
+            assert actuator.type is not None
+        await client.step()
+        for name, sensor in arm.sensors.items():
+            assert sensor.latest.shape == (sensor.dim,), name
+        assert set(arm.get_sensors()) == set(arm.sensors)
+        for body in arm.bodies.values():
+            assert np.allclose(np.linalg.norm(body.xquat), 1)
+
+
+async def test_set_points_are_partial_and_misspelled_names_are_told(connect: Any) -> None:
+    with SimulatedServer("arm", play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        (arm,) = client.articulations.values()
+        one, two, *_ = arm.actuators
+        arm.set_ctrl({one: 0.1})
+        arm.set_ctrl({f"{arm.prefix}_{two}": 0.2})
+        assert (arm.get_ctrl()[one], arm.get_ctrl()[two]) == (0.1, 0.2)
+        with pytest.raises(UnknownName, match="no actuator of"):
+            arm.set_ctrl({one: 0.3, "elbw": 1.0})
+        assert arm.get_ctrl()[one] == 0.1
+        assert arm.resolve_actuator("nonsense") is None
+        assert arm.resolve_joint(f"{arm.prefix}_{next(iter(arm.joints))}") == next(iter(arm.joints))
+        await client.step()
+        assert arm.last_applied_ctrl[0] == np.float32(0.1)
+
+
+async def test_reset_finds_a_keyframe_by_its_short_name(connect: Any) -> None:
+    with SimulatedServer("quadruped", play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        (robot,) = client.articulations.values()
+        await client.step(100)
+        reply = await client.reset(keyframe_name="home")
+        assert (reply.step, client.step_count) == (0, 0)
+        key = client.model.key(f"{robot.prefix}_home")
+        assert np.array_equal(client.data.qpos, key.qpos)
+        with pytest.raises(UnknownKeyframe, match=f"{robot.prefix}_home"):
+            await client.reset(keyframe_name="homme")
+
+
+async def test_an_ambiguous_keyframe_is_refused(connect: Any) -> None:
+    with SimulatedServer("quadruped", "quadruped", play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        with pytest.raises(UnknownKeyframe, match="could mean"):
+            await client.reset(keyframe_name="home")
+        one, _ = client.articulations.values()
+        await client.reset(keyframe_name=f"{one.prefix}_home")
+
+
+async def test_reset_overrides_single_joints(connect: Any) -> None:
+    with SimulatedServer("arm", play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        (arm,) = client.articulations.values()
+        name = next(iter(arm.joints))
+        await client.reset(per_articulation_qpos={arm.prefix: {name: 0.25}}, seed=3)
+        assert arm.get_qpos()[name] == 0.25
+        with pytest.raises(KeyError, match="no joint of"):
+            await client.reset(per_articulation_qpos={arm.prefix: {"nonsense": 0.25}})
+
+
+async def test_observation_levels(connect: Any) -> None:
+    with SimulatedServer("quadruped", play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover(observations="minimal")
+        (robot,) = client.articulations.values()
+        reply = await client.step()
+        state = reply.per_articulation[robot.prefix]
+        assert (state.ctrl, state.sensors, state.bodies) == (None, None, None)
+        reply = await client.step(observations="full")
+        state = reply.per_articulation[robot.prefix]
+        assert state.bodies is not None
+        assert all(actuator.force is not None for actuator in robot.actuators.values())
+        reply = await client.step()
+        assert reply.per_articulation[robot.prefix].sensors is None, "one step's level must not outlive it"
+        with pytest.raises(ValueError, match="everything"):
+            await client.step(observations="everything")
+
+
+async def test_discover_again_keeps_what_the_user_holds(connect: Any) -> None:
+    with SimulatedServer("arm", play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        (arm,) = client.articulations.values()
+        actuator = next(iter(arm.actuators.values()))
+        actuator.set_control(0.2)
+        old_session = client.session_id
+        await client.discover()
+        assert client.session_id != old_session
+        assert client.articulations[arm.prefix] == arm
+        await client.step()
+        assert arm.last_applied_ctrl[0] == np.float32(0.2)
+        assert actuator.value == 0.2
+
+
+async def test_a_second_client_takes_over_and_the_first_is_told(connect: Any) -> None:
+    with SimulatedServer("ball", play=True) as server:
+        first, second = connect(server, step_mode="direct"), connect(server, step_mode="direct")
+        await first.discover()
+        await second.discover()
+        with pytest.raises(SessionTakenOver):
+            await first.step()
+        await second.step()
+
+
+async def test_without_a_local_model_the_arrays_still_come(connect: Any) -> None:
+    with SimulatedServer("arm", play=True) as server:
+        client = connect(server, step_mode="direct", local_model=False)
+        await client.discover()
+        assert client.model is None
+        (arm,) = client.articulations.values()
+        arm.set_ctrl({next(iter(arm.actuators)): 0.3})
+        await client.step(5)
+        assert len(arm.qpos_array) == 8
+        assert arm.last_applied_ctrl[0] == np.float32(0.3)
+        with pytest.raises(URLabError, match="local_model=True"):
+            _ = arm.root_pos_w
+
+
+async def test_modes_are_promoted_and_taken_back(connect: Any) -> None:
+    with SimulatedServer("ball", play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        assert client.step_mode is StepMode.DIRECT
+        await client.close()
+        other = connect(server)
+        await other.discover()
+        assert await other.runtime.set_mode("puppet") is StepMode.PUPPET
+        reply = await other.call(_set_mode("live"))
+        assert reply.previous_mode == "puppet"
+
+
+async def test_closing_reverts_only_its_own_promotion(connect: Any) -> None:
+    with SimulatedServer("ball", play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        await client.close()
+        other = connect(server)
+        await other.discover()
+        reply = await other.call(_set_mode("live"))
+        assert reply.previous_mode == "live"
+
+
+def _set_mode(mode: str) -> Any:
+    from urlab_client.protocol.messages.runtime import SetMode
+
+    return SetMode(mode=mode)
+
+
+async def test_live_mode_hands_over_set_points(connect: Any) -> None:
+    with SimulatedServer("arm", play=True) as server:
+        client = connect(server, step_mode="live")
+        await client.discover()
+        (arm,) = client.articulations.values()
+        arm.set_ctrl({next(iter(arm.actuators)): 0.3})
+        reply = await client.step(100)
+        assert (reply.time, reply.step) == (0.0, 0), "live physics starts paused and counts nothing"
+        assert await client.runtime.set_paused(False) is False
+
+
+async def test_puppet_mode_pushes_the_local_state(connect: Any, asset: Any) -> None:
+    with SimulatedServer(asset("humanoid.xml"), play=True) as server:
+        client = connect(server, step_mode="puppet")
+        await client.discover(observations="full")
+        (robot,) = client.articulations.values()
+        client.data.qpos[2] = 2.5
+        reply = await client.step(0)
+        assert (reply.time, reply.step) == (0.0, 1)
+        assert robot.qpos_array[2] == 2.5
+        assert robot.bodies["torso"].xpos[2] == 2.5
+        client.data.ctrl[:] = 0.1
+        local = mujoco.MjData(client.model)
+        local.qpos[:], local.ctrl[:] = client.data.qpos, client.data.ctrl
+        mujoco.mj_forward(client.model, local)
+        mujoco.mj_step(client.model, local, 25)
+        reply = await client.step(25)
+        assert reply.time == local.time
+        assert np.array_equal(robot.qpos_array, local.qpos)
+
+
+@pytest.mark.parametrize("mode", ["raw", "ue_controller"])
+async def test_control_mode(connect: Any, mode: str) -> None:
+    with SimulatedServer("quadruped", play=True, controllers={"*": "pd"}) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        (robot,) = client.articulations.values()
+        assert robot.control_mode is ControlMode.UE_CONTROLLER
+        assert robot.controller.kind == "pd"
+        robot.control_mode = mode
+        robot.ctrl_array[:] = 0.05
+        await client.step()
+        bypassed = np.allclose(robot.last_applied_ctrl, np.float32(0.05))
+        assert bypassed == (mode == "raw")
+        with pytest.raises(ValueError, match="autopilot"):
+            robot.control_mode = "autopilot"
+
+
+async def test_gains(connect: Any) -> None:
+    from urlab_client import ControllerSchemaViolation
+
+    with SimulatedServer("quadruped", play=True, controllers={"*": "pd"}) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        (robot,) = client.articulations.values()
+        controller = robot.controller
+        kp, joint = controller.kp, next(iter(robot.actuators))
+        await controller.set_gains(kp={joint: 40.0})
+        assert kp[joint] == 40.0
+        await controller.set_defaults(kp=60, kv=2, torque_limit=30)
+        assert set(kp.values()) == {60.0}
+        assert controller.params["default_kp"] == 60.0
+        with pytest.raises(ControllerSchemaViolation, match="no actuator 'tail'"):
+            await controller.set_gains(kp={"tail": 1.0})
+        with pytest.raises(ControllerSchemaViolation, match="at least 0"):
+            await controller.set_defaults(kp=-1)
+        assert (await controller.refresh())["kp"][joint] == 60.0
