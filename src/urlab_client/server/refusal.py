@@ -1,0 +1,25 @@
+"""The way a handler of the simulated server answers with an error."""
+
+from __future__ import annotations
+
+__all__ = ["Refusal"]
+
+
+class Refusal(Exception):
+    """A request cannot be served; the dispatcher turns this into an error reply.
+
+    Attributes:
+        code: Stable wire code, for example `spawn_failed`.
+        message: What was wrong, where, and what would be right; one line.
+    """
+
+    code: str
+    message: str
+
+    def __init__(self, code: str, message: str) -> None:
+        super().__init__(code, message)
+        self.code = code
+        self.message = message
+
+    def __str__(self) -> str:
+        return f"{self.code}: {self.message}"
