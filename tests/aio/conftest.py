@@ -95,7 +95,7 @@ class ScriptedServer:
                 self._socket.send_multipart(frames)
             if self._socket in ready:
                 *envelope, body = self._socket.recv_multipart()
-                request = msgspec.msgpack.decode(body)
+                request = (msgspec.json if body[:1] == b"{" else msgspec.msgpack).decode(body)
                 answer = self.answers.get(request["op"], lambda _: None)(request)
                 if answer is None:
                     self.held.put(envelope)

@@ -413,7 +413,7 @@ class URLabClient:
             per_articulation_qpos=overrides or None,
         )
         reply = await self._session.call(request, timeout=timeout)
-        self._state.absorb(reply, "reset")
+        self._state.absorb_reset(reply, request.keyframe_name)
         return reply
 
     async def call(self, request: Request[R], *, timeout: Timeout = DEFAULT) -> R:

@@ -146,6 +146,22 @@ class Mirror:
             self.model = self.data = None
             self.approximate = False
 
+    def reset(self, keyframe: str | None) -> None:
+        """Reset the data as the server does: replies carry the articulations' state, but not all of it. Under the lock.
+
+        Args:
+            keyframe: Compiled keyframe name, or None.
+        """
+        if self.model is None or self.data is None:
+            return
+        import mujoco  # noqa: PLC0415
+
+        key = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_KEY, keyframe) if keyframe else -1
+        if key >= 0:
+            mujoco.mj_resetDataKeyframe(self.model, self.data, key)
+        else:
+            mujoco.mj_resetData(self.model, self.data)
+
     def mark_stale(self) -> None:
         """Note that positions or velocities changed, so that derived quantities must be computed before use."""
         self._stale = True

@@ -194,6 +194,17 @@ class SimState:
         self._entity_records = records
         self.entities = NameMap({**self.articulations, **plain}, kind="entity")
 
+    def absorb_reset(self, reply: StateReply, keyframe: str | None) -> None:
+        """Take over the state after a reset, whole or not at all."""
+        for key, state in reply.per_articulation.items():
+            if key in self._records:
+                self._records[key].check(state, "reset")
+        with self.mirror.lock:
+            self.mirror.reset(keyframe)
+            for record in self._entity_records.values():
+                record.pose = None
+            self.absorb(reply, "reset")
+
     def absorb(self, reply: StateReply, op: str, *, into_mirror: bool = True) -> None:
         """Take over the state in a reply, whole or not at all.
 
