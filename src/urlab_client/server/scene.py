@@ -49,7 +49,7 @@ FULL_BRIGHTNESS: Final = 5000.0
 _SPOT_CUTOFF: Final = 44.0
 """Unreal's default outer cone angle, degrees."""
 
-_COINCIDENT: Final = 1e-6
+_SAME: Final = 1e-6
 
 
 class CompileFailed(Exception):
@@ -94,7 +94,7 @@ class ArticulationIndex:
         prefix: `key` and an underscore: what its compiled names begin with.
         actor_id: Stable id given by the client; may be empty.
         model_name: The MJCF's `model` attribute, or its file stem.
-        root_body: Lowest body id; -1 if the MJCF has nothing but world geoms.
+        root_body: Lowest body id; 0, the world, if the MJCF has nothing but world geoms.
         bodies: Body ids.
         joints: Joint ids.
         actuators: Actuator ids.
@@ -255,7 +255,9 @@ def compile_scene(
             message += " (scenes use implicitfast; start the server with --mjcf-options to take the model's own)"
         raise CompileFailed(message) from None
     warnings.extend(one_line(message) for message in messages)
-    warnings.extend(_coinciding_planes(model))
+    planes = _coinciding_planes(model)
+    _draw_once(model, planes)
+    warnings.extend(_floor_warning(model, members) for members in planes)
     for warning in warnings:
         logger.warning("%s", warning)
     indices = tuple(_index(model, actor, blueprint, camera_size) for actor, blueprint in articulations)
@@ -500,29 +502,62 @@ def _fit_offscreen_buffer(model: mujoco.MjModel, sizes: Iterable[tuple[int, int]
         screen.offheight = max(screen.offheight, height)
 
 
-def _coinciding_planes(model: mujoco.MjModel) -> list[str]:
-    """Return a warning for each set of static planes that lie in one another, as floors inside robots do."""
+def _coinciding_planes(model: mujoco.MjModel) -> list[list[int]]:
+    """Return each set of two or more static, colliding planes that lie in one another, as floors inside robots do."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    groups: list[tuple[Floats, float, list[str]]] = []
     solid = (model.geom_contype | model.geom_conaffinity) != 0
-    for geom in np.flatnonzero((model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)) & solid):
-        if model.body_weldid[model.geom_bodyid[geom]] != 0:
-            continue
-        normal: Floats = data.geom_xmat[geom].reshape(3, 3)[:, 2]
+    static = model.body_weldid[model.geom_bodyid] == 0
+    groups: list[tuple[Floats, float, list[int]]] = []
+    for geom in np.flatnonzero((model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)) & solid & static).tolist():
+        normal: Floats = data.geom_xmat[geom].reshape(3, 3)[:, 2].copy()
         offset = float(normal @ data.geom_xpos[geom])
-        for other, at, names in groups:
-            if np.abs(other - normal).max() < _COINCIDENT and abs(at - offset) < _COINCIDENT:
-                names.append(model.geom(geom).name)
+        for other, at, members in groups:
+            if np.abs(other - normal).max() < _SAME and abs(at - offset) < _SAME:
+                members.append(geom)
                 break
         else:
-            groups.append((normal.copy(), offset, [model.geom(geom).name]))
-    return [
-        f"{len(names)} floors coincide ({', '.join(names[:4])}{', …' if len(names) > 4 else ''}): what stands on them "
-        f"has {len(names)} contacts for one, which costs time and makes the floor a little stiffer"
-        for _, _, names in groups
-        if len(names) > 1
-    ]
+            groups.append((normal, offset, [geom]))
+    return [members for _, _, members in groups if len(members) > 1]
+
+
+def _draw_once(model: mujoco.MjModel, planes: list[list[int]]) -> None:
+    """Hide what every robot brings along and a picture bears only once. Physics is not touched.
+
+    Of coinciding floors one is drawn, as large as all together: drawn all, they flicker. Of directional lights that
+    shine alike one stays on.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    for members in planes:
+        sizes: Floats = model.geom_size[members, :2]
+        # Half size 0 is endless.
+        drawn = members[int(np.argmax(np.where(sizes == 0.0, np.inf, sizes).sum(axis=1)))]
+        turn: Floats = data.geom_xmat[drawn].reshape(3, 3)
+        for other in members:
+            if other == drawn:
+                continue
+            center = turn.T @ (data.geom_xpos[other] - data.geom_xpos[drawn])
+            reach = np.abs(turn.T @ data.geom_xmat[other].reshape(3, 3))[:2, :2] @ model.geom_size[other, :2]
+            size: Floats = model.geom_size[drawn, :2]
+            model.geom_size[drawn, :2] = np.where(size == 0.0, 0.0, np.maximum(size, np.abs(center[:2]) + reach))
+            model.geom_matid[other] = -1
+            model.geom_rgba[other, 3] = 0.0
+    suns: list[Floats] = []
+    for light in np.flatnonzero(model.light_type == int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)).tolist():
+        sun = np.concatenate([model.light_dir[light], model.light_diffuse[light]])
+        if model.light_bodyid[light] == 0 and any(np.abs(sun - other).max() < _SAME for other in suns):
+            model.light_active[light] = False
+        else:
+            suns.append(sun)
+
+
+def _floor_warning(model: mujoco.MjModel, members: list[int]) -> str:
+    names = ", ".join(model.geom(geom).name for geom in members[:4])
+    return (
+        f"{len(members)} floors coincide ({names}{', …' if len(members) > 4 else ''}): what stands on them has "
+        f"{len(members)} contacts for one, which costs time and makes the ground a little stiffer"
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -579,7 +614,7 @@ def _index(
         prefix=actor.prefix,
         actor_id=actor.actor_id,
         model_name=blueprint.model_name or blueprint.stem,
-        root_body=int(bodies[0]) if bodies.size else -1,
+        root_body=int(bodies[0]) if bodies.size else 0,
         bodies=bodies,
         joints=joints,
         actuators=actuators,
