@@ -10,7 +10,7 @@ import pytest
 
 from urlab_client import SessionTakenOver, UnknownKeyframe, UnknownName, URLabError
 from urlab_client.enums import ControlMode, StepMode
-from urlab_client.server import SimulatedServer
+from urlab_client.server import ControllerConfig, SimulatedServer
 
 MODELS = ["humanoid.xml", "ant.xml", "walker2d_v5.xml", "pusher_v5.xml"]
 
@@ -352,7 +352,7 @@ async def test_puppet_mode_pushes_the_local_state(connect: Any, asset: Any) -> N
 
 @pytest.mark.parametrize("mode", ["raw", "ue_controller"])
 async def test_control_mode(connect: Any, mode: str) -> None:
-    with SimulatedServer("quadruped", play=True, controllers={"*": "pd"}) as server:
+    with SimulatedServer("quadruped", play=True, controllers={"*": ControllerConfig()}) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         (robot,) = client.articulations.values()
@@ -370,7 +370,7 @@ async def test_control_mode(connect: Any, mode: str) -> None:
 async def test_gains(connect: Any) -> None:
     from urlab_client import ControllerSchemaViolation
 
-    with SimulatedServer("quadruped", play=True, controllers={"*": "pd"}) as server:
+    with SimulatedServer("quadruped", play=True, controllers={"*": ControllerConfig()}) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         (robot,) = client.articulations.values()
