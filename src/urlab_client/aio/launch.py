@@ -120,27 +120,36 @@ class LaunchedTransport:
             *command, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE
         )
         self._process = process
-        assert process.stdout is not None and process.stderr is not None  # noqa: PT018, S101  # both are pipes
         try:
-            async with asyncio.timeout(_START_S):
-                line = await process.stdout.readline()
-                if not line:
-                    reason = (await process.stderr.read()).decode(errors="replace").strip()
-                    await process.wait()
-                    raise ServerUnreachable(
-                        f"{op.name}: no simulated server for {self._address}: {reason or 'it ended without a word'}",
-                        op=op.name,
-                    )
-        except TimeoutError:
-            process.kill()
-            raise ServerUnreachable(
-                f"{op.name}: the simulated server for {self._address} was not ready within {_START_S:g} s.", op=op.name
-            ) from None
+            line = await self._first_line(process, op)
+        except BaseException:  # cancelled, too: the next call starts afresh
+            if process.returncode is None:
+                process.kill()
+            raise
         ready = msgspec.json.decode(line, type=_Ready)
-        self._drain = asyncio.create_task(_log_lines(process.stderr), name="urlab-server-log")
+        if process.stderr is not None:
+            self._drain = asyncio.create_task(_log_lines(process.stderr), name="urlab-server-log")
         transport = ZmqTransport(f"{ready.address}:{ready.step_port}")
         transport.stats = self.stats
         return transport
+
+    async def _first_line(self, process: asyncio.subprocess.Process, op: Op) -> bytes:
+        """Return the ready line, or raise what the server said instead."""
+        output, errors = process.stdout, process.stderr
+        if output is None or errors is None:
+            raise TypeError("the server's output must be a pipe")
+        try:
+            async with asyncio.timeout(_START_S):
+                line = await output.readline()
+                if line:
+                    return line
+                reason = (await errors.read()).decode(errors="replace").strip()
+                await process.wait()
+        except TimeoutError:
+            reason = f"not ready within {_START_S:g} s"
+        raise ServerUnreachable(
+            f"{op.name}: no simulated server for {self._address}: {reason or 'it ended without a word'}", op=op.name
+        )
 
 
 _DEFAULTS: Sequence[str] = (

@@ -1,0 +1,117 @@
+"""`sim://…` addresses: the client brings its own server and takes it away again."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import urlab_client
+from urlab_client import OutcomeUnknown, ServerUnreachable
+from urlab_client.aio import URLabClient
+from urlab_client.aio.launch import serve_arguments
+
+
+def children() -> set[int]:
+    listing = subprocess.run(
+        ["ps", "--ppid", str(os.getpid()), "-o", "pid=,args="], capture_output=True, text=True, check=False
+    )
+    return {int(line.split()[0]) for line in listing.stdout.splitlines() if "urlab_client serve" in line}
+
+
+async def test_a_script_needs_no_server_of_its_own() -> None:
+    async with URLabClient("sim://arm", step_mode="direct") as client:
+        assert children() == set(), "nothing starts before the first call"
+        await client.discover()
+        (server,) = children()
+        await client.step(10)
+        assert client.sim_time == pytest.approx(0.02)
+    with pytest.raises(ProcessLookupError):
+        os.kill(server, 0)
+
+
+def test_the_facade_does_the_same() -> None:
+    with urlab_client.URLabClient("sim://ball?model=pallet", step_mode="direct") as client:
+        client.discover()
+        client.step(10)
+        assert set(client.articulations) == {"ball", "pallet"}
+    assert children() == set()
+
+
+async def test_options_of_serve_go_into_the_address(tmp_path: Path) -> None:
+    model = tmp_path / "slow.xml"
+    body = '<body><freejoint/><geom size=".1"/></body>'
+    model.write_text(f'<mujoco model="slow"><option timestep="0.01"/><worldbody>{body}</worldbody></mujoco>')
+    async with URLabClient(f"sim://{model}?mjcf-options", step_mode="direct") as client:
+        await client.discover()
+        await client.step()
+        assert client.sim_time == 0.01
+
+
+async def test_a_model_that_is_not_there() -> None:
+    async with URLabClient("sim://nowhere.xml") as client:
+        with pytest.raises(ServerUnreachable, match=r"nowhere\.xml"):
+            await client.discover()
+    assert children() == set()
+
+
+async def test_a_killed_server_is_noticed() -> None:
+    async with URLabClient("sim://ball", step_mode="direct") as client:
+        await client.discover()
+        (server,) = children()
+        os.kill(server, signal.SIGKILL)
+        with pytest.raises((OutcomeUnknown, ServerUnreachable)):
+            await client.step(timeout=2)
+        assert not client.connected
+
+
+async def test_cancelling_the_first_call_leaves_no_server_behind() -> None:
+    async with URLabClient("sim://ball") as client:
+        call = asyncio.create_task(client.discover())
+        while not children():  # noqa: ASYNC110  # the process table has no event to wait for
+            await asyncio.sleep(0)
+        call.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await call
+    assert children() == set()
+
+
+def test_the_server_dies_with_its_client() -> None:
+    script = (
+        "import os, urlab_client\n"
+        "client = urlab_client.URLabClient('sim://ball')\n"
+        "client.discover()\n"
+        "print(client._aio._transport._process.pid, flush=True)\n"
+        "os._exit(9)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 9
+    pid = int(done.stdout)
+    descriptor = None
+    try:
+        descriptor = os.pidfd_open(pid)
+    except ProcessLookupError:
+        return  # already gone
+    import select
+
+    ready, _, _ = select.select([descriptor], [], [], 10)
+    os.close(descriptor)
+    assert ready, "the server outlived its client by ten seconds"
+
+
+@pytest.mark.parametrize(
+    ("address", "arguments"),
+    [
+        ("sim://arm", ["arm"]),
+        ("sim:///models/a.xml?model=b.xml", ["/models/a.xml", "b.xml"]),
+        ("sim://arm?mjcf-options&step-mode=direct", ["arm", "--mjcf-options", "--step-mode=direct"]),
+        ("sim://arm?controller=arm=pd,kp=50", ["arm", "--controller=arm=pd,kp=50"]),
+    ],
+)
+def test_addresses_become_arguments(address: str, arguments: list[str]) -> None:
+    assert serve_arguments(address) == arguments
