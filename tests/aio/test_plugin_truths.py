@@ -333,6 +333,22 @@ async def test_pixels_become_what_the_reference_says(plugin: Any, connect: Any) 
         assert cams["c10"].sim_time == pytest.approx(0.002)
 
 
+async def test_a_camera_that_delivers_nothing_is_marked(plugin: Any, connect: Any) -> None:
+    async with connect() as client:
+        await client.discover()
+        one, ten = client.articulations["robot"].cameras.values()
+        frame = {"width": 2.0, "height": 1.0, "dtype": "bgra8", "data": bytes(8)}
+        plugin.cameras = {"c1": frame}
+        await client.step(include_cameras=True)
+        assert (one.delivered, ten.delivered) == (True, False)
+        plugin.cameras = {}
+        await client.step(include_cameras={"robot/c1": "latest"})
+        assert not one.delivered
+        assert one.sim_time == pytest.approx(0.002)
+        await client.step()
+        assert not one.delivered
+
+
 async def test_a_frame_of_the_wrong_size_spoils_the_whole_reply(plugin: Any, connect: Any) -> None:
     async with connect() as client:
         await client.discover()

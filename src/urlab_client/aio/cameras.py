@@ -24,12 +24,15 @@ class URLabCameraView:
     """Newest frame: real (H, W, 4) RGBA, depth (H, W) metres, semantic and instance (H, W, 4) BGRA; yours to keep."""
     sim_time: float | None
     """Simulation time of the reply that carried the newest frame, seconds."""
+    delivered: bool
+    """False when the last step that asked for a frame got none: `latest_frame` is then older than the state."""
 
     def __init__(self, name: str, info: CameraInfo) -> None:
         self.name = name
         self.info = info
         self.latest_frame = None
         self.sim_time = None
+        self.delivered = True
 
     @property
     def mode(self) -> CameraMode | str:

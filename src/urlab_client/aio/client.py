@@ -378,6 +378,8 @@ class URLabClient:
             for record, wrenches in carried:
                 record.drop_wrenches(wrenches)
         state.absorb(reply, "step", into_mirror=state.mode is not StepMode.PUPPET)
+        if cameras:
+            state.note_missing_frames(cameras, reply)
         return reply
 
     async def reset(

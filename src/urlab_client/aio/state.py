@@ -278,6 +278,18 @@ class SimState:
         if self.hello is not None:
             self.hello.manager_present = False
 
+    def note_missing_frames(self, asked: bool | Mapping[str, str | None], reply: StepOk) -> None:
+        """Mark the cameras whose frame was asked for and did not come: the server just leaves them out."""
+        if isinstance(asked, bool):
+            views = [view for art in self.articulations.values() for view in art.cameras.values()] if asked else []
+        else:
+            views = [view for view in map(self.camera, asked) if view is not None]
+        came = {id(self.camera(name)) for name in reply.cameras or {}}
+        for view in views:
+            if view.delivered and id(view) not in came:
+                log.warning("camera %s delivered no frame; its latest_frame is older than the state", view.name)
+            view.delivered = id(view) in came
+
     def _frames(self, cameras: Mapping[str, CameraFrame]) -> list[tuple[URLabCameraView, CameraFrame]]:
         found: list[tuple[URLabCameraView, CameraFrame]] = []
         for name, frame in cameras.items():
