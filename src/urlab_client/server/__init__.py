@@ -1,0 +1,12 @@
+"""A URLab server without Unreal: the plugin's protocol in front of real MuJoCo.
+
+For tests, demonstrations and offline work; `urlab serve` runs the same server from the command line. Importing this
+package imports MuJoCo.
+"""
+
+from urlab_client.server.bundled import bundled_models
+from urlab_client.server.controllers import ControllerConfig
+from urlab_client.server.endpoint import PortInUse
+from urlab_client.server.simulated import ModelError, SimulatedServer
+
+__all__ = ["ControllerConfig", "ModelError", "PortInUse", "SimulatedServer", "bundled_models"]

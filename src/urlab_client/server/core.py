@@ -1,0 +1,116 @@
+"""What the op handlers of a server work on, in one object.
+
+For the handlers, which get it as their first argument, and for `SimulatedServer`, which makes it.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from urlab_client.protocol.enums import CameraMode, StepMode
+from urlab_client.server.controllers import ControllerConfig
+from urlab_client.server.engine import Engine
+from urlab_client.server.observe import Observer
+from urlab_client.server.play import Play, Running
+from urlab_client.server.scene import ArticulationIndex, Scene, compile_scene
+from urlab_client.server.session import Session
+from urlab_client.server.world import World
+
+__all__ = ["PhysicsConfig", "ServerCore"]
+
+logger = logging.getLogger("urlab_client.server")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhysicsConfig:
+    """How play sessions of a server are set up.
+
+    Attributes:
+        step_mode: The mode every session is pinned to; `auto` starts live and lets clients choose.
+        unpaused: Let physics run from the start.
+        controllers: Controller by actor id or articulation key; `*` stands for all others.
+        camera_modes: What a camera's pixels mean, by `ACTOR/CAMERA`, where the actor is an id or a key.
+        camera_size: Width and height of cameras whose MJCF gives none, pixels.
+        mjcf_options: Honour the `<option>` of the first model.
+    """
+
+    step_mode: StepMode = StepMode.AUTO
+    unpaused: bool = False
+    controllers: Mapping[str, ControllerConfig] = field(default_factory=dict[str, ControllerConfig])
+    camera_modes: Mapping[str, CameraMode] = field(default_factory=dict[str, CameraMode])
+    camera_size: tuple[int, int] | None = None
+    mjcf_options: bool = False
+
+    def controller(self, index: ArticulationIndex) -> ControllerConfig | None:
+        """Return the controller an articulation is to get."""
+        for name in (index.actor_id, index.key, "*"):
+            if name and name in self.controllers:
+                return self.controllers[name]
+        return None
+
+    def camera_mode(self, index: ArticulationIndex, camera: str) -> CameraMode:
+        """Return what the pixels of an articulation's camera mean."""
+        for name in (index.actor_id, index.key):
+            if name and f"{name}/{camera}" in self.camera_modes:
+                return self.camera_modes[f"{name}/{camera}"]
+        return CameraMode.REAL
+
+
+@dataclass(kw_only=True)
+class ServerCore:
+    """A server without its sockets.
+
+    Attributes:
+        world: The level being edited.
+        physics: How play sessions are set up.
+        camera_endpoint: Where camera images will be published.
+        session: The client's session.
+        play: The play session.
+    """
+
+    world: World
+    physics: PhysicsConfig
+    camera_endpoint: str
+    session: Session = field(default_factory=Session)
+    play: Play = field(default_factory=Play)
+
+    def begin_play(self) -> None:
+        """Start play with the level as it is now; `play.wait` says how it ends."""
+        actors = self.world.freeze()
+        physics = self.physics
+
+        def build() -> Running:
+            scene = compile_scene(actors, honour_mjcf_options=physics.mjcf_options, camera_size=physics.camera_size)
+            return _run(scene, physics)
+
+        self.play.begin(build)
+        self.world.pie_running = True
+
+    def stop_play(self) -> None:
+        """End play, if it runs."""
+        self.play.stop()
+        self.world.pie_running = False
+
+
+def _run(scene: Scene, physics: PhysicsConfig) -> Running:
+    controllers = {index.key: config for index in scene.articulations if (config := physics.controller(index))}
+    _warn_of_strangers(scene, physics)
+    engine = Engine(scene, pinned_mode=physics.step_mode, paused=not physics.unpaused, controllers=controllers)
+    return Running(scene, engine.start(), Observer(scene, engine.controls))
+
+
+def _warn_of_strangers(scene: Scene, physics: PhysicsConfig) -> None:
+    """Say which of the configured names fit nothing: most likely they are misspelt."""
+    names = {name for index in scene.articulations for name in (index.actor_id, index.key)}
+    cameras = {
+        f"{name}/{camera.name}"
+        for index in scene.articulations
+        for name in (index.actor_id, index.key)
+        for camera in index.cameras
+    }
+    for unknown in sorted(physics.controllers.keys() - names - {"*"}):
+        logger.warning("a controller is configured for '%s', but no articulation has that id or key", unknown)
+    for unknown in sorted(physics.camera_modes.keys() - cameras):
+        logger.warning("a camera mode is configured for '%s', but no articulation has such a camera", unknown)

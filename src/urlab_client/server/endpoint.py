@@ -1,0 +1,202 @@
+"""The request socket of a server: one ZeroMQ REP socket, served by one thread.
+
+For `SimulatedServer`. Knows frames, not their meaning: whoever opens it says how to answer one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import logging
+import os
+import socket
+import threading
+from collections.abc import Callable
+from typing import Final
+
+import zmq
+
+from urlab_client.protocol.codec import MAX_REQUEST_BYTES
+
+__all__ = ["PortInUse", "ReservedPort", "RpcEndpoint", "connect_host", "numeric_host", "tcp"]
+
+logger = logging.getLogger("urlab_client.server")
+
+LINGER_MS: Final = 500
+"""How long a reply under way may keep the socket open after the end."""
+
+_WAKE = "inproc://urlab-wake"
+
+
+class PortInUse(OSError):
+    """Another program, often another server, holds a port.
+
+    Attributes:
+        host: Address of the interface.
+        port: TCP port.
+    """
+
+    host: str
+    port: int
+
+    def __init__(self, host: str, port: int, option: str = "port") -> None:
+        """Describe the conflict.
+
+        Args:
+            host: Address of the interface.
+            port: TCP port.
+            option: Name of the setting that chooses another port.
+        """
+        super().__init__(
+            errno.EADDRINUSE,
+            f"{tcp(host)}:{port} is in use: end the program that holds it, "
+            f"or choose another {option} (0 picks a free one)",
+        )
+        self.host = host
+        self.port = port
+        self._option = option
+
+    def __reduce__(self) -> tuple[type[PortInUse], tuple[str, int, str]]:
+        return type(self), (self.host, self.port, self._option)
+
+
+def numeric_host(host: str) -> str:
+    """Return the IP address to bind for `host`; empty or `*` means all IPv4 interfaces.
+
+    Raises:
+        OSError: No such host.
+    """
+    if host in ("", "*"):
+        return "0.0.0.0"  # noqa: S104 - asked for
+    try:
+        return str(socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0][4][0])
+    except socket.gaierror as error:
+        raise OSError(error.errno, f"cannot bind to {host!r}: {error.strerror}") from error
+
+
+def connect_host(host: str) -> str:
+    """Return where a client on this machine reaches a server bound to the address `host`."""
+    return {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104
+
+
+def tcp(host: str) -> str:
+    """Return the address of an IP address, without a port."""
+    return f"tcp://[{host}]" if ":" in host else f"tcp://{host}"
+
+
+class ReservedPort:
+    """A TCP port that nothing listens on yet and nobody else can take. A client that connects is refused."""
+
+    def __init__(self, host: str, port: int, option: str) -> None:
+        """Bind it.
+
+        Args:
+            host: IP address of the interface.
+            port: TCP port; 0 picks a free one.
+            option: Name of the setting, for the error.
+
+        Raises:
+            PortInUse: Somebody has it.
+            OSError: The address is not one of this machine.
+        """
+        self._socket = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
+        try:
+            self._socket.bind((host, port))
+        except OSError as error:
+            self._socket.close()
+            raise _bind_error(error.errno, host, port, option) from error
+        self.port = int(self._socket.getsockname()[1])
+
+    def release(self) -> None:
+        """Give the port back. Safe to call twice."""
+        self._socket.close()
+
+
+def _bind_error(code: int | None, host: str, port: int, option: str) -> OSError:
+    if code == errno.EADDRINUSE:
+        return PortInUse(host, port, option)
+    return OSError(code, f"cannot bind {tcp(host)}:{port}: {os.strerror(code or 0)}")
+
+
+class RpcEndpoint:
+    """Receives requests one at a time and sends what `answer` returns.
+
+    Attributes:
+        port: TCP port that is bound.
+    """
+
+    port: int
+
+    def __init__(self, answer: Callable[[bytes], bytes], *, host: str = "127.0.0.1", port: int = 0) -> None:
+        """Bind the socket; `start` begins to serve.
+
+        Args:
+            answer: Turns the frame of a request into the frame of its reply; must not raise.
+            host: IP address of the interface.
+            port: TCP port; 0 picks a free one.
+
+        Raises:
+            PortInUse: Somebody has the port.
+            OSError: The address is not one of this machine.
+        """
+        self._answer = answer
+        self._context = zmq.Context()
+        self._context.linger = LINGER_MS
+        self._socket = self._context.socket(zmq.REP)
+        # A frame between the two limits is answered with the reason, one beyond both costs the sender its connection.
+        self._socket.maxmsgsize = 2 * MAX_REQUEST_BYTES
+        self._socket.ipv6 = ":" in host
+        try:
+            self._socket.bind(f"{tcp(host)}:{port}")
+            self.port = int(self._socket.get_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
+            self._socket.bind(_WAKE)
+        except zmq.ZMQError as error:
+            self._context.destroy(linger=0)
+            raise _bind_error(error.errno, host, port, "step_port") from error
+        self._waker = self._context.socket(zmq.DEALER)
+        self._waker.connect(_WAKE)
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name="urlab-rpc", daemon=True)
+
+    def start(self) -> None:
+        """Start the thread that serves."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Ask the thread to end after the request under way, without waiting. Call once."""
+        self._stopping = True
+        with contextlib.suppress(zmq.ZMQError):  # the thread has ended already
+            self._waker.send_multipart([b"", b""], zmq.NOBLOCK)
+        self._waker.close()
+
+    def join(self, timeout: float) -> bool:
+        """Wait for the end after `stop`.
+
+        Args:
+            timeout: Seconds to wait.
+
+        Returns:
+            False when the request under way took longer; the thread then closes the socket when it is done.
+        """
+        if self._thread.ident is None:
+            self._close()
+        elif self._thread is not threading.current_thread():
+            self._thread.join(timeout)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        try:
+            while True:
+                frames = self._socket.recv_multipart()
+                if self._stopping:
+                    break
+                # A request of several frames is none; executing the first part would be a guess.
+                self._socket.send(self._answer(frames[0] if len(frames) == 1 else b""))
+        except zmq.ZMQError:
+            logger.exception("the request socket failed; the server answers no longer")
+        finally:
+            self._close()
+
+    def _close(self) -> None:
+        self._socket.close()
+        self._context.term()

@@ -1,0 +1,258 @@
+"""Handlers of the `runtime` ops: live changes to the running simulation."""
+
+# ruff: noqa: D103 - what an op does stands once, on its request struct
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import mujoco
+import numpy as np
+from msgspec import field
+
+from urlab_client.protocol.base import Quat, Vec3
+from urlab_client.protocol.enums import StepMode
+from urlab_client.protocol.messages.runtime import (
+    ConfigureController,
+    ConfigureControllerOk,
+    ContactFilter,
+    GetContacts,
+    GetContactsOk,
+    ListKeyframes,
+    ListKeyframesOk,
+    ReadMocapPose,
+    ReadMocapPoseOk,
+    SetControlSource,
+    SetControlSourceOk,
+    SetMocapPose,
+    SetMocapPoseOk,
+    SetMode,
+    SetModeOk,
+    SetPaused,
+    SetPausedOk,
+    SetQpos,
+    SetQposOk,
+    SetSimSpeed,
+    SetSimSpeedOk,
+    SetTwist,
+    SetTwistOk,
+)
+from urlab_client.protocol.types import Contact, KeyframeInfo
+from urlab_client.server.controllers import ArticulationControl
+from urlab_client.server.core import ServerCore
+from urlab_client.server.dispatch import handles
+from urlab_client.server.engine import Engine, parse_control_source, parse_mode
+from urlab_client.server.refusal import Refusal
+from urlab_client.server.requests import need
+
+MAX_CONTACTS: Final = 64
+
+
+@handles(SetMode)
+def set_mode(server: ServerCore, request: SetMode) -> SetModeOk:
+    engine = server.play.running().engine
+    if engine.pinned_mode is not None:
+        engine.set_mode(StepMode.LIVE)  # refuses, before the field is looked at
+    previous, current = engine.set_mode(parse_mode(need(request, request.mode, "mode")))
+    return SetModeOk(previous_mode=previous, current_mode=current)
+
+
+@handles(SetPaused)
+def set_paused(server: ServerCore, request: SetPaused) -> SetPausedOk:
+    engine = server.play.running().engine
+    return SetPausedOk(paused=engine.set_paused(need(request, request.paused, "paused")))
+
+
+@handles(SetSimSpeed)
+def set_sim_speed(server: ServerCore, request: SetSimSpeed) -> SetSimSpeedOk:
+    engine = server.play.running().engine
+    percent = need(request, request.percent, "percent")
+    if math.isnan(percent):
+        raise Refusal("missing_field", "set_sim_speed: field 'percent' is not a number")
+    return SetSimSpeedOk(percent=engine.set_sim_speed(percent))
+
+
+@handles(SetControlSource)
+def set_control_source(server: ServerCore, request: SetControlSource) -> SetControlSourceOk:
+    engine = server.play.running().engine
+    source = parse_control_source(need(request, request.source, "source"))
+    if not request.articulation:
+        engine.set_control_source(source)
+        return SetControlSourceOk(source=source, scope="global")
+    engine.set_control_source(source, request.articulation)
+    return SetControlSourceOk(source=source, scope="articulation", articulation=request.articulation)
+
+
+class AnyTwist(SetTwist, tag="set_twist", kw_only=True):
+    """Reads vectors of any length; elements that are not there count as 0."""
+
+    # Clients send three numbers, which is what the declared types say; a server takes any number of them.
+    linear: list[float] = field(default_factory=list[float])  # pyright: ignore[reportIncompatibleVariableOverride]
+    angular: list[float] = field(default_factory=list[float])  # pyright: ignore[reportIncompatibleVariableOverride]
+
+
+@handles(AnyTwist)
+def set_twist(server: ServerCore, request: AnyTwist) -> SetTwistOk:
+    engine = server.play.running().engine
+    key = need(request, request.articulation, "articulation")
+    twist = engine.set_twist(key, request.linear, request.angular)
+    return SetTwistOk(articulation=key, linear=twist.linear, angular=twist.angular)
+
+
+@handles(ConfigureController)
+def configure_controller(server: ServerCore, request: ConfigureController) -> ConfigureControllerOk:
+    engine = server.play.running().engine
+    key = need(request, request.articulation, "articulation")
+    return ConfigureControllerOk(articulation=key, params=engine.configure_controller(key, request.params))
+
+
+@handles(SetQpos)
+def set_qpos(server: ServerCore, request: SetQpos) -> SetQposOk:
+    running = server.play.running()
+    engine, model, data = running.engine, running.scene.model, running.scene.data
+    target = need(request, request.target, "target")
+    by_name = request.target_by == "actor_name"
+    index = engine.control(target).index if by_name else _by_actor_id(engine, target).index
+    qpos = need(request, request.qpos, "qpos")
+    if not len(index.joints):
+        raise Refusal("no_joints", f"articulation '{index.key}' has no joints")
+    addresses = index.qpos_adr
+    first_is_free = int(model.jnt_type[index.joints[0]]) == mujoco.mjtJoint.mjJNT_FREE
+    shortcut = len(qpos) == 7 != len(addresses) and first_is_free
+    if shortcut:
+        addresses = addresses[:7]
+    elif len(qpos) != len(addresses):
+        or_base = ", or 7 for its free base" if first_is_free and len(addresses) != 7 else ""
+        raise Refusal(
+            "dim_mismatch", f"{len(qpos)} values given, articulation '{index.key}' takes {len(addresses)}{or_base}"
+        )
+    with engine.lock:
+        data.qpos[addresses] = qpos
+        engine.forward()
+        written = data.qpos[addresses]
+    return SetQposOk(
+        target=target, actor_name=index.key, actor_id=index.actor_id, qpos=written, free_base_shortcut=shortcut
+    )
+
+
+def _by_actor_id(engine: Engine, actor_id: str) -> ArticulationControl:
+    for control in engine.controls.values():
+        if control.index.actor_id == actor_id:
+            return control
+    raise Refusal("unknown_articulation", actor_id)
+
+
+@handles(SetMocapPose)
+def set_mocap_pose(server: ServerCore, request: SetMocapPose) -> SetMocapPoseOk:
+    running = server.play.running()
+    body = need(request, request.body, "body")
+    mocap = _mocap_id(running.scene.model, body)
+    if request.pos is None and request.quat is None:
+        raise Refusal("missing_field", "set_mocap_pose: give 'pos' (3 numbers), 'quat' (4 numbers, w x y z) or both")
+    data = running.scene.data
+    with running.engine.lock:
+        if request.pos is not None:
+            data.mocap_pos[mocap] = request.pos
+        if request.quat is not None:
+            data.mocap_quat[mocap] = request.quat
+        pos, quat = _mocap_pose(data, mocap)
+    return SetMocapPoseOk(body=body, pos=pos, quat=quat)
+
+
+@handles(ReadMocapPose)
+def read_mocap_pose(server: ServerCore, request: ReadMocapPose) -> ReadMocapPoseOk:
+    running = server.play.running()
+    body = need(request, request.body, "body")
+    mocap = _mocap_id(running.scene.model, body)
+    with running.engine.lock:
+        pos, quat = _mocap_pose(running.scene.data, mocap)
+    return ReadMocapPoseOk(body=body, pos=pos, quat=quat)
+
+
+def _mocap_id(model: mujoco.MjModel, body: str) -> int:
+    number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, body)
+    if number < 0:
+        raise Refusal("unknown_body", body)
+    mocap = int(model.body_mocapid[number])
+    if mocap < 0:
+        raise Refusal("not_mocap_body", f"body '{body}' is no mocap body: its MJCF does not say mocap=\"true\"")
+    return mocap
+
+
+def _mocap_pose(data: mujoco.MjData, mocap: int) -> tuple[Vec3, Quat]:
+    x, y, z = data.mocap_pos[mocap].tolist()
+    qw, qx, qy, qz = data.mocap_quat[mocap].tolist()
+    return (x, y, z), (qw, qx, qy, qz)
+
+
+@handles(GetContacts)
+def get_contacts(server: ServerCore, request: GetContacts) -> GetContactsOk:
+    running = server.play.running()
+    model, data = running.scene.model, running.scene.data
+    limit = request.max_contacts if request.max_contacts > 0 else MAX_CONTACTS
+    wanted = request.filter or ContactFilter()
+    contacts: list[Contact] = []
+    with running.engine.lock:
+        for number in range(data.ncon):
+            contact = _contact(model, data, number, wanted)
+            if contact is None:
+                continue
+            if len(contacts) == limit:
+                return GetContactsOk(n_contacts=limit, truncated=True, contacts=contacts)
+            contacts.append(contact)
+    return GetContactsOk(n_contacts=len(contacts), truncated=False, contacts=contacts)
+
+
+def _contact(model: mujoco.MjModel, data: mujoco.MjData, number: int, wanted: ContactFilter) -> Contact | None:
+    """Return contact `number`, or None when the filter excludes it."""
+    raw = data.contact[number]
+    (geom1, body1), (geom2, body2) = (_side(model, int(geom)) for geom in raw.geom)
+    pairs = ((wanted.geom1, geom1), (wanted.geom2, geom2), (wanted.body1, body1), (wanted.body2, body2))
+    if any(name and name != actual for name, actual in pairs):
+        return None
+    force = np.zeros(6)
+    mujoco.mj_contactForce(model, data, number, force)
+    x, y, z = raw.pos.tolist()
+    nx, ny, nz = raw.frame[:3].tolist()
+    fx, fy, fz, tx, ty, tz = force.tolist()
+    return Contact(
+        geom1=geom1,
+        geom2=geom2,
+        body1=body1,
+        body2=body2,
+        pos=(x, y, z),
+        normal=(nx, ny, nz),
+        dist=float(raw.dist),
+        force=(fx, fy, fz, tx, ty, tz),
+    )
+
+
+def _side(model: mujoco.MjModel, geom: int) -> tuple[str, str]:
+    """Return the names of a contact's geom and its body; both empty for what is no geom, such as a flex."""
+    if geom < 0:
+        return "", ""
+    body = int(model.geom_bodyid[geom])
+    return (
+        mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom) or "",
+        mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, body) or "",
+    )
+
+
+@handles(ListKeyframes)
+def list_keyframes(server: ServerCore, request: ListKeyframes) -> ListKeyframesOk:
+    del request
+    model = server.play.running().scene.model
+    return ListKeyframesOk(keyframes=[_keyframe(model, number) for number in range(model.nkey)])
+
+
+def _keyframe(model: mujoco.MjModel, number: int) -> KeyframeInfo:
+    return KeyframeInfo(
+        name=mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, number) or "",
+        time=float(model.key_time[number]),
+        qpos=model.key_qpos[number].tolist(),
+        qvel=model.key_qvel[number].tolist(),
+        ctrl=model.key_ctrl[number].tolist(),
+        mocap_pos=model.key_mpos[number].tolist(),
+        mocap_quat=model.key_mquat[number].tolist(),
+    )

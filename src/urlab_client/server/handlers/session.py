@@ -1,0 +1,212 @@
+"""Handlers of the ops without a namespace, and the handshake that `begin_pie` sends as well."""
+
+# ruff: noqa: D103 - what an op does stands once, on its request struct
+
+from __future__ import annotations
+
+import base64
+import logging
+from typing import Final
+
+import mujoco
+
+from urlab_client.protocol.enums import ObservationLevel, StepMode
+from urlab_client.protocol.messages.session import (
+    ArticulationInfo,
+    CameraInfo,
+    ControllerInfo,
+    EntityInfo,
+    Forward,
+    ForwardOk,
+    Hello,
+    HelloOk,
+    Meta,
+    MetaOk,
+    OpInfo,
+    OriginalNames,
+    Reset,
+    ResetOk,
+    Step,
+    StepOk,
+)
+from urlab_client.protocol.registry import OPS
+from urlab_client.server.controllers import ArticulationControl, float32
+from urlab_client.server.core import ServerCore
+from urlab_client.server.dispatch import handles
+from urlab_client.server.observe import sim_clock, wall_clock
+from urlab_client.server.play import Running
+from urlab_client.server.scene import EntityIndex
+
+logger = logging.getLogger("urlab_client.server")
+
+URLAB_VERSION: Final = "urlab/0.1"
+"""The version the plugin of this protocol reports; clients compare with it."""
+
+
+@handles(Hello)
+def hello(server: ServerCore, request: Hello) -> HelloOk:
+    reply = handshake(server, "", include_assets=request.include_assets)
+    running = server.play.current
+    if running is not None:
+        running.engine.reset_step_count()
+    # Last: physics may be too busy to answer, and then the old session stays.
+    reply.session_id = server.session.open(observations=request.observations, encoding=request.encoding)
+    return reply
+
+
+def handshake(server: ServerCore, session_id: str, *, include_assets: bool = False) -> HelloOk:
+    """Describe the server as `hello` and the start of play do, without any effect on the session."""
+    reply = HelloOk(
+        session_id=session_id,
+        urlab_version=URLAB_VERSION,
+        mujoco_version_int=mujoco.mj_version(),
+        mujoco_version=mujoco.mj_versionString(),
+        manager_present=server.play.manager_present,
+        articulations=[],
+    )
+    if not server.play.manager_present:
+        return reply
+    reply.entities = {}
+    reply.global_cameras = {}
+    running = server.play.current
+    if running is None:
+        return reply
+    scene, engine = running.scene, running.engine
+    with engine.lock:
+        reply.mjb = scene.mjb()
+        reply.articulations = [_articulation(server, control) for control in engine.controls.values()]
+    reply.mjb_base64 = base64.b64encode(reply.mjb).decode("ascii")
+    reply.mjb_size = len(reply.mjb)
+    reply.entities = {entity.name: _entity(entity) for entity in scene.entities}
+    if include_assets:
+        _add_assets(reply, running)
+    return reply
+
+
+def _articulation(server: ServerCore, control: ArticulationControl) -> ArticulationInfo:
+    index, controller = control.index, control.controller
+    names = index.original_names
+    return ArticulationInfo(
+        prefix=index.key,
+        actor_id=index.actor_id,
+        default_control_mode="raw" if controller is None else "ue_controller",
+        controller=None
+        if controller is None
+        else ControllerInfo(kind=controller.kind, params=controller.params(), schema=controller.schema()),
+        actuator_types=dict(index.actuator_types),
+        original_names=OriginalNames(
+            actuators=dict(names["actuators"]),
+            joints=dict(names["joints"]),
+            sensors=dict(names["sensors"]),
+            bodies=dict(names["bodies"]),
+        ),
+        camera_topics={
+            camera.name: CameraInfo(
+                mode=server.physics.camera_mode(index, camera.name),
+                resolution=camera.resolution,
+                fovy=float32(camera.fovy),
+                zmq_endpoint=server.camera_endpoint,
+                zmq_topic=f"{index.key}/camera/{camera.name}",
+            )
+            for camera in index.cameras
+        },
+    )
+
+
+def _entity(entity: EntityIndex) -> EntityInfo:
+    if entity.free_joint_id < 0:
+        return EntityInfo(id=entity.body, has_free_base=False)
+    return EntityInfo(
+        id=entity.body,
+        has_free_base=True,
+        free_joint=entity.free_joint,
+        free_joint_id=entity.free_joint_id,
+        qpos_offset=entity.qpos_adr,
+        qvel_offset=entity.qvel_adr,
+    )
+
+
+def _add_assets(reply: HelloOk, running: Running) -> None:
+    reply.vfs_assets = {}
+    try:
+        reply.mjcf_compiled = running.scene.mjcf()
+        reply.vfs_assets = running.scene.assets()
+    except (ValueError, mujoco.FatalError) as error:
+        logger.warning("the scene cannot be written as MJCF, so the handshake goes without: %s", error)
+
+
+@handles(Meta)
+def meta(server: ServerCore, request: Meta) -> MetaOk:
+    # Also the ops that this server answers with `unsupported`: the catalogue says what the protocol is, and a client
+    # that reads it must not conclude that it talks to another version of the plugin.
+    del server, request
+    return MetaOk(
+        ops=[
+            OpInfo(
+                name=op.name,
+                category=op.needs,
+                namespace=op.ns,
+                required_fields=list(op.declared_required) or None,
+                reply_fields=list(op.declared_reply) or None,
+            )
+            for op in OPS.values()
+            if op.name not in ("hello", "meta")
+        ]
+    )
+
+
+@handles(Step)
+def step(server: ServerCore, request: Step) -> StepOk:
+    running = server.play.running()
+    if running.engine.mode in (StepMode.DIRECT, StepMode.PUPPET):
+        server.session.adopt_level(request.observations)
+    level = server.session.level
+    return running.engine.step(request, lambda _: _observe_step(running, level))
+
+
+def _observe_step(running: Running, level: ObservationLevel) -> StepOk:
+    engine, observer = running.engine, running.observer
+    time = engine.time
+    return StepOk(
+        time=time,
+        step=engine.step_count,
+        sim_time=sim_clock(time),
+        wall_time=wall_clock(),
+        per_articulation=observer.articulations(level),
+        entities=observer.entities(),
+    )
+
+
+@handles(Reset)
+def reset(server: ServerCore, request: Reset) -> ResetOk:
+    running = server.play.running()
+    engine = running.engine
+    with engine.lock:
+        engine.reset(
+            keyframe_name=request.keyframe_name, seed=request.seed, per_articulation_qpos=request.per_articulation_qpos
+        )
+        time = engine.time
+        return ResetOk(
+            time=time,
+            step=engine.step_count,
+            sim_time=sim_clock(time),
+            wall_time=wall_clock(),
+            per_articulation=running.observer.articulations(server.session.level),
+        )
+
+
+@handles(Forward)
+def forward(server: ServerCore, request: Forward) -> ForwardOk:
+    del request
+    running = server.play.running()
+    engine = running.engine
+    with engine.lock:
+        engine.forward()
+        time = engine.time
+        return ForwardOk(
+            time=time,
+            step=engine.step_count,
+            sim_time=sim_clock(time),
+            wall_time=wall_clock(),
+            per_articulation=running.observer.articulations(server.session.level),
+        )

@@ -1,0 +1,449 @@
+"""`SimulatedServer`: a server that speaks the plugin's protocol, with real MuJoCo and without Unreal."""
+
+from __future__ import annotations
+
+import inspect
+import logging
+import os
+import tempfile
+import threading
+import time
+import warnings
+import weakref
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType, TracebackType
+from typing import Any, Final, Literal, Self
+
+import anyio
+import anyio.to_thread
+
+from urlab_client.protocol.enums import CameraMode, PIEState, StepMode
+from urlab_client.protocol.errors import URLabError
+from urlab_client.server.bundled import bundled_models
+from urlab_client.server.content import ContentRoot
+from urlab_client.server.controllers import ControllerConfig
+from urlab_client.server.core import PhysicsConfig, ServerCore
+from urlab_client.server.dispatch import Dispatcher
+from urlab_client.server.endpoint import ReservedPort, RpcEndpoint, connect_host, numeric_host, tcp
+from urlab_client.server.handlers import HANDLERS
+from urlab_client.server.refusal import Refusal
+from urlab_client.server.world import World
+
+__all__ = ["ModelError", "SimulatedServer"]
+
+logger = logging.getLogger("urlab_client.server")
+
+CLOSE_S: Final = 1.0
+"""Longest time that closing takes, whatever is under way."""
+
+GAP_M: Final = 1.0
+"""Free space between the models placed side by side, metres."""
+
+_NO_LIMIT: Final = float("inf")
+
+
+class ModelError(URLabError, ValueError):
+    """A model or level that a server was to start with is missing or cannot be used."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Ports:
+    """Numbers as asked for; 0 for any free one."""
+
+    step: int
+    state: int
+    ctrl: int
+    info: int
+    camera: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Config:
+    models: tuple[str, ...]
+    play: bool
+    host: str
+    ports: _Ports
+    saved_dir: Path | None
+    model_roots: tuple[Path, ...] | None
+    actor_names: Literal["model", "plugin"]
+    physics: PhysicsConfig
+
+
+class SimulatedServer:
+    """A URLab server without Unreal, for tests, demonstrations and offline work.
+
+    It runs in threads of its own, so a program may hold it and any number of clients::
+
+        with SimulatedServer("arm", play=True) as server:
+            client = URLabClient(**server.client_options())
+
+    `async with` does the same without blocking the event loop. The server answers as the plugin does, with these
+    differences: a broken MJCF is refused instead of imported empty, positions in replies are right, entities are
+    reported, handlers of all transports run one at a time, and what has no counterpart here answers `unsupported`.
+
+    Each MJCF becomes a blueprint and one actor whose id is the file stem, made unique with `_1`, `_2`, …. The first
+    stands at the origin, the others beside it along +y: so far that the boxes around their geoms, at their reference
+    poses, are a metre apart. Planes, being endless, do not count: a model of nothing but a floor stays at the
+    origin. The level has no name and has a manager, so play can start at once.
+    """
+
+    def __init__(
+        self,
+        *models: str | os.PathLike[str],
+        play: bool = False,
+        unpaused: bool = False,
+        step_mode: StepMode | str = StepMode.AUTO,
+        host: str = "127.0.0.1",
+        step_port: int = 0,
+        state_port: int = 0,
+        ctrl_port: int = 0,
+        info_port: int = 0,
+        camera_port: int = 0,
+        saved_dir: str | os.PathLike[str] | None = None,
+        model_roots: Sequence[str | os.PathLike[str]] | None = None,
+        controllers: Mapping[str, ControllerConfig] = MappingProxyType({}),
+        camera_modes: Mapping[str, CameraMode | str] = MappingProxyType({}),
+        camera_size: tuple[int, int] | None = None,
+        mjcf_options: bool = False,
+        actor_names: Literal["model", "plugin"] = "model",
+    ) -> None:
+        """Describe a server; `start`, or entering it, opens it.
+
+        Args:
+            models: MJCF files, names of bundled robots (see `bundled_models`), and at most one saved level (`.json`),
+                which becomes the open level.
+            play: Start a play session at once.
+            unpaused: Let physics run from the start of each play session; the plugin starts paused.
+            step_mode: `live`, `direct` or `puppet` pins the mode; `auto` starts live and lets clients choose.
+            host: Interface to bind, an address or a name.
+            step_port: Port of requests; 0 picks a free one, here and below.
+            state_port: Port of the state stream. This version reserves it without serving it, like the next three: a
+                connection is refused.
+            ctrl_port: Port of streamed controls.
+            info_port: Port of the info stream.
+            camera_port: Port of camera images.
+            saved_dir: Folder of levels and imported models; None for a temporary one that goes when the server closes.
+            model_roots: Folders below which clients may import MJCF files. None for the folders of `models`, or the
+                current folder where those name none.
+            controllers: Controller by actor id or articulation key; `*` stands for all others.
+            camera_modes: What a camera's pixels mean, by `ACTOR/CAMERA`.
+            camera_size: Width and height of cameras whose MJCF gives none, pixels; default 640 by 480.
+            mjcf_options: Honour the `<option>` of the first model; the plugin ignores it.
+            actor_names: Name articulations after their MJCF's model name (`robot`, `robot_1`) or as the plugin does
+                (`robot_C_0`, `robot_C_1`).
+
+        Raises:
+            ValueError: A port, mode or size that is none, or two levels.
+        """
+        names = tuple(os.fspath(model) for model in models)
+        if sum(map(_is_level, names)) > 1:
+            raise ValueError(f"only one level can be open: {', '.join(filter(_is_level, names))}")
+        if actor_names not in ("model", "plugin"):
+            raise ValueError(f"actor_names is 'model' or 'plugin', not {actor_names!r}")
+        if camera_size is not None and (len(camera_size) != 2 or min(camera_size) < 1):
+            raise ValueError(f"camera_size is a width and a height of at least 1 pixel, not {camera_size!r}")
+        ports = _Ports(step=step_port, state=state_port, ctrl=ctrl_port, info=info_port, camera=camera_port)
+        for name, port in vars(ports).items():
+            if not 0 <= port <= 65535:
+                raise ValueError(f"{name}_port is a number from 0 to 65535, not {port}")
+        self._config = _Config(
+            models=names,
+            play=play,
+            host=host,
+            ports=ports,
+            saved_dir=None if saved_dir is None else Path(saved_dir),
+            model_roots=None if model_roots is None else tuple(map(Path, model_roots)),
+            actor_names=actor_names,
+            physics=PhysicsConfig(
+                step_mode=StepMode(step_mode),
+                unpaused=unpaused,
+                controllers=dict(controllers),
+                camera_modes={camera: CameraMode(mode) for camera, mode in camera_modes.items()},
+                camera_size=camera_size,
+                mjcf_options=mjcf_options,
+            ),
+        )
+        self._lock = threading.Lock()
+        self._opened: _Opened | None = None
+        self._made_at = _caller()
+        self._finalizer: weakref.finalize[..., Self] | None = None
+
+    def __repr__(self) -> str:
+        opened = self._opened
+        where = "closed" if opened is None else f"{self.address}:{opened.endpoint.port}"
+        return f"<{type(self).__name__} {' '.join(self._config.models) or 'empty'} at {where}>"
+
+    # Life
+
+    def start(self) -> Self:
+        """Open the server and return it once it answers; without effect while it is open.
+
+        After `close` it starts afresh, from the models.
+
+        Raises:
+            PortInUse: Somebody has a port.
+            OSError: The host is none of this machine, or `saved_dir` cannot be used.
+            ModelError: A model is missing or broken, or play was asked for and MuJoCo rejects the scene.
+        """
+        with self._lock:
+            if self._opened is None:
+                self._opened = _Opened.open(self._config)
+                self._finalizer = weakref.finalize(self, _Opened.close_here, self._opened, os.getpid())
+        return self
+
+    def close(self) -> None:
+        """Close the server within about a second, whatever is under way; without effect while it is closed.
+
+        A request under way is answered `shutting_down` where it can be broken off.
+        """
+        with self._lock:
+            opened, self._opened = self._opened, None
+            if opened is not None:
+                if self._finalizer is not None:
+                    self._finalizer.detach()
+                opened.close()
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    async def __aenter__(self) -> Self:
+        try:
+            await anyio.to_thread.run_sync(self.start)
+        except BaseException:
+            # Cancelled while it started: nobody else would close it.
+            await self._aclose()
+            raise
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        await self._aclose()
+
+    async def _aclose(self) -> None:
+        with anyio.CancelScope(shield=True):
+            await anyio.to_thread.run_sync(self.close)
+
+    def __del__(self) -> None:
+        if getattr(self, "_opened", None) is not None:
+            warnings.warn(
+                f"{self!r} was not closed; it was opened at {self._made_at}",
+                ResourceWarning,
+                source=self,
+                stacklevel=2,
+            )
+
+    # Where it is
+
+    @property
+    def address(self) -> str:
+        """Address for a client on this machine, without a port: `tcp://127.0.0.1`."""
+        return tcp(connect_host(self._running.host))
+
+    @property
+    def step_port(self) -> int:
+        """Port of requests."""
+        return self._running.endpoint.port
+
+    @property
+    def state_port(self) -> int:
+        """Port of the state stream; reserved, not served yet."""
+        return self._running.reserved["state"].port
+
+    @property
+    def ctrl_port(self) -> int:
+        """Port of streamed controls; reserved, not served yet."""
+        return self._running.reserved["ctrl"].port
+
+    @property
+    def info_port(self) -> int:
+        """Port of the info stream; reserved, not served yet."""
+        return self._running.reserved["info"].port
+
+    @property
+    def camera_port(self) -> int:
+        """Port of camera images; reserved, not served yet."""
+        return self._running.reserved["camera"].port
+
+    @property
+    def saved_dir(self) -> Path:
+        """Folder of levels and imported models."""
+        return self._running.saved_dir
+
+    def client_options(self) -> dict[str, Any]:
+        """Return what a client needs to reach this server: `URLabClient(**server.client_options())`."""
+        return {
+            "address": self.address,
+            "step_port": self.step_port,
+            "state_port": self.state_port,
+            "ctrl_port": self.ctrl_port,
+            "info_port": self.info_port,
+        }
+
+    @property
+    def _running(self) -> _Opened:
+        opened = self._opened
+        if opened is None:
+            raise RuntimeError("the server is closed: use it in a with block, or call start() first")
+        return opened
+
+
+class _Opened:
+    """Everything an open server holds. Knows nothing of the `SimulatedServer`, which can so be collected."""
+
+    def __init__(self, config: _Config) -> None:
+        self.host = numeric_host(config.host)
+        self.reserved: dict[str, ReservedPort] = {}
+        self._scratch: tempfile.TemporaryDirectory[str] | None = None
+        self._endpoint: RpcEndpoint | None = None
+        self._core: ServerCore | None = None
+        self._closed = False
+
+    @classmethod
+    def open(cls, config: _Config) -> _Opened:
+        """Open a server, or leave nothing behind."""
+        opened = cls(config)
+        try:
+            opened._start(config)
+        except BaseException:
+            opened.close()
+            raise
+        return opened
+
+    @property
+    def endpoint(self) -> RpcEndpoint:
+        """The request socket."""
+        if self._endpoint is None:
+            raise RuntimeError("the server is still starting")
+        return self._endpoint
+
+    @property
+    def saved_dir(self) -> Path:
+        """Folder of the content root."""
+        if self._core is None:
+            raise RuntimeError("the server is still starting")
+        return self._core.world.content.root
+
+    def _start(self, config: _Config) -> None:
+        for name in ("state", "ctrl", "info", "camera"):
+            self.reserved[name] = ReservedPort(self.host, getattr(config.ports, name), f"{name}_port")
+        core = ServerCore(
+            world=World(self._content(config), actor_names=config.actor_names),
+            physics=config.physics,
+            camera_endpoint=f"{tcp(self.host)}:{self.reserved['camera'].port}",
+        )
+        self._core = core
+        # Bound before the models are read, which takes longer, and answering after: requests wait in the socket.
+        self._endpoint = RpcEndpoint(Dispatcher(core, HANDLERS).answer, host=self.host, port=config.ports.step)
+        try:
+            _populate(core.world, config.models)
+        except Refusal as refusal:
+            raise ModelError(refusal.message) from None
+        if config.play:
+            core.begin_play()
+            if core.play.wait(_NO_LIMIT) is not PIEState.READY:
+                raise ModelError(f"play cannot start: {core.play.compile_error}")
+        self._endpoint.start()
+        logger.info("serving at %s:%d", tcp(self.host), self._endpoint.port)
+
+    def _content(self, config: _Config) -> ContentRoot:
+        folder = config.saved_dir
+        if folder is None:
+            self._scratch = tempfile.TemporaryDirectory(prefix="urlab-", ignore_cleanup_errors=True)
+            folder = Path(self._scratch.name)
+        roots = config.model_roots
+        if roots is None:
+            files = [Path(model).resolve() for model in config.models if Path(model).exists()]
+            roots = tuple(dict.fromkeys(file.parent for file in files)) or (Path.cwd(),)
+        return ContentRoot(folder, model_roots=roots)
+
+    @staticmethod
+    def close_here(opened: _Opened, pid: int) -> None:
+        """Close, unless this is a forked child, to which neither threads nor sockets belong."""
+        if os.getpid() == pid:
+            opened.close()
+
+    def close(self) -> None:
+        """Release everything. Safe to call twice."""
+        if self._closed:
+            return
+        self._closed = True
+        deadline = time.monotonic() + CLOSE_S
+        if self._endpoint is not None:
+            self._endpoint.stop()
+        idle = True
+        if self._core is not None:
+            idle = self._core.play.close(CLOSE_S / 2)
+        if self._endpoint is not None:
+            idle = self._endpoint.join(max(0.0, deadline - time.monotonic())) and idle
+        if not idle:
+            logger.warning("a request was still under way when the server closed; its thread ends after it")
+        for port in self.reserved.values():
+            port.release()
+        if self._scratch is not None:
+            self._scratch.cleanup()
+
+
+def _is_level(model: str) -> bool:
+    return model.lower().endswith(".json")
+
+
+def _populate(world: World, models: Sequence[str]) -> None:
+    """Open the level among `models`, place the others, and see to a manager."""
+    for level in filter(_is_level, models):
+        world.load_level_file(Path(level))
+    edge: float | None = None
+    for row in world.list_actors():
+        edge = _beyond(world, row.name, edge)
+    sources: dict[str, str] = {}
+    for model in models:
+        if not _is_level(model):
+            edge = _place(world, model, sources, edge)
+    world.ensure_manager()
+
+
+def _place(world: World, model: str, sources: dict[str, str], edge: float | None) -> float | None:
+    """Import a model and place it beyond `edge`, the largest y in use; return the new one."""
+    path = model if model in bundled_models() and not Path(model).exists() else os.fspath(Path(model).absolute())
+    # What whoever runs the server names is meant as it is now, whatever an earlier run imported.
+    blueprint, _ = world.import_xml(path, force_reimport=path not in sources, trusted=True)
+    stem = blueprint.stem
+    if sources.setdefault(path, stem) != stem or any(s == stem and p != path for p, s in sources.items()):
+        others = [p for p, s in sources.items() if s == stem and p != path]
+        raise ModelError(f"{model} and {others[0]} would both become blueprint '{stem}': rename one of the files")
+    placed = world.spawn_actor(blueprint.class_path, _free_id(world, Path(path).stem))
+    bounds = world.get_actor_bounds(placed.actor_name, components_only=True)
+    if bounds.extents != (0.0, 0.0, 0.0) and edge is not None:
+        world.set_actor_transform(placed.actor_name, location=(0.0, edge + GAP_M - bounds.min[1], 0.0))
+    return _beyond(world, placed.actor_name, edge)
+
+
+def _free_id(world: World, stem: str) -> str:
+    name, count = stem, 0
+    while world.actor(name) is not None:
+        count += 1
+        name = f"{stem}_{count}"
+    return name
+
+
+def _beyond(world: World, actor_name: str, edge: float | None) -> float | None:
+    """Return the larger of `edge` and the actor's largest y; an actor without a box has none."""
+    bounds = world.get_actor_bounds(actor_name, components_only=True)
+    if bounds.extents == (0.0, 0.0, 0.0):
+        return edge
+    return bounds.max[1] if edge is None else max(edge, bounds.max[1])
+
+
+def _caller() -> str:
+    """Return file and line of the code that called into this module."""
+    frame = inspect.currentframe()
+    while frame is not None and frame.f_code.co_filename == __file__:
+        frame = frame.f_back
+    return "an unknown place" if frame is None else f"{frame.f_code.co_filename}:{frame.f_lineno}"
