@@ -100,6 +100,8 @@ from urlab_client.protocol.types import (
     ClientConfig,
     Contact,
     ContactsResult,
+    Diagnosis,
+    Finding,
     KeyframeInfo,
     MocapPose,
     PIEStartResult,
@@ -115,6 +117,7 @@ from urlab_client.protocol.types import (
     URLabBlueprint,
     URLabLightHandle,
     URLabSpawnHandle,
+    Verdict,
 )
 from urlab_client.sync import (
     DEFAULT,
@@ -171,9 +174,11 @@ __all__ = [
     "CreateLevelFailed",
     "DestroyAssetFailed",
     "DestroyFailed",
+    "Diagnosis",
     "DimMismatch",
     "DuplicateFailed",
     "FindActorsFailed",
+    "Finding",
     "ForkedError",
     "GameThreadTimeout",
     "GetActorBoundsFailed",
@@ -258,6 +263,7 @@ __all__ = [
     "UnknownName",
     "UnknownOp",
     "Unsupported",
+    "Verdict",
     "WrongTransport",
     "__version__",
 ]

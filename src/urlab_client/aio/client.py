@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NoReturn, Self, TypeVar
 from urlab_client.aio.articulation import URLabArticulation, URLabEntity
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.explain import diagnose
 from urlab_client.aio.launch import SCHEME, LaunchedTransport
 from urlab_client.aio.mirror import model_names
 from urlab_client.aio.namespaces.debug import DebugNamespace
@@ -35,7 +36,7 @@ from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.protocol.messages.session import Meta as MetaRequest
 from urlab_client.protocol.messages.session import MetaOk, OpInfo, Reset, ResetOk, Step, StepOk
 from urlab_client.protocol.names import NameMap
-from urlab_client.protocol.types import ClientConfig
+from urlab_client.protocol.types import ClientConfig, Diagnosis
 
 if TYPE_CHECKING:
     import mujoco
@@ -425,6 +426,13 @@ class URLabClient:
             URLabRPCError: The server refused.
         """
         return await self._session.call(request, timeout=timeout)
+
+    async def explain(self) -> Diagnosis:
+        """Find out why a robot does not move: sockets, versions, play, pause, modes, controllers, set-points.
+
+        Takes a few seconds at most, raises nothing about what it finds, and changes nothing on the server.
+        """
+        return await diagnose(self._config, self._session, self._state)
 
     async def meta(self, *, timeout: Timeout = DEFAULT) -> list[OpInfo]:
         """List the ops that the server offers; needs no session."""

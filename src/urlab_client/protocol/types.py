@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from enum import StrEnum
 from typing import Any, Protocol, TypeVar
 
 from msgspec import Struct
@@ -19,6 +20,8 @@ __all__ = [
     "ClientConfig",
     "Contact",
     "ContactsResult",
+    "Diagnosis",
+    "Finding",
     "KeyframeInfo",
     "MocapPose",
     "PIEStartResult",
@@ -34,6 +37,7 @@ __all__ = [
     "URLabBlueprint",
     "URLabLightHandle",
     "URLabSpawnHandle",
+    "Verdict",
 ]
 
 Vec3 = tuple[float, float, float]
@@ -47,6 +51,46 @@ class HasArticulations(Protocol[A_co]):
 
     @property
     def articulations_by_id(self) -> Mapping[str, A_co]: ...
+
+
+class Verdict(StrEnum):
+    """How serious a finding is."""
+
+    OK = "ok"
+    NOTE = "note"
+    PROBLEM = "problem"
+
+
+class Finding(Struct, frozen=True):
+    """One thing that `client.explain()` looked at.
+
+    Attributes:
+        verdict: `OK`, `NOTE` (worth knowing) or `PROBLEM` (keeps robots from moving).
+        subject: What it is about: `server`, `play`, an articulation's key, …
+        text: What is the case, and what to do about it.
+    """
+
+    verdict: Verdict
+    subject: str
+    text: str
+
+
+class Diagnosis(Struct, frozen=True):
+    """What `client.explain()` found, from the sockets inwards; `print()` shows it line by line.
+
+    Attributes:
+        findings: In the order of examination.
+    """
+
+    findings: list[Finding]
+
+    @property
+    def healthy(self) -> bool:
+        """Whether nothing keeps the robots from moving."""
+        return all(finding.verdict is not Verdict.PROBLEM for finding in self.findings)
+
+    def __str__(self) -> str:
+        return "\n".join(f"{finding.verdict:<8}{finding.subject}: {finding.text}" for finding in self.findings)
 
 
 class ClientConfig(Struct, frozen=True, kw_only=True):

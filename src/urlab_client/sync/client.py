@@ -17,7 +17,7 @@ from urlab_client.protocol.base import Reply, Request
 from urlab_client.protocol.enums import CameraTiming, ObservationLevel, StepMode, Transport
 from urlab_client.protocol.messages.session import OpInfo, ResetOk, StepOk
 from urlab_client.protocol.names import NameMap
-from urlab_client.protocol.types import ClientConfig
+from urlab_client.protocol.types import ClientConfig, Diagnosis
 from urlab_client.sync._portal import FacadeRoot
 from urlab_client.sync.articulation import URLabArticulation, URLabEntity
 from urlab_client.sync.cameras import URLabCameraView
@@ -342,6 +342,13 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
             URLabRPCError: The server refused.
         """
         return self._portal.call(self._aio.call(request, timeout=timeout))
+
+    def explain(self) -> Diagnosis:
+        """Find out why a robot does not move: sockets, versions, play, pause, modes, controllers, set-points.
+
+        Takes a few seconds at most, raises nothing about what it finds, and changes nothing on the server.
+        """
+        return self._portal.call(self._aio.explain())
 
     def meta(self, *, timeout: Timeout = DEFAULT) -> list[OpInfo]:
         """List the ops that the server offers; needs no session."""

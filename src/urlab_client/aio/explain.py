@@ -1,0 +1,163 @@
+"""`client.explain()`: why is my robot not moving?
+
+Looks from the outside in, from sockets to set-points, and says what it sees in sentences. Changes nothing on the
+server: what the wire cannot tell without a change (the step mode, the control source) is what this client knows.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Iterator
+
+import numpy as np
+
+from urlab_client.aio.session import Session
+from urlab_client.aio.state import SimState
+from urlab_client.protocol.enums import ControlMode, PIEState, StepMode
+from urlab_client.protocol.errors import RPC_ERRORS, URLabError, URLabRPCError
+from urlab_client.protocol.messages.session import Meta
+from urlab_client.protocol.messages.sim import PieStatus
+from urlab_client.protocol.types import ClientConfig, Diagnosis, Finding, Verdict
+
+__all__ = ["diagnose"]
+
+_PROBE_S = 1.0
+_WATCH_S = 0.25
+
+
+async def diagnose(config: ClientConfig, session: Session, state: SimState) -> Diagnosis:
+    """Examine a client's server, play session and articulations."""
+    return Diagnosis([finding async for finding in _examine(config, session, state)])
+
+
+async def _examine(config: ClientConfig, session: Session, state: SimState) -> AsyncIterator[Finding]:
+    async for finding in _reachability(config, session):
+        yield finding
+    loop = asyncio.get_running_loop()
+    before = loop.time()
+    try:
+        ops = (await session.call(Meta(), timeout=_PROBE_S)).ops
+    except URLabError as error:
+        yield Finding(Verdict.PROBLEM, "server", f"It does not answer: {error}")
+        return
+    yield Finding(
+        Verdict.OK, "server", f"It answers in {1e3 * (loop.time() - before):.1f} ms and offers {len(ops)} ops."
+    )
+    hello = state.hello
+    if hello is None or not session.session_id:
+        yield Finding(Verdict.PROBLEM, "session", "No session is open. Call discover() first.")
+        return
+    yield _versions(state)
+    finding, playing = await _play(session, state)
+    yield finding
+    if not playing:
+        return
+    for finding in _modes(config, state):
+        yield finding
+    for finding in _articulations(state):
+        yield finding
+
+
+async def _reachability(config: ClientConfig, session: Session) -> AsyncIterator[Finding]:
+    scheme, _, rest = session.transport.endpoint.partition("://")
+    host = rest.rpartition(":")[0]
+    if scheme != "tcp":
+        return
+    ports = {"RPC": int(rest.rpartition(":")[2])}
+    if config.step_mode in (StepMode.LIVE, StepMode.AUTO):
+        ports |= {"state stream": config.state_port}
+    for what, port in ports.items():
+        problem = await _connect(host, port)
+        if problem is None:
+            yield Finding(Verdict.OK, what, f"{host}:{port} accepts connections.")
+        else:
+            need = Verdict.PROBLEM if what == "RPC" else Verdict.NOTE
+            yield Finding(need, what, f"{host}:{port}: {problem}.")
+
+
+async def _connect(host: str, port: int) -> str | None:
+    try:
+        async with asyncio.timeout(_PROBE_S):
+            _, writer = await asyncio.open_connection(host, port)
+    except TimeoutError:
+        return f"no answer within {_PROBE_S:g} s; is a firewall in between?"
+    except OSError as error:
+        return f"{error.strerror or error}; is the server running, and on this port?"
+    writer.close()
+    return None
+
+
+def _versions(state: SimState) -> Finding:
+    hello, mirror = state.hello, state.mirror
+    assert hello is not None  # noqa: S101  # the caller looked
+    server = f"{hello.urlab_version} with MuJoCo {hello.mujoco_version}"
+    if mirror.approximate:
+        text = f"The server runs {server}; the local model was compiled here and only approximates the server's."
+        return Finding(Verdict.NOTE, "versions", text)
+    if mirror.model is None:
+        return Finding(Verdict.NOTE, "versions", f"The server runs {server}; there is no local model.")
+    return Finding(Verdict.OK, "versions", f"The server runs {server}; the local model is the same build's.")
+
+
+async def _play(session: Session, state: SimState) -> tuple[Finding, bool]:
+    try:
+        first = await session.call(PieStatus(), timeout=_PROBE_S)
+        await asyncio.sleep(_WATCH_S)
+        second = await session.call(PieStatus(), timeout=_PROBE_S)
+    except URLabRPCError as refusal:
+        if isinstance(refusal, RPC_ERRORS["unknown_op"]):
+            return Finding(Verdict.NOTE, "play", "A packaged build: its play state cannot be asked for."), True
+        return Finding(Verdict.PROBLEM, "play", str(refusal)), False
+    if second.state != PIEState.READY:
+        advice = {
+            PIEState.OFF: "Call sim.start().",
+            PIEState.COMPILING: "Wait, or check that the level has a manager: scene.ensure_manager().",
+            PIEState.COMPILE_FAILED: f"MuJoCo says: {second.compile_error}",
+        }.get(PIEState(second.state), "")
+        return Finding(Verdict.PROBLEM, "play", f"Play is {second.state}. {advice}".strip()), False
+    runs = second.sim_time != first.sim_time
+    if state.mode is StepMode.LIVE and not runs:
+        text = f"Physics stands still at {second.sim_time or 0:g} s: it is paused. Call runtime.set_paused(False)."
+        return Finding(Verdict.PROBLEM, "play", text), True
+    if state.mode is not StepMode.LIVE and runs:
+        text = f"Time passes by itself although this client expects mode {state.mode}: somebody changed the mode. "
+        return Finding(Verdict.PROBLEM, "play", text + "Call runtime.set_mode() or discover()."), True
+    how = "running" if runs else "waiting for step()"
+    return Finding(Verdict.OK, "play", f"Play is ready, physics {how} at {second.sim_time or 0:g} s."), True
+
+
+def _modes(config: ClientConfig, state: SimState) -> Iterator[Finding]:
+    wanted = StepMode.LIVE if config.step_mode is StepMode.AUTO else config.step_mode
+    if state.mode is wanted:
+        yield Finding(Verdict.OK, "step mode", f"{state.mode}, as asked for.")
+    else:
+        text = f"{state.mode} instead of {wanted}. The server may pin it, or runtime.set_mode() changed it."
+        yield Finding(Verdict.NOTE, "step mode", text)
+    if state.step_count == 0 and state.mode is not StepMode.LIVE:
+        yield Finding(Verdict.NOTE, "steps", "step() was not called since discover(): nothing moves without it.")
+
+
+def _articulations(state: SimState) -> Iterator[Finding]:
+    if not state.records:
+        yield Finding(Verdict.PROBLEM, "articulations", "The play session has none. Spawn a robot before sim.start().")
+    for key, record in state.records.items():
+        if not len(record.ctrl):
+            yield Finding(Verdict.NOTE, key, "It has no actuators: it moves by contacts and gravity only.")
+            continue
+        controlled = record.controller is not None and record.control_mode is ControlMode.UE_CONTROLLER
+        if controlled and record.controller is not None:
+            limits = record.controller.params.get("torque_limit", {})
+            dead = [name for name, limit in limits.items() if limit == 0]
+            if dead:
+                text = f"A torque limit of 0 means no torque at all: {', '.join(dead)}. Raise it with set_gains()."
+                yield Finding(Verdict.PROBLEM, key, text)
+        if not np.any(record.ctrl):
+            text = "All set-points are 0. Set them with set_ctrl() or ctrl_array before step()."
+            yield Finding(Verdict.NOTE, key, text)
+        elif not controlled and state.step_count and not np.any(record.applied):
+            text = "Set-points are sent but none is applied: is the control source `ui`? "
+            yield Finding(Verdict.PROBLEM, key, text + "Call runtime.set_control_source('zmq').")
+        else:
+            how = f"through its {record.controller.kind} controller" if controlled and record.controller else "directly"
+            largest = float(np.max(np.abs(record.applied), initial=0.0))
+            yield Finding(Verdict.OK, key, f"Set-points act {how}; the largest control applied last is {largest:.3g}.")

@@ -1,0 +1,93 @@
+"""`client.explain()`: each reason why a robot does not move is named, with what to do."""
+
+from __future__ import annotations
+
+import socket
+from typing import Any
+
+from urlab_client import Verdict
+from urlab_client.server import ControllerConfig, SimulatedServer
+
+
+def problems(diagnosis: Any) -> str:
+    return "\n".join(f.text for f in diagnosis.findings if f.verdict is Verdict.PROBLEM)
+
+
+async def test_nobody_there(connect: Any) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    client = connect(address="tcp://127.0.0.1", step_port=port)
+    diagnosis = await client.explain()
+    assert not diagnosis.healthy
+    assert f"127.0.0.1:{port}" in problems(diagnosis)
+    assert "is the server running" in problems(diagnosis)
+
+
+async def test_no_session(connect: Any) -> None:
+    with SimulatedServer("arm", play=True) as server:
+        assert "Call discover() first" in problems(await connect(server).explain())
+
+
+async def test_no_play(connect: Any) -> None:
+    with SimulatedServer("arm") as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        assert "Play is off. Call sim.start()" in problems(await client.explain())
+
+
+async def test_paused(connect: Any) -> None:
+    with SimulatedServer("arm", play=True) as server:
+        client = connect(server, step_mode="live")
+        await client.discover()
+        assert "it is paused. Call runtime.set_paused(False)" in problems(await client.explain())
+        await client.runtime.set_paused(False)
+        assert "paused" not in problems(await client.explain())
+
+
+async def test_forgotten_set_points_then_healthy(connect: Any) -> None:
+    with SimulatedServer("arm", play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        text = str(await client.explain())
+        assert "step() was not called" in text
+        assert "All set-points are 0" in text
+        (arm,) = client.articulations.values()
+        arm.ctrl_array[:] = 0.1
+        await client.step(5)
+        diagnosis = await client.explain()
+        assert diagnosis.healthy, str(diagnosis)
+        assert "Set-points act directly" in str(diagnosis)
+
+
+async def test_control_source(connect: Any) -> None:
+    with SimulatedServer("arm", play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        (arm,) = client.articulations.values()
+        arm.ctrl_array[:] = 0.1
+        await client.runtime.set_control_source("ui")
+        await client.step(5)
+        assert "set_control_source('zmq')" in problems(await client.explain())
+
+
+async def test_a_torque_limit_of_zero(connect: Any) -> None:
+    with SimulatedServer("quadruped", play=True, controllers={"*": ControllerConfig(torque_limit=0)}) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        assert "A torque limit of 0 means no torque at all" in problems(await client.explain())
+
+
+async def test_another_client_changed_the_mode(connect: Any) -> None:
+    with SimulatedServer("ball", play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        reply = await client.call(_live())
+        assert reply.current_mode == "live"
+        assert "Time passes by itself" in problems(await client.explain())
+
+
+def _live() -> Any:
+    from urlab_client.protocol.messages.runtime import SetMode
+
+    return SetMode(mode="live")
