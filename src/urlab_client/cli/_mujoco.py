@@ -1,0 +1,26 @@
+"""MuJoCo without its OpenGL part, which the commands do not need in their own process."""
+
+from __future__ import annotations
+
+import os
+
+__all__ = ["import_mujoco"]
+
+_VARIABLE = "MUJOCO_GL"
+
+
+def import_mujoco() -> None:
+    """Import MuJoCo without OpenGL.
+
+    Importing it loads the OpenGL platform that `MUJOCO_GL` names, and fails where that is missing. Whoever has the
+    variable set for other programs can still serve and drive robots. Pictures are drawn in a process of their own.
+    """
+    chosen = os.environ.get(_VARIABLE)
+    os.environ[_VARIABLE] = "disable"
+    try:
+        import mujoco  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]  # for its effect
+    finally:
+        if chosen is None:
+            del os.environ[_VARIABLE]
+        else:
+            os.environ[_VARIABLE] = chosen

@@ -1,0 +1,239 @@
+"""`urlab demo`: a level authored, a robot driven through both clients, and what came of it on disk.
+
+Starts a simulated server of its own, so it needs nothing but this package.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import hashlib
+import importlib.util
+import logging
+import platform
+from collections.abc import Callable
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from urlab_client.cli._arguments import Commands, count
+from urlab_client.cli._failure import CommandError
+from urlab_client.cli._files import replaced
+from urlab_client.cli._mujoco import import_mujoco
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress
+    from rich.table import Table
+
+    from urlab_client.cli.demo_runs import Outcome, Run
+    from urlab_client.cli.robot_file import RobotFile
+
+__all__ = ["add_parser", "run"]
+
+_ASYNC_SHARE = 4  # the async run takes a quarter of the steps
+_COLUMNS = 120  # where the output is no terminal
+_REPORT_EVERY = 20  # steps between two updates of the progress bar
+
+
+class DemoArguments(argparse.Namespace):
+    """What the command line says."""
+
+    model: str
+    output: Path
+    steps: int
+    no_render: bool
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command to the parser."""
+    parser = commands.add_parser(
+        "demo",
+        help="drive a robot end to end; keep a plot, a picture and the configuration",
+        description="Start a simulated server, author a level, drive a robot through the blocking client and two of "
+        "them through the async client, and write joints.png, last_state.png and run.json. Needs the extra "
+        "'urlab-client[demo]'.",
+    )
+    parser.add_argument(
+        "model",
+        nargs="?",
+        default="quadruped",
+        metavar="MODEL",
+        help="an MJCF file or the name of a bundled robot (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--output", type=Path, default=Path("urlab-demo"), metavar="DIR", help="where to write (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--steps",
+        type=count,
+        default=2000,
+        metavar="N",
+        help="steps of the blocking run; the async run takes a quarter (default: %(default)s)",
+    )
+    parser.add_argument("--no-render", action="store_true", help="draw no picture of the last state")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: DemoArguments) -> int:
+    """Run the demonstration.
+
+    Raises:
+        CommandError: A library, the model or the output folder cannot be used.
+        URLabError: The server refused something.
+    """
+    missing = [name for name in ("matplotlib", "rich") if importlib.util.find_spec(name) is None]
+    if missing:
+        raise CommandError(f"{' and '.join(missing)} not installed; run: pip install 'urlab-client[demo]'")
+    folder = _writable(arguments.output)
+    import_mujoco()
+
+    from urlab_client.cli.demo_runs import drive_one, drive_two  # noqa: PLC0415
+    from urlab_client.cli.robot_file import read_robot  # noqa: PLC0415
+    from urlab_client.server.simulated import SimulatedServer  # noqa: PLC0415
+
+    robot = read_robot(arguments.model)
+    if robot.bundled:  # of its warnings, about the floor that each copy brings, nothing can be done
+        logging.getLogger("urlab_client.server").setLevel(logging.ERROR)
+    steps, fewer = arguments.steps, max(1, arguments.steps // _ASYNC_SHARE)
+    console = _console()
+    with SimulatedServer(model_roots=[robot.path.parent], mjcf_options=True) as server, _progress(console) as progress:
+        one = drive_one(server, robot, steps, _bar(progress, "blocking client, one robot", steps))
+        two = asyncio.run(drive_two(server, robot, fewer, _bar(progress, "async client, two robots", fewer)))
+    console.print(_table(robot, [one.outcome, two.outcome]))
+    written = _write(folder, robot, one, two, render=not arguments.no_render)
+    for file, note in written.items():
+        console.print(f"{file}  {note}", soft_wrap=True, highlight=False)
+    return 0
+
+
+def _writable(folder: Path) -> Path:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(_Probed), replaced(folder / "probe"):
+            raise _Probed
+    except OSError as error:
+        raise CommandError(f"--output {folder}: cannot write there: {error.strerror or error}") from None
+    return folder
+
+
+class _Probed(Exception):
+    """Takes a probe back."""
+
+
+def _console() -> Console:
+    from rich.console import Console  # noqa: PLC0415
+
+    console = Console()
+    return console if console.is_terminal else Console(width=_COLUMNS)
+
+
+def _progress(console: Console) -> Progress:
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn  # noqa: PLC0415
+
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    return Progress(*columns, console=console)
+
+
+def _bar(progress: Progress, description: str, steps: int) -> Callable[[], None]:
+    """Return what to call after each step."""
+    bar = progress.add_task(description, total=steps)
+    done = 0
+
+    def advance() -> None:
+        nonlocal done
+        done += 1
+        if done % _REPORT_EVERY == 0 or done == steps:
+            progress.update(bar, completed=done)
+
+    return advance
+
+
+def _table(robot: RobotFile, outcomes: list[Outcome]) -> Table:
+    from rich import box  # noqa: PLC0415
+    from rich.table import Table  # noqa: PLC0415
+
+    table = Table(title=f"{robot.name}, direct mode", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
+    table.add_column("client")
+    for heading in ("robots", "steps", "sim (s)", "steps/s", "real-time\nfactor"):
+        table.add_column(heading, justify="right")
+    table.add_column("final base pose\nx y z (m)\nquaternion w x y z", no_wrap=True)
+    for outcome in outcomes:
+        table.add_row(
+            outcome.client,
+            str(outcome.robots),
+            str(outcome.steps),
+            f"{outcome.sim_time:.3f}",
+            f"{outcome.steps_per_second:.0f}",
+            f"{outcome.real_time_factor:.2f}",
+            "\n".join(
+                _numbers(values) for pose in outcome.final_base_poses for values in (pose.position, pose.quaternion)
+            ),
+        )
+    return table
+
+
+def _numbers(values: list[float]) -> str:
+    return " ".join(f"{value:6.3f}" for value in values)
+
+
+def _write(folder: Path, robot: RobotFile, one: Run, two: Run, *, render: bool) -> dict[Path, str]:
+    """Write the files and return what is in each, or why it is missing."""
+    from urlab_client.cli.figures import plot_trace  # noqa: PLC0415
+    from urlab_client.cli.picture import NoPicture, draw_state  # noqa: PLC0415
+
+    plot, picture, record = folder / "joints.png", folder / "last_state.png", folder / "run.json"
+    plot_trace(one.trace, plot)
+    notes = {plot: "joint positions over simulation time, blocking run"}
+    drawn_by: str | None = None
+    if render:
+        try:
+            drawn_by = draw_state(two.model, two.data, picture)
+            notes[picture] = f"last state, two robots (OpenGL: {drawn_by})"
+        except NoPicture as reason:
+            notes[picture] = f"not drawn: {reason}"
+    else:
+        notes[picture] = "not drawn: --no-render"
+    if drawn_by is None:
+        picture.unlink(missing_ok=True)  # one of an earlier run would show another state
+    configuration = _configuration(robot, one, two) | {"opengl": drawn_by}
+    with replaced(record) as temporary:
+        temporary.write_bytes(msgspec.json.format(msgspec.json.encode(configuration), indent=2) + b"\n")
+    notes[record] = "versions, model, options, seed and results"
+    return notes
+
+
+def _configuration(robot: RobotFile, one: Run, two: Run) -> dict[str, Any]:
+    import mujoco  # noqa: PLC0415
+
+    from urlab_client.cli.demo_runs import SEED  # noqa: PLC0415
+
+    option = one.model.opt
+    return {
+        "written_at": datetime.now(UTC).isoformat(timespec="seconds"),
+        "versions": {
+            "python": platform.python_version(),
+            "platform": platform.platform(),
+            **{name: version(name) for name in ("urlab-client", "mujoco", "numpy", "pyzmq", "msgspec")},
+        },
+        "model": {
+            "name": robot.name,
+            "path": str(robot.path),
+            "sha256": hashlib.sha256(robot.path.read_bytes()).hexdigest(),
+        },
+        "options": {
+            "step_mode": "direct",
+            "timestep": option.timestep,
+            "integrator": mujoco.mjtIntegrator(option.integrator).name,
+            "cone": mujoco.mjtCone(option.cone).name,
+            "solver": mujoco.mjtSolver(option.solver).name,
+            "gravity": option.gravity.tolist(),
+        },
+        "seed": SEED,
+        "pilots": {run.outcome.level: [pilot.settings for pilot in run.pilots] for run in (one, two)},
+        "runs": [one.outcome, two.outcome],
+    }

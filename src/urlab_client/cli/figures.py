@@ -1,0 +1,86 @@
+"""The demo's plot: joint positions over simulation time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from urlab_client.cli._files import replaced
+
+__all__ = ["Quantity", "Trace", "plot_trace"]
+
+_PER_PANEL = 6  # more lines in one panel cannot be told apart
+_DPI = 150
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What is drawn in panels of its own.
+
+    Attributes:
+        label: Axis label with the unit.
+        names: Names of the lines.
+        columns: Columns of the trace's values.
+    """
+
+    label: str
+    names: Sequence[str]
+    columns: Sequence[int]
+
+
+@dataclass(frozen=True)
+class Trace:
+    """Values over simulation time.
+
+    Attributes:
+        title: Title of the plot.
+        time: Simulation time, seconds, shape (samples,).
+        values: Shape (samples, columns).
+        quantities: What the columns are.
+    """
+
+    title: str
+    time: NDArray[np.float64]
+    values: NDArray[np.float64]
+    quantities: Sequence[Quantity]
+
+
+def plot_trace(trace: Trace, path: Path) -> None:
+    """Write the plot as PNG."""
+    # The figure's own canvas, not pyplot: no display, no global state.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    panels = [panel for quantity in trace.quantities for panel in _panels(quantity)]
+    figure: Any = Figure(figsize=(10, 0.9 + 2.3 * len(panels)), layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(trace.title)
+    axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+    for axis, panel in zip(axes, panels, strict=True):
+        for index, (name, column) in enumerate(zip(panel.names, panel.columns, strict=True)):
+            axis.plot(trace.time, trace.values[:, column], label=name, lw=1.4, color=f"C{index}")
+        axis.set_ylabel(panel.label)
+        axis.grid(visible=True, alpha=0.3)
+        axis.margins(x=0.01)
+        axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize="small")
+    figure.align_ylabels(axes)
+    axes[-1].set_xlabel("simulation time (s)")
+    with replaced(path) as temporary:
+        figure.savefig(temporary, dpi=_DPI)
+
+
+def _panels(quantity: Quantity) -> list[Quantity]:
+    """Split a quantity into panels of about equal size."""
+    total = len(quantity.names)
+    count = math.ceil(total / _PER_PANEL)
+    size = math.ceil(total / count) if count else 0
+    return [
+        Quantity(quantity.label, quantity.names[start : start + size], quantity.columns[start : start + size])
+        for start in range(0, total, size or 1)
+    ]

@@ -1,0 +1,290 @@
+"""`urlab ping`: who answers at an address, and how fast."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import re
+import statistics
+import time
+from typing import TYPE_CHECKING
+
+import msgspec
+from msgspec import Struct
+
+from urlab_client.aio.launch import SCHEME
+from urlab_client.cli._arguments import Commands, count, port, seconds
+from urlab_client.cli._failure import CommandError
+from urlab_client.cli._mujoco import import_mujoco
+from urlab_client.protocol.errors import ModeLocked, URLabRPCError, URLabVersionMismatch
+from urlab_client.protocol.messages.runtime import SetMode
+
+if TYPE_CHECKING:
+    from urlab_client.aio import URLabArticulation, URLabClient
+
+__all__ = ["add_parser", "run"]
+
+_WATCH_S = 0.1  # several steps even at the slowest pace of live mode
+
+
+class PingArguments(argparse.Namespace):
+    """What the command line says."""
+
+    address: str
+    step_port: int
+    timeout: float
+    count: int
+    no_session: bool
+    json: bool
+
+
+class RoundTrips(Struct):
+    """Times from a request to its reply, milliseconds."""
+
+    count: int
+    min: float
+    median: float
+    max: float
+
+
+class Articulation(Struct):
+    """One articulation; `joints` and `sensors` are None where the model could not be loaded here."""
+
+    key: str
+    actor_id: str
+    joints: int | None
+    actuators: int
+    sensors: int | None
+    cameras: int
+    controller: str | None
+
+
+class Play(Struct):
+    """The play session.
+
+    `physics` is `advancing`, `standing still` or None without a model; `step_mode` None where only the client that
+    drives the server knows it.
+    """
+
+    state: str
+    sim_time: float | None
+    physics: str | None
+    step_mode: str | None
+    step_mode_pinned: bool
+
+
+class Identity(Struct):
+    """What a session tells about the server."""
+
+    urlab_version: str
+    mujoco_version: str
+    local_mujoco_version: str
+    same_mujoco_build: bool
+    play: Play
+    articulations: list[Articulation]
+    entities: list[str]
+
+
+class Report(Struct):
+    """What `--json` prints; `server` is None without a session."""
+
+    address: str
+    ops: int
+    round_trip_ms: RoundTrips
+    server: Identity | None = None
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command to the parser."""
+    parser = commands.add_parser(
+        "ping",
+        help="show who answers at an address",
+        description="Show who answers at an address: versions, play state and step mode, articulations, and the "
+        "round-trip times of `meta`. Reading them opens a session, which takes the server over from the client that "
+        "drives it; with --no-session only the op list and the round-trip times are read, and nobody is disturbed.",
+    )
+    parser.add_argument(
+        "address",
+        nargs="?",
+        default="tcp://localhost",
+        metavar="ADDRESS",
+        help="tcp://HOST[:PORT], ipc://PATH, or sim://MODEL to start a server for the occasion (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--step-port", type=port, default=5559, metavar="PORT", help="RPC port, if ADDRESS has none (default: 5559)"
+    )
+    parser.add_argument(
+        "--timeout", type=seconds, default=2.0, metavar="SECONDS", help="to wait for each reply (default: 2)"
+    )
+    parser.add_argument("--count", type=count, default=5, metavar="N", help="round trips to time (default: 5)")
+    parser.add_argument("--no-session", action="store_true", help="disturb nobody: do not open a session")
+    parser.add_argument("--json", action="store_true", help="print one line of JSON")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: PingArguments) -> int:
+    """Print what is known of the server.
+
+    Raises:
+        CommandError: The address is malformed.
+        URLabError: Nothing answers, or it answers nonsense.
+    """
+    if not arguments.no_session:
+        import_mujoco()  # beforehand, as the event loop had better not wait for it
+    report = asyncio.run(_ping(arguments))
+    print(json.dumps(msgspec.to_builtins(report)) if arguments.json else _text(report))
+    return 0
+
+
+async def _ping(arguments: PingArguments) -> Report:
+    async with _client(arguments, local_model=True) as client:
+        ops = await client.meta(timeout=arguments.timeout)
+        report = Report(arguments.address, len(ops), await _round_trips(client, arguments))
+        if arguments.no_session:
+            return report
+        try:
+            await client.discover()
+            report.server = await _identity(client)
+        except URLabVersionMismatch:
+            async with _client(arguments, local_model=False) as other:
+                await other.discover()
+                report.server = await _identity(other)
+        return report
+
+
+def _client(arguments: PingArguments, *, local_model: bool) -> URLabClient:
+    from urlab_client.aio import URLabClient  # noqa: PLC0415
+
+    try:
+        return URLabClient(
+            arguments.address,
+            step_port=arguments.step_port,
+            rcv_timeout_ms=max(1, round(arguments.timeout * 1000)),
+            local_model=local_model,
+        )
+    except ValueError as error:
+        raise CommandError(str(error)) from None
+
+
+async def _round_trips(client: URLabClient, arguments: PingArguments) -> RoundTrips:
+    times: list[float] = []
+    for _ in range(arguments.count):
+        start = time.perf_counter()
+        await client.meta(timeout=arguments.timeout)
+        times.append(1e3 * (time.perf_counter() - start))
+    low, middle, high = (round(f(times), 3) for f in (min, statistics.median, max))
+    return RoundTrips(count=len(times), min=low, median=middle, max=high)
+
+
+async def _identity(client: URLabClient) -> Identity:
+    import mujoco  # noqa: PLC0415
+
+    local = mujoco.mj_versionString()
+    return Identity(
+        urlab_version=client.urlab_version,
+        mujoco_version=client.mujoco_version,
+        local_mujoco_version=local,
+        same_mujoco_build=client.mujoco_version == local,
+        play=await _play(client),
+        articulations=[_articulation(art, client.model is not None) for art in client.articulations.values()],
+        entities=[name for name in client.entities if name not in client.articulations],
+    )
+
+
+def _articulation(articulation: URLabArticulation, with_model: bool) -> Articulation:
+    controller = articulation.controller
+    return Articulation(
+        key=articulation.prefix,
+        actor_id=articulation.actor_id,
+        joints=len(articulation.joints) if with_model else None,
+        actuators=len(articulation.actuators),
+        sensors=len(articulation.sensors) if with_model else None,
+        cameras=len(articulation.cameras),
+        controller=None if controller is None else str(controller.kind),
+    )
+
+
+async def _play(client: URLabClient) -> Play:
+    try:
+        before = await client.sim.status()
+    except URLabRPCError:  # a packaged build has no such op
+        state = "ready" if client.manager_present else "off"
+        return Play(state=state, sim_time=None, physics=None, step_mode=None, step_mode_pinned=False)
+    play = Play(state=before.state, sim_time=before.sim_time, physics=None, step_mode=None, step_mode_pinned=False)
+    if before.sim_time is None or not client.manager_present:
+        return play
+    await asyncio.sleep(_WATCH_S)
+    after = await client.sim.status()
+    advancing = after.sim_time is not None and after.sim_time > before.sim_time
+    play.sim_time, play.physics = after.sim_time, "advancing" if advancing else "standing still"
+    pinned = await _pinned_mode(client)
+    play.step_mode_pinned = pinned is not None
+    play.step_mode = pinned or ("live" if advancing else None)
+    return play
+
+
+async def _pinned_mode(client: URLabClient) -> str | None:
+    """Return the mode the server is pinned to; no op reads the mode, but a pinned server names it in its refusal."""
+    try:
+        await client.call(SetMode(mode="?"))  # no mode: changes nothing on any server
+    except ModeLocked as locked:
+        named = re.search(r"\b(live|direct|puppet|auto)\b", locked.message, re.IGNORECASE)
+        return named[0].lower() if named else "unknown"
+    except URLabRPCError:
+        return None
+    return None
+
+
+def _text(report: Report) -> str:
+    rows = [("ops", str(report.ops))]
+    server = report.server
+    if server is not None:
+        here = "the build here" if server.same_mujoco_build else f"the build here is {server.local_mujoco_version}"
+        rows = [
+            ("URLab", server.urlab_version),
+            ("MuJoCo", f"{server.mujoco_version} ({here})"),
+            *rows,
+            *_play_rows(server.play),
+            *_titled("articulations", [_articulation_text(art) for art in server.articulations]),
+            *_titled("entities", server.entities),
+        ]
+    trips = report.round_trip_ms
+    times = f"min {trips.min:.2f} ms, median {trips.median:.2f} ms, max {trips.max:.2f} ms ({trips.count} times meta)"
+    lines = [report.address, *(f"  {title:13}  {text}" for title, text in (*rows, ("round trip", times)))]
+    if server is not None and not report.address.startswith(SCHEME):
+        lines.append(
+            "A session was opened: a client that was driving this server has to call discover() again; "
+            "--no-session avoids that."
+        )
+    return "\n".join(lines)
+
+
+def _play_rows(play: Play) -> list[tuple[str, str]]:
+    if play.physics is None:
+        return [("play", play.state)]
+    mode = f"{play.step_mode}, pinned by the server" if play.step_mode_pinned else play.step_mode
+    return [
+        ("play", f"{play.state}, sim time {play.sim_time:.3f} s, {play.physics}"),
+        ("step mode", mode or "live and paused, or a mode in which its client steps"),
+    ]
+
+
+def _titled(title: str, texts: list[str]) -> list[tuple[str, str]]:
+    return [(title if index == 0 else "", text) for index, text in enumerate(texts)]
+
+
+def _articulation_text(articulation: Articulation) -> str:
+    counts = [
+        _plural(articulation.joints, "joint"),
+        _plural(articulation.actuators, "actuator"),
+        _plural(articulation.sensors, "sensor"),
+        _plural(articulation.cameras, "camera"),
+    ]
+    control = f"{articulation.controller} controller" if articulation.controller else "no controller"
+    actor = f" (actor {articulation.actor_id})" if articulation.actor_id else ""
+    return f"{articulation.key}{actor}: {', '.join([text for text in counts if text] + [control])}"
+
+
+def _plural(number: int | None, noun: str) -> str:
+    return "" if number is None else f"{number} {noun}{'' if number == 1 else 's'}"

@@ -1,0 +1,369 @@
+"""`urlab serve`: a simulated server until a signal, or the end of standard input, says stop."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import queue
+import signal
+import sys
+import tempfile
+import threading
+from enum import Enum
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, cast
+
+from urlab_client.cli._arguments import Commands, port
+from urlab_client.cli._failure import CommandError
+from urlab_client.cli._mujoco import import_mujoco
+from urlab_client.protocol.enums import CameraMode, ControllerKind, StepMode
+
+if TYPE_CHECKING:
+    from urlab_client.server.simulated import SimulatedServer
+
+__all__ = ["add_parser", "run"]
+
+_PORTS = {"step": 5559, "state": 5555, "ctrl": 5556, "info": 5557, "camera": 5558}
+_GAINS = ("kp", "kv", "torque_limit")
+_LARGEST_IMAGE = 16384
+
+# A lock wait on Windows does not see Ctrl-C, so there it is taken in slices.
+_WAIT_S = 0.1 if sys.platform == "win32" else None
+
+_PATIENCE_S = 0.5  # of the second that ending may take, for a start under way
+
+
+class ControllerOption(NamedTuple):
+    """`--controller ACTOR=KIND[,gain=…]`."""
+
+    actor: str
+    kind: ControllerKind
+    gains: dict[str, float]
+
+
+class CameraOption(NamedTuple):
+    """`--camera-mode ACTOR/CAMERA=MODE`."""
+
+    camera: str
+    mode: CameraMode
+
+
+class ServeArguments(argparse.Namespace):
+    """What the command line says."""
+
+    models: list[str]
+    host: str
+    step_port: int
+    state_port: int
+    ctrl_port: int
+    info_port: int
+    camera_port: int
+    shm_dir: str | None
+    saved_dir: Path | None
+    model_root: list[Path] | None
+    play: bool
+    unpaused: bool
+    step_mode: str
+    controller: list[ControllerOption]
+    camera_mode: list[CameraOption]
+    camera_size: tuple[int, int] | None
+    mjcf_options: bool
+    actor_names: Literal["model", "plugin"]
+    json: bool
+    until_eof: bool
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command to the parser."""
+    parser = commands.add_parser(
+        "serve",
+        help="run a simulated server",
+        description="Run a simulated server that any URLab client can talk to. It ends with exit code 0 on SIGINT "
+        "(Ctrl-C) and SIGTERM.",
+    )
+    parser.add_argument(
+        "models",
+        nargs="+",
+        metavar="MODEL",
+        help="an MJCF file, the name of a bundled robot (arm, quadruped, ...) or a saved level (.json); each MJCF "
+        "becomes a blueprint and one actor whose id is the file stem",
+    )
+    network = parser.add_argument_group("network")
+    network.add_argument("--host", default="127.0.0.1", help="interface to bind (default: %(default)s)")
+    for name, default in _PORTS.items():
+        network.add_argument(
+            f"--{name}-port", type=port, default=default, metavar="PORT", help="default %(default)s; 0: any free one"
+        )
+    memory = network.add_mutually_exclusive_group()
+    memory.add_argument("--shm-dir", metavar="DIR", help="refused: shared memory is not in this version")
+    memory.add_argument("--no-shm", action="store_true", help="do without shared memory, as this version always does")
+    content = parser.add_argument_group("content")
+    content.add_argument(
+        "--saved-dir",
+        type=Path,
+        metavar="DIR",
+        help="where levels and imported models are kept (default: a folder that goes with the server)",
+    )
+    content.add_argument(
+        "--model-root",
+        type=Path,
+        action="append",
+        metavar="DIR",
+        help="folder below which clients may import MJCF files; repeatable (default: the models' folders)",
+    )
+    content.add_argument(
+        "--actor-names",
+        choices=("model", "plugin"),
+        default="model",
+        help="keys of articulations: the MJCF model name, or as the plugin gives them, robot_C_0 (default: model)",
+    )
+    physics = parser.add_argument_group("physics")
+    physics.add_argument("--play", action="store_true", help="start a play session at once")
+    physics.add_argument("--unpaused", action="store_true", help="let physics run from the start of play")
+    physics.add_argument(
+        "--step-mode",
+        choices=[str(mode) for mode in StepMode],
+        default="auto",
+        metavar="MODE",
+        help="auto: live until a client says otherwise; live, direct or puppet pin the mode (default: auto)",
+    )
+    physics.add_argument(
+        "--controller",
+        type=_controller,
+        action="append",
+        default=[],
+        metavar="ACTOR=KIND",
+        help="attach a controller: ACTOR=pd[,kp=N][,kv=N][,torque_limit=N] or ACTOR=passthrough, '*' for all actors; "
+        "repeatable",
+    )
+    physics.add_argument(
+        "--mjcf-options",
+        action="store_true",
+        help="honour the <option> of each model; without it the plugin's defaults apply, with a warning",
+    )
+    cameras = parser.add_argument_group("cameras")
+    cameras.add_argument(
+        "--camera-mode",
+        type=_camera_mode,
+        action="append",
+        default=[],
+        metavar="ACTOR/CAMERA=MODE",
+        help=f"{', '.join(CameraMode)}; repeatable (default: real)",
+    )
+    cameras.add_argument("--camera-size", type=_camera_size, metavar="WxH", help="pixels, for cameras that give none")
+    life = parser.add_argument_group("for programs that start a server")
+    life.add_argument("--json", action="store_true", help="say that the server is ready with one line of JSON")
+    life.add_argument(
+        "--until-eof",
+        action="store_true",
+        help="also end when standard input closes, so that the server cannot outlive whoever holds the other end",
+    )
+    parser.set_defaults(run=run)
+
+
+def run(arguments: ServeArguments) -> int:
+    """Serve until told to stop.
+
+    Raises:
+        CommandError: An option cannot be honoured, or a model cannot be used.
+        OSError: A port is in use, or a folder cannot be used.
+    """
+    if arguments.shm_dir is not None:
+        raise CommandError("--shm-dir: shared memory is not in this version; leave the option out, or say --no-shm")
+    _check_ports(arguments)
+    events: _Events = queue.SimpleQueue()
+    _stop_on_signals(events)
+    if arguments.until_eof:
+        threading.Thread(target=_watch_input, args=[events], name="urlab-stdin", daemon=True).start()
+    import_mujoco()
+    _check_paths(arguments)
+    with tempfile.TemporaryDirectory(prefix="urlab-", ignore_cleanup_errors=True) as scratch:
+        server = _server(arguments, arguments.saved_dir or Path(scratch))
+        starter = _Starter(server, events)
+        starter.start()
+        if _next(events) is _Event.STARTED:
+            if starter.error is not None:
+                raise starter.error
+            with server:
+                _announce(server, arguments)
+                while _next(events) is not _Event.STOP:
+                    pass
+            return 0
+        starter.join(_PATIENCE_S)
+        stuck = starter.is_alive()
+        if not stuck:
+            server.close()
+    if stuck:
+        # Inside MuJoCo's compiler, which nothing can break off, and which the interpreter must not be torn down under.
+        os._exit(0)
+    return 0
+
+
+class _Event(Enum):
+    """What the main thread waits for."""
+
+    STARTED = "started"
+    STOP = "stop"
+
+
+_Events: TypeAlias = "queue.SimpleQueue[_Event]"  # unlike a threading.Event, it may be used in signal handlers
+
+
+class _Starter(threading.Thread):
+    """Opens the server off the main thread, which so sees a signal at once, whatever is being compiled.
+
+    Attributes:
+        error: What went wrong, or None.
+    """
+
+    def __init__(self, server: SimulatedServer, events: _Events) -> None:
+        super().__init__(name="urlab-start", daemon=True)
+        self.error: Exception | None = None
+        self._server = server
+        self._events = events
+
+    def run(self) -> None:
+        try:
+            self._server.start()
+        except Exception as error:  # noqa: BLE001 - raised again by the main thread
+            self.error = error
+        self._events.put(_Event.STARTED)
+
+
+def _next(events: _Events) -> _Event:
+    while True:
+        with contextlib.suppress(queue.Empty):
+            return events.get(timeout=_WAIT_S)
+
+
+def _stop_on_signals(events: _Events) -> None:
+    def stop(number: int, frame: FrameType | None) -> None:
+        events.put(_Event.STOP)
+
+    signal.signal(signal.SIGINT, stop)
+    signal.signal(signal.SIGTERM, stop)
+    hangup = getattr(signal, "SIGHUP", None)
+    if hangup is not None and signal.getsignal(hangup) != signal.SIG_IGN:  # nohup wants it ignored
+        signal.signal(hangup, stop)
+
+
+def _watch_input(events: _Events) -> None:
+    # Not through sys.stdin, whose lock this thread would still hold when the interpreter ends.
+    with contextlib.suppress(OSError):  # there is no standard input
+        while os.read(0, 4096):
+            pass
+    events.put(_Event.STOP)
+
+
+def _server(arguments: ServeArguments, saved_dir: Path) -> SimulatedServer:
+    from urlab_client.server.controllers import ControllerConfig  # noqa: PLC0415
+    from urlab_client.server.simulated import SimulatedServer  # noqa: PLC0415
+
+    try:
+        return SimulatedServer(
+            *arguments.models,
+            play=arguments.play,
+            unpaused=arguments.unpaused,
+            step_mode=arguments.step_mode,
+            host=arguments.host,
+            step_port=arguments.step_port,
+            state_port=arguments.state_port,
+            ctrl_port=arguments.ctrl_port,
+            info_port=arguments.info_port,
+            camera_port=arguments.camera_port,
+            saved_dir=saved_dir,
+            model_roots=arguments.model_root,
+            controllers={item.actor: ControllerConfig(item.kind, **item.gains) for item in arguments.controller},
+            camera_modes={item.camera: item.mode for item in arguments.camera_mode},
+            camera_size=arguments.camera_size,
+            mjcf_options=arguments.mjcf_options,
+            actor_names=arguments.actor_names,
+        )
+    except ValueError as error:
+        raise CommandError(str(error)) from None
+
+
+def _announce(server: SimulatedServer, arguments: ServeArguments) -> None:
+    ports = {name: int(getattr(server, f"{name}_port")) for name in _PORTS}
+    if arguments.json:
+        ready: dict[str, Any] = {"event": "ready", "address": server.address}
+        ready |= {f"{name}_port": number for name, number in ports.items()}
+        ready |= {"shm_dir": None, "saved_dir": str(server.saved_dir), "pid": os.getpid()}
+        print(json.dumps(ready), flush=True)
+        return
+    others = ", ".join(f"{name} {number}" for name, number in ports.items() if name != "step")
+    models = ", ".join(Path(model).name for model in arguments.models)
+    end = "Ctrl-C or the end of standard input" if arguments.until_eof else "Ctrl-C"
+    print(f"Serving {models} at {server.address}:{ports['step']} ({others}); {end} ends it.", flush=True)
+
+
+def _check_ports(arguments: ServeArguments) -> None:
+    users: dict[int, str] = {}
+    for name in _PORTS:
+        number = cast("int", getattr(arguments, f"{name}_port"))
+        if number and number in users:
+            raise CommandError(f"--{users[number]}-port and --{name}-port are both {number}; each needs its own")
+        users[number] = name
+
+
+def _check_paths(arguments: ServeArguments) -> None:
+    from urlab_client.server.bundled import bundled_models  # noqa: PLC0415
+
+    bundled = bundled_models()
+    for model in arguments.models:
+        if model not in bundled and not Path(model).is_file():
+            raise CommandError(f"{model}: no such file, and no bundled robot, which are {', '.join(bundled)}")
+    for folder in arguments.model_root or ():
+        if not folder.is_dir():
+            raise CommandError(f"--model-root {folder}: no such folder")
+
+
+def _controller(text: str) -> ControllerOption:
+    actor, equals, value = text.partition("=")
+    kind, *gains = value.split(",")
+    if not actor or not equals:
+        raise argparse.ArgumentTypeError(f"{text!r}: write ACTOR=pd or ACTOR=passthrough ('*' for all actors)")
+    if kind not in [*ControllerKind]:
+        raise argparse.ArgumentTypeError(f"{text!r}: {kind!r} is no controller; there are {_names(ControllerKind)}")
+    if gains and kind != ControllerKind.PD:
+        raise argparse.ArgumentTypeError(f"{text!r}: {gains[0]!r}: a {kind} controller has no gains")
+    return ControllerOption(actor, ControllerKind(kind), dict(_gain(text, gain) for gain in gains))
+
+
+def _gain(text: str, gain: str) -> tuple[str, float]:
+    name, _, number = gain.partition("=")
+    if name not in _GAINS:
+        raise argparse.ArgumentTypeError(f"{text!r}: {gain!r} is no gain; write {', '.join(f'{n}=N' for n in _GAINS)}")
+    try:
+        value = float(number)
+    except ValueError:
+        value = -1.0
+    if not 0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r}: {gain!r}: {name} is a number from 0")
+    return name, value
+
+
+def _camera_mode(text: str) -> CameraOption:
+    camera, equals, mode = text.rpartition("=")
+    actor, slash, name = camera.partition("/")
+    if not (equals and actor and slash and name):
+        raise argparse.ArgumentTypeError(f"{text!r}: write ACTOR/CAMERA=MODE, for example arm/wrist=depth")
+    if mode not in [*CameraMode]:
+        raise argparse.ArgumentTypeError(f"{text!r}: {mode!r} is no camera mode; there are {_names(CameraMode)}")
+    return CameraOption(camera, CameraMode(mode))
+
+
+def _camera_size(text: str) -> tuple[int, int]:
+    width, cross, height = text.lower().partition("x")
+    if cross and width.isdecimal() and height.isdecimal():
+        size = int(width), int(height)
+        if all(0 < side <= _LARGEST_IMAGE for side in size):
+            return size
+    raise argparse.ArgumentTypeError(f"{text!r}: write WIDTHxHEIGHT in pixels, 1 to {_LARGEST_IMAGE}, as in 640x480")
+
+
+def _names(kinds: type[ControllerKind | CameraMode]) -> str:
+    return ", ".join(kinds)

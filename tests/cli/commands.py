@@ -1,0 +1,111 @@
+"""The `urlab` command in child processes, each with a deadline."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Generator, Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+
+DEADLINE_S = 60.0
+FREE_PORTS = [f"--{name}-port=0" for name in ("step", "state", "ctrl", "info", "camera")]
+GYMNASIUM_MODELS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
+
+
+def urlab(
+    *arguments: str | Path, cwd: Path, environment: Mapping[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end."""
+    return subprocess.run(
+        [sys.executable, "-m", "urlab_client", *map(str, arguments)],
+        cwd=cwd,
+        env={**os.environ, **(environment or {})},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=DEADLINE_S,
+        check=False,
+    )
+
+
+def refusal(done: subprocess.CompletedProcess[str]) -> str:
+    """Return the one line on standard error of a command that ended with code 2 and said nothing else."""
+    assert (done.returncode, done.stdout) == (2, ""), done
+    (line,) = done.stderr.splitlines()
+    return line
+
+
+class Server:
+    """A running `urlab serve`."""
+
+    def __init__(self, process: subprocess.Popen[str], first_line: str) -> None:
+        self.process = process
+        self.first_line = first_line
+
+    @property
+    def ready(self) -> dict[str, Any]:
+        """The line of JSON."""
+        return json.loads(self.first_line)
+
+    @property
+    def client_options(self) -> dict[str, Any]:
+        """What a client needs."""
+        ports = {f"{name}_port": self.ready[f"{name}_port"] for name in ("step", "state", "ctrl", "info")}
+        return {"address": self.ready["address"], **ports}
+
+    @property
+    def rpc(self) -> str:
+        """Address with the RPC port."""
+        return f"{self.ready['address']}:{self.ready['step_port']}"
+
+    def end(self, number: signal.Signals | None) -> tuple[int, str, str]:
+        """Send a signal, or close standard input; return exit code and what came after the first line."""
+        if number is None:
+            assert self.process.stdin is not None
+            self.process.stdin.close()
+            self.process.stdin = None
+        else:
+            self.process.send_signal(number)
+        out, err = self.process.communicate(timeout=DEADLINE_S)
+        return self.process.returncode, out, err
+
+
+@contextlib.contextmanager
+def child(*command: str | Path, cwd: Path) -> Generator[subprocess.Popen[str]]:
+    """Run a Python program with pipes; it is killed when it outlives the deadline or the block."""
+    process = subprocess.Popen(
+        [sys.executable, *map(str, command)],
+        cwd=cwd,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    watchdog = threading.Timer(DEADLINE_S, process.kill)
+    watchdog.start()
+    with process:
+        try:
+            yield process
+        finally:
+            watchdog.cancel()
+            process.kill()
+
+
+@contextlib.contextmanager
+def served(*arguments: str | Path, cwd: Path, json: bool = True) -> Generator[Server]:
+    """Run `urlab serve` on free ports until the block ends."""
+    options = [*FREE_PORTS, "--json"] if json else FREE_PORTS
+    with child("-m", "urlab_client", "serve", *options, *arguments, cwd=cwd) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        line = process.stdout.readline()
+        assert line, process.stderr.read()
+        yield Server(process, line)

@@ -1,0 +1,206 @@
+"""`urlab demo`: what it drives, what it prints and what it leaves on disk."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import math
+import shutil
+import struct
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from commands import GYMNASIUM_MODELS, refusal, urlab
+from matplotlib.image import imread
+
+from urlab_client import URLabClient
+from urlab_client.cli import main
+from urlab_client.cli.pilots import SinePilot
+from urlab_client.cli.robot_file import read_robot
+from urlab_client.server import SimulatedServer
+
+NO_OPENGL = {"MUJOCO_GL": "disable"}
+
+
+def png_size(path: Path) -> tuple[int, int]:
+    """Return width and height from the file's header."""
+    head = path.read_bytes()[:24]
+    assert head[:8] == b"\x89PNG\r\n\x1a\n"
+    width, height = struct.unpack(">II", head[16:])
+    return width, height
+
+
+def tilt(quaternion: list[float]) -> float:
+    """Return the angle between a body's z axis and the vertical, degrees."""
+    _, x, y, _ = quaternion
+    return math.degrees(math.acos(1 - 2 * (x * x + y * y)))
+
+
+@pytest.fixture(scope="module")
+def demonstration(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    folder = tmp_path_factory.mktemp("demo")
+    done = urlab("demo", cwd=folder)
+    assert done.returncode == 0, done
+    assert done.stderr == ""
+    return folder / "urlab-demo", done.stdout
+
+
+@pytest.fixture(scope="module")
+def record(demonstration: tuple[Path, str]) -> dict[str, Any]:
+    folder, _ = demonstration
+    return json.loads((folder / "run.json").read_bytes())
+
+
+def test_drives_one_robot_blocking_and_two_async(record: dict[str, Any]) -> None:
+    one, two = record["runs"]
+    assert (one["client"], one["robots"], one["steps"]) == ("blocking", 1, 2000)
+    assert (two["client"], two["robots"], two["steps"]) == ("async", 2, 500)
+    for run in (one, two):
+        assert run["sim_time"] == pytest.approx(0.002 * run["steps"])
+        assert run["steps_per_second"] == pytest.approx(run["steps"] / run["wall_time"])
+        assert run["real_time_factor"] == pytest.approx(run["sim_time"] / run["wall_time"])
+
+
+def test_the_quadruped_walks_and_does_not_fall(record: dict[str, Any]) -> None:
+    one, two = record["runs"]
+    (alone,) = one["final_base_poses"]
+    assert alone["position"][0] > 0.5
+    right, left = two["final_base_poses"]
+    assert left["position"][1] - right["position"][1] > 0.5
+    for pose in (alone, right, left):
+        assert 0.27 < pose["position"][2] < 0.32
+        assert tilt(pose["quaternion"]) < 10
+
+
+def test_prints_a_table_and_what_it_wrote(demonstration: tuple[Path, str], record: dict[str, Any]) -> None:
+    _, text = demonstration
+    assert "2000/2000" in text
+    assert "500/500" in text
+    for heading in ("robots", "steps", "sim (s)", "steps/s", "real-time", "final base pose"):
+        assert heading in text
+    x = record["runs"][0]["final_base_poses"][0]["position"][0]
+    assert f"{x:6.3f}" in text
+    for name in ("joints.png", "last_state.png", "run.json"):
+        assert name in text
+
+
+def test_plots_the_joints(demonstration: tuple[Path, str]) -> None:
+    folder, _ = demonstration
+    width, height = png_size(folder / "joints.png")
+    assert width >= 1200
+    assert height >= 900
+    pixels = (imread(folder / "joints.png")[..., :3] * 255).astype(np.uint32)
+    assert len(np.unique(pixels @ np.array([1, 256, 65536], np.uint32))) > 50  # a dozen lines and their soft edges
+
+
+def test_draws_the_last_state_or_says_what_is_missing(demonstration: tuple[Path, str], record: dict[str, Any]) -> None:
+    folder, text = demonstration
+    picture = folder / "last_state.png"
+    if record["opengl"] is None:
+        assert "libegl1" in text
+        assert not picture.exists()
+        return
+    assert png_size(picture) == (1280, 960)
+    red, green, blue = np.moveaxis(imread(picture)[..., :3], -1, 0)
+    shell = (red > 0.6) & (green < 0.75 * red) & (blue < 0.5 * red)  # the quadruped's orange
+    rows, columns = np.nonzero(shell)
+    assert shell.mean() > 0.005
+    assert rows.max() - rows.min() > 0.3 * 960  # large in the picture …
+    assert columns.max() - columns.min() > 0.3 * 1280
+    assert min(rows.min(), columns.min(), 959 - rows.max(), 1279 - columns.max()) > 10  # … and whole
+
+
+def test_records_the_configuration(record: dict[str, Any]) -> None:
+    assert record["versions"]["mujoco"] == mujoco.mj_versionString()
+    assert record["model"]["name"] == "quadruped"
+    assert len(record["model"]["sha256"]) == 64
+    assert record["options"]["timestep"] == 0.002
+    assert record["seed"] == 0
+    assert {pilot["kind"] for pilots in record["pilots"].values() for pilot in pilots} == {"trot"}
+
+
+def test_leaves_nothing_else(demonstration: tuple[Path, str], record: dict[str, Any]) -> None:
+    folder, _ = demonstration
+    pictures = {"joints.png"} if record["opengl"] is None else {"joints.png", "last_state.png"}
+    assert {path.name for path in folder.iterdir()} == {"run.json", *pictures}
+    assert [*folder.parent.iterdir()] == [folder]
+
+
+@pytest.mark.parametrize("name", ["ant", "pusher_v5"])
+def test_drives_the_robot_of_a_user(tmp_path: Path, name: str) -> None:
+    model = shutil.copy(GYMNASIUM_MODELS / f"{name}.xml", tmp_path / "my-robot.xml")
+    output = tmp_path / "a" / "b"
+    done = urlab("demo", model, "--steps", "40", "--no-render", "--output", output, cwd=tmp_path)
+    assert done.returncode == 0, done
+    record = json.loads((output / "run.json").read_bytes())
+    assert record["model"]["path"] == str(model)
+    assert record["options"]["timestep"] == mujoco.MjModel.from_xml_path(str(model)).opt.timestep
+    assert [run["steps"] for run in record["runs"]] == [40, 10]
+    assert not (output / "last_state.png").exists()
+    assert "--no-render" in done.stdout
+
+
+def test_a_robot_without_a_floor_gets_one(tmp_path: Path) -> None:
+    model = tmp_path / "block.xml"
+    model.write_text(
+        "<mujoco><worldbody><body pos='0 0 -5'><freejoint/>"
+        "<geom type='box' size='.1 .1 .1'/></body></worldbody></mujoco>"
+    )
+    assert main(["demo", str(model), "--steps", "400", "--no-render", "--output", str(tmp_path)]) == 0
+    record = json.loads((tmp_path / "run.json").read_bytes())
+    heights = [pose["position"][2] for run in record["runs"] for pose in run["final_base_poses"]]
+    assert heights == pytest.approx([0.1, 0.1, 0.1], abs=0.01)
+
+
+def test_goes_on_without_opengl(tmp_path: Path) -> None:
+    stale = tmp_path / "last_state.png"
+    stale.write_bytes(b"of an earlier run")
+    done = urlab("demo", "arm", "--steps", "8", "--output", tmp_path, cwd=tmp_path, environment=NO_OPENGL)
+    assert done.returncode == 0, done
+    assert "libegl1" in done.stdout
+    assert "libosmesa6" in done.stdout
+    assert not stale.exists()
+    assert (tmp_path / "joints.png").exists()
+
+
+def test_a_missing_extra_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "rich" else object())
+    assert main(["demo", "--output", str(tmp_path)]) == 2
+    assert capsys.readouterr() == ("", "urlab demo: rich not installed; run: pip install 'urlab-client[demo]'\n")
+
+
+def test_a_model_that_is_none(tmp_path: Path) -> None:
+    assert "quadruped" in refusal(urlab("demo", "robbot", cwd=tmp_path))
+    broken = tmp_path / "broken.xml"
+    broken.write_text("<mujoco><worldbody><geom type='potato'/></worldbody></mujoco>")
+    line = refusal(urlab("demo", broken, "--output", tmp_path, cwd=tmp_path))
+    assert str(broken) in line
+    assert "potato" in line
+
+
+def test_an_output_folder_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    assert main(["demo", "--output", str(file)]) == 2
+    assert str(file) in capsys.readouterr().err
+
+
+def test_the_gentle_pilot_stays_inside_the_control_ranges() -> None:
+    with SimulatedServer("arm", play=True) as server, URLabClient(**server.client_options()) as client:
+        client.discover()
+        arm = client.articulations["arm"]
+        pilot = SinePilot(arm, read_robot("arm").home_ctrl)
+        seen = []
+        for time in np.linspace(0, 5, 200):
+            pilot.act(time)
+            seen.append(arm.ctrl_array.copy())
+        ranges = np.array([actuator.ctrlrange for actuator in arm.actuators.values()])
+    low, high = np.min(seen, axis=0), np.max(seen, axis=0)
+    assert (low >= ranges[:, 0]).all()
+    assert (high <= ranges[:, 1]).all()
+    assert (high - low > 0.1 * np.ptp(ranges, axis=1)).all()

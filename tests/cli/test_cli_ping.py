@@ -1,0 +1,122 @@
+"""`urlab ping`: what it reports, and whom it disturbs."""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Generator
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import pytest
+from commands import GYMNASIUM_MODELS, Server, refusal, served, urlab
+
+from urlab_client import SessionTakenOver, URLabClient
+from urlab_client.cli import main
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Generator[Server]:
+    models = GYMNASIUM_MODELS / "ant.xml", "arm"
+    options = "--play", "--mjcf-options", "--controller", "arm=pd"
+    with served(*models, *options, cwd=tmp_path_factory.mktemp("served")) as server:
+        yield server
+
+
+def ping_json(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
+    assert main(["ping", "--json", *arguments]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_reports_who_is_there(server: Server, capsys: pytest.CaptureFixture[str]) -> None:
+    report = ping_json(capsys, server.rpc, "--count", "3")
+    assert (report["address"], report["ops"]) == (server.rpc, 62)
+    trips = report["round_trip_ms"]
+    assert trips["count"] == 3
+    assert 0 < trips["min"] <= trips["median"] <= trips["max"]
+    found = report["server"]
+    assert found["urlab_version"]
+    assert found["mujoco_version"] == found["local_mujoco_version"] == mujoco.mj_versionString()
+    assert found["same_mujoco_build"] is True
+    assert found["play"] == {
+        "state": "ready",
+        "sim_time": 0.0,
+        "physics": "standing still",
+        "step_mode": None,
+        "step_mode_pinned": False,
+    }
+    ant, arm = found["articulations"]
+    assert ant == {
+        "key": "ant", "actor_id": "ant", "joints": 9, "actuators": 8, "sensors": 0, "cameras": 1, "controller": None
+    }  # fmt: skip
+    assert (arm["key"], arm["actuators"], arm["controller"]) == ("arm", 7, "pd")
+
+
+def test_the_same_in_words(server: Server, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["ping", server.ready["address"], "--step-port", str(server.ready["step_port"])]) == 0
+    text = capsys.readouterr().out
+    for words in (mujoco.mj_versionString(), "9 joints, 8 actuators", "pd controller", "round trip", "--no-session"):
+        assert words in text
+
+
+def test_opens_a_session_only_if_it_may(server: Server, capsys: pytest.CaptureFixture[str]) -> None:
+    with URLabClient(**server.client_options) as client:
+        client.discover()
+        assert ping_json(capsys, server.rpc, "--no-session")["server"] is None
+        client.step()
+        ping_json(capsys, server.rpc)
+        with pytest.raises(SessionTakenOver):
+            client.step()
+
+
+def test_the_mode_of_a_server_that_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with served("ball", "--play", "--unpaused", cwd=tmp_path) as live:
+        play = ping_json(capsys, live.rpc)["server"]["play"]
+    assert (play["physics"], play["step_mode"], play["step_mode_pinned"]) == ("advancing", "live", False)
+
+
+def test_the_mode_of_a_pinned_server(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with served("ball", "--play", "--step-mode", "direct", cwd=tmp_path) as pinned:
+        play = ping_json(capsys, pinned.rpc)["server"]["play"]
+    assert (play["physics"], play["step_mode"], play["step_mode_pinned"]) == ("standing still", "direct", True)
+
+
+def test_a_server_without_play(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with served("ball", cwd=tmp_path) as editor:
+        found = ping_json(capsys, editor.rpc)["server"]
+    assert (found["play"]["state"], found["play"]["physics"], found["articulations"]) == ("off", None, [])
+
+
+def test_a_server_of_its_own(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["ping", "sim://pallet?model=ball"]) == 0
+    text = capsys.readouterr().out
+    assert "pallet" in text
+    assert "--no-session" not in text  # nobody to disturb
+
+
+def test_nobody_there(tmp_path: Path) -> None:
+    with socket.socket() as reserved:
+        reserved.bind(("127.0.0.1", 0))  # taken, and nothing listens
+        address = f"tcp://127.0.0.1:{reserved.getsockname()[1]}"
+        line = refusal(urlab("ping", address, "--timeout", "0.2", cwd=tmp_path))
+    assert line.startswith("urlab ping: ")
+    assert address in line
+    assert "refused" in line
+
+
+def test_somebody_who_does_not_answer(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        line = refusal(urlab("ping", address, "--timeout", "0.2", cwd=tmp_path))
+    assert address in line
+    assert "does not speak ZeroMQ" in line
+
+
+@pytest.mark.parametrize("address", ["robot", "http://localhost", "sim://nothing.xml", "tcp://"])
+def test_an_address_that_is_none(address: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["ping", address]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    assert address.removeprefix("sim://") in err

@@ -1,0 +1,196 @@
+"""`urlab serve` as other programs rely on it."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+from pathlib import Path
+
+import pytest
+from commands import DEADLINE_S, FREE_PORTS, GYMNASIUM_MODELS, child, refusal, served, urlab
+
+from urlab_client import ModeLocked, URLabClient, URLabPDController
+from urlab_client.protocol.enums import CameraMode, StepMode
+
+READY_KEYS = [
+    "event", "address", "step_port", "state_port", "ctrl_port", "info_port", "camera_port", "shm_dir", "saved_dir",
+    "pid",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, None])
+def test_serves_until_told_to_stop_and_leaves_nothing_behind(tmp_path: Path, end: signal.Signals | None) -> None:
+    options = ["--until-eof"] if end is None else []
+    with served("quadruped", "ball", "--play", *options, cwd=tmp_path) as server:
+        ready = server.ready
+        assert [*ready] == READY_KEYS
+        assert (ready["event"], ready["address"], ready["shm_dir"]) == ("ready", "tcp://127.0.0.1", None)
+        assert ready["pid"] == server.process.pid
+        assert len({ready[key] for key in READY_KEYS if key.endswith("_port")}) == 5
+        assert Path(ready["saved_dir"]).is_dir()
+        with URLabClient(**server.client_options, step_mode="direct") as client:
+            client.discover()
+            assert set(client.articulations) == {"quadruped", "ball"}
+            client.step(5)
+            assert client.sim_time == pytest.approx(0.01)
+        assert server.end(end) == (0, "", "")
+    assert not Path(ready["saved_dir"]).exists()
+    assert not [*tmp_path.iterdir()]
+    with socket.create_server(("127.0.0.1", ready["step_port"])):  # nobody holds the port
+        pass
+
+
+def test_ends_while_a_client_is_connected_and_physics_runs(tmp_path: Path) -> None:
+    with served("ball", "--play", "--unpaused", cwd=tmp_path) as server, URLabClient(**server.client_options) as client:
+        client.discover()
+        before = client.step().time
+        while client.step().time == before:
+            pass
+        assert server.end(signal.SIGTERM) == (0, "", "")
+
+
+def test_says_readably_where_it_serves(tmp_path: Path) -> None:
+    with served("arm", cwd=tmp_path, json=False) as server:
+        assert server.first_line.startswith("Serving arm at tcp://127.0.0.1:")
+        assert "Ctrl-C" in server.first_line
+        assert server.end(signal.SIGINT) == (0, "", "")
+
+
+def test_a_signal_during_a_start_that_takes_long(tmp_path: Path) -> None:
+    program = tmp_path / "slow.py"
+    program.write_text(
+        "import sys, threading\n"
+        "from pathlib import Path\n"
+        "from urlab_client.cli import main\n"
+        "from urlab_client.server import SimulatedServer\n"
+        "def start(self):\n"
+        "    print(self._config.saved_dir, flush=True)\n"
+        "    threading.Event().wait()\n"
+        "SimulatedServer.start = start\n"
+        "sys.exit(main(sys.argv[1:]))\n"
+    )
+    with child(program, "serve", "arm", *FREE_PORTS, cwd=tmp_path) as process:
+        assert process.stdout is not None
+        scratch = Path(process.stdout.readline().strip())
+        process.send_signal(signal.SIGTERM)
+        out, err = process.communicate(timeout=DEADLINE_S)
+    assert (process.returncode, out, err) == (0, "", "")
+    assert not scratch.exists()
+
+
+def test_every_option_has_its_effect(tmp_path: Path) -> None:
+    models = tmp_path / "models"
+    models.mkdir()
+    saved = tmp_path / "saved"
+    with served(
+        "arm", "quadruped", "--host", "localhost", "--no-shm", "--saved-dir", saved, "--model-root", models,
+        "--model-root", GYMNASIUM_MODELS, "--play", "--unpaused", "--step-mode", "direct",
+        "--controller", "arm=pd,kp=40,kv=3,torque_limit=12.5", "--controller", "*=passthrough",
+        "--camera-mode", "arm/wrist=depth", "--camera-size", "320x200", "--mjcf-options", "--actor-names", "plugin",
+        "--until-eof",
+        cwd=tmp_path,
+    ) as server:  # fmt: skip
+        assert server.ready["saved_dir"] == str(saved)
+        with URLabClient(**server.client_options) as client:
+            client.discover()
+            assert [*client.articulations] == ["arm_C_0", "quadruped_C_0"]
+            arm, quadruped = client.articulations.values()
+            assert isinstance(arm.controller, URLabPDController)
+            assert (set(arm.controller.kp.values()), set(arm.controller.kv.values())) == ({40.0}, {3.0})
+            assert set(arm.controller.torque_limit.values()) == {12.5}
+            assert quadruped.controller is not None
+            assert not isinstance(quadruped.controller, URLabPDController)
+            assert arm.cameras["wrist"].mode is CameraMode.DEPTH
+            assert arm.cameras["wrist"].resolution == (320, 200)
+            with pytest.raises(ModeLocked):
+                client.runtime.set_mode(StepMode.LIVE)
+            assert client.scene.import_xml(str(GYMNASIUM_MODELS / "ant.xml")).imported_now
+        assert server.end(signal.SIGTERM)[:2] == (0, "")
+    assert (saved / "MuJoCoImports" / "ant").is_dir()
+
+
+def test_names_the_options_of_a_model_that_it_ignores(tmp_path: Path) -> None:
+    with served(GYMNASIUM_MODELS / "humanoid.xml", "--play", cwd=tmp_path) as server:
+        code, _, err = server.end(signal.SIGTERM)
+    assert code == 0
+    assert any(line.startswith("urlab serve: warning: ") and "timestep" in line for line in err.splitlines()), err
+
+
+def test_serves_a_saved_level(tmp_path: Path) -> None:
+    with served("arm", "--saved-dir", tmp_path, cwd=tmp_path) as server:
+        with URLabClient(**server.client_options) as client:
+            client.discover()
+            client.scene.create_level("lab")
+            client.scene.ensure_manager()
+            client.scene.spawn_actor(client.scene.import_xml("ball"), "toy", location=(1, 2, 3))
+            client.scene.save_level()
+        server.end(signal.SIGTERM)
+    level = tmp_path / "Levels" / "lab.json"
+    with served(level, "--play", cwd=tmp_path) as server, URLabClient(**server.client_options) as client:
+        client.discover()
+        assert client.articulations_by_id["toy"].root_pos_w.tolist() == pytest.approx([1, 2, 3.1])
+
+
+def write(folder: Path, name: str, text: str) -> Path:
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def test_a_missing_model(tmp_path: Path) -> None:
+    line = refusal(urlab("serve", "robbot.xml", *FREE_PORTS, cwd=tmp_path))
+    assert line.startswith("urlab serve: robbot.xml: no such file")
+    assert "quadruped" in line
+
+
+def test_a_broken_model(tmp_path: Path) -> None:
+    broken = write(tmp_path, "broken.xml", "<mujoco><worldbody><geom type='potato'/></worldbody></mujoco>")
+    line = refusal(urlab("serve", broken, *FREE_PORTS, cwd=tmp_path))
+    assert str(broken) in line
+    assert "potato" in line
+    assert [*tmp_path.iterdir()] == [broken]
+
+
+def test_a_port_in_use(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as holder:
+        port = holder.getsockname()[1]
+        for name in ("step", "camera"):
+            line = refusal(urlab("serve", "arm", *FREE_PORTS, f"--{name}-port={port}", cwd=tmp_path))
+            assert f"127.0.0.1:{port} is in use" in line
+            assert f"{name}_port" in line
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["arm", "--shm-dir", "/dev/shm"], ["--shm-dir", "not in this version"]),
+        (["arm", "--step-port", "1", "--info-port", "1"], ["--step-port", "--info-port", "1"]),
+        (["arm", "--host", "host.invalid"], ["host.invalid"]),
+        (["arm", "--model-root", "nowhere"], ["--model-root", "nowhere"]),
+        (["lab.json"], ["lab.json"]),
+    ],
+)
+def test_what_cannot_be_honoured_is_one_line(tmp_path: Path, arguments: list[str], words: list[str]) -> None:
+    line = refusal(urlab("serve", *FREE_PORTS, *arguments, cwd=tmp_path))
+    assert all(word in line for word in words), line
+
+
+def test_needs_no_opengl(tmp_path: Path) -> None:
+    done = urlab("serve", "nothing.xml", cwd=tmp_path, environment={"MUJOCO_GL": "broken"})
+    assert "nothing.xml" in refusal(done)
+
+
+def test_what_reads_standard_input_does_not_hold_up_the_end(tmp_path: Path) -> None:
+    with served("ball", "--until-eof", cwd=tmp_path) as server:
+        assert server.end(signal.SIGTERM) == (0, "", "")
+
+
+def test_the_end_of_the_parent_is_the_end_of_the_server(tmp_path: Path) -> None:
+    with served("ball", "--until-eof", cwd=tmp_path) as server:
+        assert server.process.stdin is not None
+        server.process.stdin.write("not the end\n")
+        server.process.stdin.flush()
+        with pytest.raises(subprocess.TimeoutExpired):
+            server.process.wait(0.0)
+        assert server.end(None) == (0, "", "")

@@ -1,0 +1,111 @@
+"""What every command has in common: help, usage errors, exit codes, what is imported."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+from commands import DEADLINE_S, child, refusal, urlab
+
+from urlab_client.cli import main
+
+
+def test_help_needs_no_heavy_library(tmp_path: Path) -> None:
+    program = (
+        "import sys; from urlab_client.cli import main\n"
+        "try: main(['--help'])\n"
+        "except SystemExit: print(sorted({'mujoco', 'rich', 'matplotlib'} & set(sys.modules)))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=DEADLINE_S, check=True
+    )
+    *text, imported = done.stdout.splitlines()
+    assert {"serve", "ping", "demo"} <= set(" ".join(text).split())
+    assert imported == "[]"
+
+
+@pytest.mark.parametrize("command", ["serve", "ping", "demo"])
+def test_each_command_explains_itself(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main([command, "--help"])
+    assert end.value.code == 0
+    assert capsys.readouterr().out.startswith(f"usage: urlab {command}")
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(["--version"])
+    assert end.value.code == 0
+    assert version("urlab-client") in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], ["COMMAND"]),
+        (["fly"], ["'fly'", "serve", "ping", "demo"]),
+        (["serve"], ["MODEL"]),
+        (["serve", "arm", "--step-port", "70000"], ["--step-port", "'70000'", "65535"]),
+        (["serve", "arm", "--step-mode", "slow"], ["--step-mode", "'slow'", "puppet"]),
+        (["serve", "arm", "--actor-names", "x"], ["--actor-names", "'x'", "plugin"]),
+        (["serve", "arm", "--controller", "arm"], ["--controller", "'arm'", "ACTOR=pd"]),
+        (["serve", "arm", "--controller", "=pd"], ["--controller", "'=pd'", "ACTOR=pd"]),
+        (["serve", "arm", "--controller", "arm=lqr"], ["'arm=lqr'", "'lqr'", "pd, passthrough"]),
+        (["serve", "arm", "--controller", "arm=pd,ki=1"], ["'ki=1'", "kp=N"]),
+        (["serve", "arm", "--controller", "arm=pd,kp=stiff"], ["'kp=stiff'", "number"]),
+        (["serve", "arm", "--controller", "arm=pd,kv=-1"], ["'kv=-1'", "number"]),
+        (["serve", "arm", "--controller", "arm=pd,kv=nan"], ["'kv=nan'", "number"]),
+        (["serve", "arm", "--controller", "arm=passthrough,kp=1"], ["'kp=1'", "passthrough"]),
+        (["serve", "arm", "--camera-mode", "wrist=depth"], ["'wrist=depth'", "ACTOR/CAMERA=MODE"]),
+        (["serve", "arm", "--camera-mode", "arm/wrist=thermal"], ["'thermal'", "depth"]),
+        (["serve", "arm", "--camera-size", "640"], ["--camera-size", "'640'", "640x480"]),
+        (["serve", "arm", "--camera-size", "0x480"], ["'0x480'"]),
+        (["serve", "arm", "--shm-dir", "x", "--no-shm"], ["--no-shm"]),
+        (["ping", "--count", "0"], ["--count", "'0'"]),
+        (["ping", "--timeout", "soon"], ["--timeout", "'soon'", "seconds"]),
+        (["ping", "--timeout", "inf"], ["--timeout", "'inf'"]),
+        (["demo", "--steps", "-5"], ["--steps", "'-5'"]),
+    ],
+)
+def test_wrong_usage_is_one_line_that_names_it(
+    arguments: list[str], words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(arguments)
+    out, err = capsys.readouterr()
+    assert (end.value.code, out) == (2, "")
+    assert err.count("\n") == 1
+    assert all(word in err for word in words), err
+
+
+def test_the_package_runs_as_the_command(tmp_path: Path) -> None:
+    assert refusal(urlab("serve", cwd=tmp_path)).startswith("urlab serve: ")
+
+
+def test_ctrl_c_is_exit_code_130_without_a_traceback(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        silent.settimeout(DEADLINE_S)
+        address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        with child(
+            "-m", "urlab_client", "ping", address, "--timeout", DEADLINE_S, "--no-session", cwd=tmp_path
+        ) as ping:
+            connection, _ = silent.accept()  # from here on it waits for an answer that never comes
+            with connection:
+                ping.send_signal(signal.SIGINT)
+                out, err = ping.communicate(timeout=DEADLINE_S)
+    assert (ping.returncode, out, err) == (130, "", "")
+
+
+def test_a_reader_that_has_gone_is_no_traceback(tmp_path: Path) -> None:
+    with child("-m", "urlab_client", "ping", "sim://ball", "--no-session", cwd=tmp_path) as ping:
+        assert ping.stdout is not None
+        ping.stdout.close()
+        ping.stdout = None
+        _, err = ping.communicate(timeout=DEADLINE_S)
+    assert ping.returncode == 2
+    assert err == ""
