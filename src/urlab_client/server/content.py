@@ -312,16 +312,14 @@ class ContentRoot:
     def _locate(self, path: str, *, trusted: bool) -> tuple[Path, str]:
         """Return the file behind a request's path and how the blueprint names its source."""
         bundled = bundled_models()
-        if path.startswith(BUNDLED_PREFIX):
-            name = path.removeprefix(BUNDLED_PREFIX)
-            if name not in bundled:
-                raise Refusal("import_failed", f"no bundled model is called '{name}': {', '.join(bundled)}")
-            return bundled[name], path
+        name = path.removeprefix(BUNDLED_PREFIX)
+        if name in bundled:  # no file is meant: MuJoCo reads none without a suffix
+            return bundled[name], f"{BUNDLED_PREFIX}{name}"
+        if name != path:
+            raise Refusal("import_failed", f"no bundled model is called '{name}': use {', '.join(bundled)}")
         try:
             candidates = self._candidates(path, trusted=trusted)
             file = next((candidate for candidate in candidates if candidate.is_file()), None)
-            if file is None and path in bundled:
-                file = bundled[path]
         except (OSError, ValueError) as error:  # too long, a null byte, a loop of links
             raise Refusal("import_failed", f"{path!r} is no usable path: {error}") from None
         if file is not None:

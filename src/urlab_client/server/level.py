@@ -262,6 +262,8 @@ def _check_settings(entry: _Actor) -> None:
         raise ValueError("only a static mesh can have 'quick_convert'")
     if entry.kind is ActorKind.ARTICULATION and entry.scale != UNIT_SCALE:
         raise ValueError("an articulation cannot be scaled")
+    if 0.0 in entry.scale:
+        raise ValueError("no component of scale can be zero")
 
 
 def _check_mesh(mesh: Mesh, convert: QuickConvert | None) -> None:

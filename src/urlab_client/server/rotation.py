@@ -18,7 +18,6 @@ from urlab_client.protocol.base import Quat, Vec3
 __all__ = [
     "IDENTITY",
     "euler_to_quat",
-    "multiply",
     "normalized",
     "quat_to_euler",
     "rotate",
@@ -28,6 +27,9 @@ __all__ = [
 ]
 
 IDENTITY: Final[Quat] = (0.0, 0.0, 0.0, 1.0)
+
+_UNIT: Final = 1e-14
+"""Rounding leaves the square of a unit quaternion's length this close to 1."""
 
 _POLE: Final = 0.4999995
 """Where Unreal treats pitch as 90 degrees: |z x - w y| beyond this."""
@@ -46,13 +48,15 @@ def xyzw(quat: Quat) -> Quat:
 
 
 def normalized(quat: Quat) -> Quat:
-    """Return the unit quaternion along `quat`, either order.
+    """Return the unit quaternion along `quat`, either order; one of unit length already stays as it is.
 
     Raises:
         ValueError: A component is not finite, or all are zero.
     """
     if not all(math.isfinite(value) for value in quat):
         raise ValueError(f"a quaternion has finite components, not {list(quat)}")
+    if abs(sum(value * value for value in quat) - 1.0) < _UNIT:
+        return quat
     largest = max(abs(value) for value in quat)
     if largest == 0.0:
         raise ValueError("a quaternion of four zeros is no rotation")
@@ -107,18 +111,6 @@ def quat_to_euler(quat: Quat) -> Vec3:
         pitch = sign * 90.0
         roll = _wrapped(sign * yaw - math.degrees(2.0 * math.atan2(x, w)))
     return roll, pitch, yaw
-
-
-def multiply(a: Quat, b: Quat) -> Quat:
-    """Return the rotation `b` followed by `a`, all (x, y, z, w): Hamilton's product a b."""
-    ax, ay, az, aw = a
-    bx, by, bz, bw = b
-    return (
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-        aw * bw - ax * bx - ay * by - az * bz,
-    )
 
 
 def rotate(quat: Quat, vector: Vec3) -> Vec3:

@@ -327,6 +327,7 @@ def _compose(
             if converted is not None:
                 bodies.append(converted)
     _restore_world_references(spec, {f"{actor.prefix}world" for actor, _ in articulations})
+    spec.dedup_assets()  # instances of one robot share its meshes and textures
     return spec, bodies
 
 

@@ -1,0 +1,508 @@
+from __future__ import annotations
+
+import json
+import os
+import threading
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from worlds import BALL_BODY, BOT, GYMNASIUM, Desk, mjcf, write_obj, write_stl
+
+from urlab_client.server.bundled import bundled_models
+from urlab_client.server.content import Blueprint, ContentRoot, level_package, mujoco_messages, write_atomic
+from urlab_client.server.refusal import Refusal
+
+BALL = mjcf(BALL_BODY, model="ball")
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Desk:
+    return Desk(tmp_path)
+
+
+def arrays(model: mujoco.MjModel) -> dict[str, np.ndarray]:
+    """Everything numeric in a model, but where its strings and files are."""
+    names = [name for name in dir(model) if not name.startswith(("_", "name_")) and "pathadr" not in name]
+    values = {name: getattr(model, name) for name in names if name not in ("names_map", "paths")}
+    return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+
+
+def compiled(blueprint: Blueprint) -> mujoco.MjModel:
+    return blueprint.spec.copy().compile()
+
+
+# Importing
+
+
+def test_an_import_is_named_after_the_file(desk: Desk) -> None:
+    path = str(desk.write("robot.xml", BOT))
+
+    first, imported_first = desk.content.import_xml(path)
+    again, imported_again = desk.content.import_xml(path)
+    forced, imported_forced = desk.content.import_xml(path, force_reimport=True)
+
+    assert (imported_first, imported_again, imported_forced) == (True, False, True)
+    assert first.class_path == again.class_path == forced.class_path == "/Game/MuJoCoImports/robot.robot_C"
+    assert first.package_path == "/Game/MuJoCoImports/robot"
+    assert first.model_name == "bot"
+    assert (first.joints, first.actuators) == (("root", "j"), ("m",))
+    assert (first.sensors, first.cameras) == (("s",), ("cam",))
+
+
+@pytest.mark.parametrize(
+    ("file", "stem"), [("my-robot v1.2.xml", "my_robot_v1_2"), ("ünïcode.xml", "ünïcode"), ("a+b.xml", "a_b")]
+)
+def test_odd_characters_of_a_file_name_become_underscores(desk: Desk, file: str, stem: str) -> None:
+    blueprint, _ = desk.content.import_xml(str(desk.write(file, BALL)))
+
+    assert blueprint.short_name == stem
+    assert compiled(blueprint).nbody == 2
+
+
+def test_mujocos_default_name_is_no_model_name(desk: Desk) -> None:
+    blueprint, _ = desk.content.import_xml(str(desk.write("nameless.xml", mjcf(BALL_BODY))))
+
+    assert blueprint.model_name == ""
+
+
+def test_a_relative_path_is_looked_up_in_the_model_roots(tmp_path: Path) -> None:
+    roots = [tmp_path / "one", tmp_path / "two"]
+    for root in roots:
+        (root / "sub").mkdir(parents=True)
+    (roots[1] / "sub" / "ball.xml").write_text(BALL)
+    content = ContentRoot(tmp_path / "saved", model_roots=roots)
+
+    blueprint, _ = content.import_xml("sub/ball.xml")
+
+    assert blueprint.source == str(roots[1] / "sub" / "ball.xml")
+
+
+def test_bundled_models_need_no_root(tmp_path: Path) -> None:
+    content = ContentRoot(tmp_path)
+
+    by_name, _ = content.import_xml("ball")
+    by_path, imported_now = content.import_xml(str(bundled_models()["ball"]))
+
+    assert by_name.source == "bundled:ball"
+    assert by_path is by_name
+    assert not imported_now
+
+
+def test_a_bundled_name_is_no_file(desk: Desk) -> None:
+    desk.write("ball", BOT)
+    desk.write("ball.xml", BOT)
+
+    assert desk.content.import_xml("ball")[0].model_name == "ball"
+
+
+@pytest.mark.parametrize("way", ["absolute", "dots", "link"])
+def test_files_outside_the_model_roots_are_refused(tmp_path: Path, desk: Desk, way: str) -> None:
+    secret = tmp_path / "secret.xml"
+    secret.write_text(BALL)
+    (desk.models / "link.xml").symlink_to(secret)
+    path = {"absolute": str(secret), "dots": "../secret.xml", "link": "link.xml"}[way]
+
+    with pytest.raises(Refusal) as refused:
+        desk.content.import_xml(path)
+
+    assert refused.value.code == "import_failed"
+    assert str(desk.models) in refused.value.message
+    assert "--model-root" in refused.value.message
+    assert desk.content.import_xml(str(secret), trusted=True)[1]
+
+
+def test_a_link_within_the_model_roots_may_be_followed(desk: Desk) -> None:
+    desk.write("versions/ball-2.xml", BALL)
+    (desk.models / "ball.xml").symlink_to(desk.models / "versions" / "ball-2.xml")
+
+    assert desk.content.import_xml("ball.xml")[0].short_name == "ball_2"
+
+
+@pytest.mark.parametrize(
+    ("path", "code", "text"),
+    [
+        ("", "missing_field", "path"),
+        ("nowhere.xml", "import_failed", "nowhere.xml does not exist"),
+        (".", "import_failed", "is a folder"),
+        ("a\0b.xml", "import_failed", "no usable path"),
+        ("x" * 5000, "import_failed", "no usable path"),
+        ("bundled:rocket", "import_failed", "quadruped"),
+    ],
+)
+def test_unusable_paths_are_refused(desk: Desk, path: str, code: str, text: str) -> None:
+    with pytest.raises(Refusal) as refused:
+        desk.content.import_xml(path)
+
+    assert refused.value.code == code
+    assert text in refused.value.message
+
+
+@pytest.mark.parametrize(
+    ("text", "cause"),
+    [
+        (mjcf('<body name="b">\n<geom size="0.1" colour="red"/></body>'), "unrecognized attribute: 'colour'"),
+        (mjcf('<body name="b"><joint/></body>'), "mass and inertia of moving bodies must be larger than mjMINVAL"),
+        ("not XML", "XML"),
+        (mjcf("", head='<asset><mesh file="none.obj"/></asset>'), "none.obj"),
+        (mjcf("", head='<include file="none.xml"/>'), "none.xml"),
+        ("", "empty"),
+    ],
+)
+def test_mujocos_reason_for_rejecting_a_file_is_passed_on(desk: Desk, text: str, cause: str) -> None:
+    path = desk.write("broken.xml", text)
+
+    with pytest.raises(Refusal) as refused:
+        desk.content.import_xml(str(path))
+
+    assert refused.value.code == "import_failed"
+    assert cause in refused.value.message
+    assert str(path) in refused.value.message
+    assert "\n" not in refused.value.message
+    assert not desk.content.blueprints
+
+
+def test_a_failed_reimport_leaves_the_blueprint_as_it_was(desk: Desk) -> None:
+    path = desk.write("ball.xml", BALL)
+    before, _ = desk.content.import_xml(str(path))
+    path.write_text("broken")
+
+    with pytest.raises(Refusal):
+        desk.content.import_xml(str(path), force_reimport=True)
+
+    assert desk.content.blueprints["ball"] is before
+    assert compiled(before).nbody == 2
+
+
+# Snapshots
+
+
+@pytest.fixture
+def workshop(desk: Desk) -> Path:
+    """A model with an include, an attached part, and meshes of one name in two folders."""
+    write_obj(desk.models / "robot" / "meshes" / "part.obj", 0.1)
+    write_stl(desk.models / "robot" / "meshes" / "shell.stl", 0.2)
+    write_obj(desk.models / "gripper" / "meshes" / "part.obj", 0.3)
+    desk.write("robot/limits.xml", '<mujocoinclude><default><joint range="-90 90"/></default></mujocoinclude>')
+    desk.write(
+        "gripper/gripper.xml",
+        mjcf(
+            '<body name="hand"><joint name="grip"/><geom type="mesh" mesh="part"/></body>',
+            model="gripper",
+            head='<compiler meshdir="meshes"/><asset><mesh file="part.obj"/></asset>',
+            tail='<actuator><position name="grip" joint="grip" kp="3"/></actuator>',
+        ),
+    )
+    return desk.write(
+        "robot/robot.xml",
+        mjcf(
+            '<body name="base" euler="10 20 30"><joint name="turn"/><geom type="mesh" mesh="part"/>'
+            '<geom type="mesh" mesh="shell"/><attach model="gripper" body="hand" prefix="tool_"/></body>',
+            model="robot",
+            head='<compiler meshdir="meshes"/><include file="limits.xml"/><asset><mesh file="part.obj"/>'
+            '<mesh file="shell.stl"/><model name="gripper" file="../gripper/gripper.xml"/></asset>',
+            tail='<actuator><velocity name="turn" joint="turn" kv="2"/></actuator>'
+            '<keyframe><key name="half" qpos="0.123456789012345678 0.5"/></keyframe>',
+        ),
+    )
+
+
+def test_a_snapshot_needs_nothing_of_its_source(desk: Desk, workshop: Path) -> None:
+    original = mujoco.MjModel.from_xml_path(str(workshop))
+    blueprint, _ = desk.content.import_xml(str(workshop))
+    desk.models.rename(desk.models.with_name("gone"))
+
+    found = ContentRoot(desk.saved).find_blueprint(blueprint.class_path)
+
+    assert found is not None
+    copies = arrays(compiled(found))
+    for name, value in arrays(original).items():
+        np.testing.assert_array_equal(copies[name], value, err_msg=name)
+    assert dict(found.actuator_types) == {"turn": "velocity", "tool_grip": "position"}
+    assert found.model_name == "robot"
+
+
+def test_later_edits_of_the_source_change_nothing_until_forced(
+    desk: Desk, workshop: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    blueprint, _ = desk.content.import_xml(str(workshop))
+    before = compiled(blueprint).mesh_vert.copy()
+    write_obj(desk.models / "robot" / "meshes" / "part.obj", 0.7)
+    workshop.write_text(workshop.read_text().replace('name="turn"/>', 'name="turn"/><site name="new"/>'))
+
+    kept, _ = desk.content.import_xml(str(workshop))
+    assert "has changed since it was imported" in caplog.text
+    np.testing.assert_array_equal(compiled(kept).mesh_vert, before)
+
+    renewed, _ = desk.content.import_xml(str(workshop), force_reimport=True)
+    assert compiled(renewed).nsite == 1
+    assert compiled(renewed).mesh_vert.max() > 2 * before.max()
+    np.testing.assert_array_equal(compiled(blueprint).mesh_vert, before)  # a play session may still run on it
+
+
+def test_two_files_of_one_stem_are_one_blueprint(desk: Desk, caplog: pytest.LogCaptureFixture) -> None:
+    first, _ = desk.content.import_xml(str(desk.write("a/robot.xml", BOT)))
+
+    second, imported_now = desk.content.import_xml(str(desk.write("b/robot.xml", BALL)))
+
+    assert second is first
+    assert not imported_now
+    assert "blueprint 'robot'" in caplog.text
+
+
+def test_only_the_last_two_snapshots_are_kept(desk: Desk) -> None:
+    path = desk.write("ball.xml", BALL)
+    for size in (0.1, 0.2, 0.3, 0.4):
+        path.write_text(BALL.replace('size="0.1"', f'size="{size}"'))
+        blueprint, _ = desk.content.import_xml(str(path), force_reimport=True)
+
+    folders = [entry for entry in blueprint.folder.parent.iterdir() if entry.is_dir()]
+
+    assert len(folders) == 2
+    assert blueprint.folder in folders
+
+
+def test_importing_the_same_content_makes_the_same_snapshot(desk: Desk, workshop: Path) -> None:
+    first, _ = desk.content.import_xml(str(workshop))
+    second, _ = desk.content.import_xml(str(workshop), force_reimport=True)
+
+    assert second.folder == first.folder
+
+
+@pytest.mark.parametrize("damage", ["record", "snapshot"])
+def test_a_damaged_blueprint_is_left_out(desk: Desk, damage: str, caplog: pytest.LogCaptureFixture) -> None:
+    good, _ = desk.content.import_xml(str(desk.write("good.xml", BALL)))
+    bad, _ = desk.content.import_xml(str(desk.write("bad.xml", BALL)))
+    record = desk.content.snapshot_record(bad)
+    if damage == "record":
+        record.write_text("{")
+    else:
+        (bad.folder / "model.xml").unlink()
+
+    assert list(ContentRoot(desk.saved).blueprints) == [good.stem]
+    assert str(record) in caplog.text
+
+
+def test_a_removed_blueprint_stays_away(desk: Desk) -> None:
+    desk.content.import_xml(str(desk.write("ball.xml", BALL)))
+
+    desk.content.remove_blueprint("ball")
+
+    assert not desk.content.blueprints
+    assert not ContentRoot(desk.saved).blueprints
+
+
+def test_a_content_root_that_cannot_be_written_refuses_imports(tmp_path: Path) -> None:
+    (tmp_path / "saved").write_text("a file where the folder should be")
+    content = ContentRoot(tmp_path / "saved")
+
+    with pytest.raises(Refusal, match="import_failed: cannot store"):
+        content.import_xml("ball")
+
+
+# Names and keyframes
+
+
+def test_every_element_gets_a_name(desk: Desk) -> None:
+    body = (
+        "<body><joint/><joint axis='0 1 0'/><geom size='0.1'/><geom type='box' size='0.1 0.1 0.1'/><site/><camera/>"
+        "<body><joint type='slide'/><geom size='0.1'/></body></body>"
+        "<body name='named'><freejoint/><geom name='Geom_Sphere' size='0.1'/></body><light/>"
+    )
+    tail = (
+        "<actuator><motor joint='HingeJoint'/></actuator>"
+        "<sensor><gyro site='tip'/><jointactuatorfrc joint='j'/></sensor><keyframe><key/><key/></keyframe>"
+    )
+    body = body.replace("<joint/>", "<joint name='j'/>").replace("<site/>", "<site name='tip'/><site/>")
+    tail = tail.replace("HingeJoint", "j")
+    blueprint, _ = desk.content.import_xml(str(desk.write("plain.xml", mjcf(body, tail=tail))))
+    spec = blueprint.spec
+
+    assert [item.name for item in spec.bodies[1:]] == ["worldbody_Body", "worldbody_Body_Body", "named"]
+    assert [item.name for item in spec.joints] == ["j", "HingeJoint", "SlideJoint", "FreeJoint"]
+    assert sorted(item.name for item in spec.geoms) == ["Geom_Box", "Geom_Sphere", "Geom_Sphere1", "Geom_Sphere2"]
+    assert [item.name for item in spec.sites] == ["tip", "Site"]
+    assert [item.name for item in spec.cameras] == ["Camera"]
+    assert [item.name for item in spec.lights] == ["Light"]
+    assert [item.name for item in spec.actuators] == ["MotorActuator"]
+    assert [item.name for item in spec.sensors] == ["GyroSensor", "JointactuatorfrcSensor"]
+    assert [item.name for item in spec.keys] == ["Keyframe", "Keyframe1"]
+    assert blueprint.actuators == ("MotorActuator",)
+
+
+def test_actuators_are_reported_as_the_element_that_authored_them(desk: Desk) -> None:
+    elements = {
+        "motor": "",
+        "general": "",
+        "position": 'kp="3"',
+        "velocity": 'kv="3"',
+        "intvelocity": 'kp="3" actrange="-1 1"',
+        "damper": 'ctrlrange="0 1"',
+        "cylinder": "",
+        "muscle": 'lengthrange="0 1"',
+        "dcmotor": 'motorconst="1" resistance="1"',
+    }
+    actuators = "".join(f'<{kind} name="{kind}" joint="j" {more}/>' for kind, more in elements.items())
+    actuators += '<adhesion name="adhesion" body="b" ctrlrange="0 1"/><position class="servo" name="classy" joint="j"/>'
+    text = mjcf(
+        '<body name="b"><joint name="j"/><geom size="0.1"/></body>',
+        head='<default><default class="servo"><position kp="7"/></default></default>',
+        tail=f"<actuator>{actuators}</actuator>",
+    )
+    desk.content.import_xml(str(desk.write("kinds.xml", text)))
+
+    types = ContentRoot(desk.saved).blueprints["kinds"].actuator_types
+
+    assert dict(types) == {kind: kind for kind in elements} | {
+        "general": "motor",
+        "adhesion": "adhesion",
+        "classy": "position",
+    }
+
+
+# Quiet
+
+
+CONFLICT = mjcf(
+    '<body name="b"><joint name="j"/><geom size="0.1"/><attach model="child" body="c" prefix="c_"/></body>',
+    model="parent",
+    head='<option timestep="0.001"/><asset><model name="child" file="child.xml"/></asset>',
+    tail='<keyframe><key name="k" qpos="1 2"/></keyframe>',
+)
+CHILD = mjcf(
+    '<body name="c"><joint name="j"/><geom size="0.1"/></body>', model="child", head='<option timestep="0.01"/>'
+)
+
+
+def test_importing_prints_nothing_and_logs_once(
+    desk: Desk,
+    capfd: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    desk.write("child.xml", CHILD)
+
+    desk.content.import_xml(str(desk.write("parent.xml", CONFLICT)))
+
+    assert capfd.readouterr() == ("", "")
+    assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
+    assert len(caplog.records) == 1
+    assert "Attach conflict" in caplog.text
+
+
+def test_a_deprecated_attribute_is_logged_and_not_raised(desk: Desk, caplog: pytest.LogCaptureFixture) -> None:
+    content = ContentRoot(desk.saved, model_roots=[GYMNASIUM])
+
+    blueprint, _ = content.import_xml("half_cheetah.xml")
+
+    assert "settotalmass" in caplog.text
+    assert compiled(blueprint).nu == 6
+
+
+def test_warnings_that_other_threads_cause_reach_the_handler_that_was_there() -> None:
+    theirs: list[str] = []
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(theirs.append)
+    root = mujoco.MjSpec()
+    child = mujoco.MjSpec.from_string(CHILD)
+    try:
+        with mujoco_messages() as ours:
+            other = threading.Thread(
+                target=lambda: root.attach(child, frame=root.worldbody.add_frame(), prefix="other_")
+            )
+            other.start()
+            other.join()
+        assert mujoco.get_mju_user_warning() is not None
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+    assert ours == []
+    assert len(theirs) == 1
+
+
+# Level names
+
+
+@pytest.mark.parametrize(
+    ("name", "package"),
+    [
+        ("lab", "/Game/Levels/lab"),
+        ("/Game/Levels/lab", "/Game/Levels/lab"),
+        ("/game/Tests/My Level-2", "/Game/Tests/My Level-2"),
+        ("sub/lab", "/Game/Levels/sub/lab"),
+    ],
+)
+def test_level_names_expand_to_package_paths(name: str, package: str) -> None:
+    assert level_package(name) == package
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "",
+        "..",
+        "../lab",
+        "/Engine/lab",
+        "/Game/",
+        "/Game/../lab",
+        "a/../b",
+        "lab.json",
+        "a\\b",
+        "C:lab",
+        "lab\0",
+        "lab ",
+        ".lab",
+        "x" * 300,
+        "/Game/MuJoCoImports/robot/blueprint",
+    ],
+)
+def test_names_that_could_leave_the_content_root_are_refused(name: str) -> None:
+    with pytest.raises(ValueError, match="level name"):
+        level_package(name)
+
+
+@given(st.text(max_size=30) | st.text("/.\\~ab_- \0:", max_size=12).map(lambda text: f"/Game/{text}"))
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_no_level_file_lies_outside_the_content_root(tmp_path: Path, name: str) -> None:
+    content = ContentRoot(tmp_path)
+    try:
+        file = content.level_file(level_package(name))
+    except ValueError:
+        return
+    resolved = Path(os.path.normpath(file))
+    assert resolved == file
+    assert file.is_relative_to(content.root)
+    assert file.suffix == ".json"
+
+
+# Files
+
+
+def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "level.json"
+    write_atomic(path, b"old")
+
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(OSError, match="No space"):
+        write_atomic(path, b"new")
+
+    assert path.read_bytes() == b"old"
+    assert os.listdir(tmp_path) == ["level.json"]
+
+
+def test_the_record_is_readable_json(desk: Desk) -> None:
+    blueprint, _ = desk.content.import_xml(str(desk.write("bot.xml", BOT)))
+
+    record = json.loads(desk.content.snapshot_record(blueprint).read_text())
+
+    assert record["format"] == "urlab-blueprint"
+    assert record["source"] == str(desk.models / "bot.xml")
+    assert record["actuator_types"] == {"m": "motor"}

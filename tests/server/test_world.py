@@ -1,0 +1,810 @@
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from worlds import BALL_BODY, BOT, Desk, mjcf, write_obj
+
+from urlab_client.server.content import ContentRoot
+from urlab_client.server.refusal import Refusal
+from urlab_client.server.scene import compile_scene
+from urlab_client.server.world import ActorKind, ActorRow, World
+
+BALL = mjcf(BALL_BODY, model="ball")
+HALF = math.sqrt(0.5)
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Desk:
+    return Desk(tmp_path)
+
+
+@pytest.fixture
+def world(desk: Desk) -> World:
+    desk.world.create_level("lab")
+    return desk.world
+
+
+@pytest.fixture
+def bot(desk: Desk, world: World) -> str:
+    """Class path of the bot."""
+    return desk.blueprint("bot", BOT)
+
+
+@pytest.fixture
+def ball(desk: Desk, world: World) -> str:
+    """Class path of the ball."""
+    return desk.blueprint("ball", BALL)
+
+
+def refusal(call: Callable[..., object], *args: Any, **kwargs: Any) -> Refusal:
+    with pytest.raises(Refusal) as refused:
+        call(*args, **kwargs)
+    assert "\n" not in refused.value.message
+    return refused.value
+
+
+def names(rows: list[ActorRow]) -> list[str]:
+    return [row.name for row in rows]
+
+
+def row(world: World, key: str) -> ActorRow:
+    return next(row for row in world.list_actors() if key in (row.name, row.actor_id))
+
+
+def same_rotation(a: Any, b: Any) -> bool:
+    return abs(abs(sum(p * q for p, q in zip(a, b, strict=True))) - 1.0) < 1e-9
+
+
+# Blueprints
+
+
+def test_blueprints_are_listed_by_name(bot: str, ball: str, world: World) -> None:
+    rows = world.list_blueprints()
+
+    assert [item.short_name for item in rows] == ["ball", "bot"]
+    assert [item.class_path for item in rows] == [ball, bot]
+    assert rows[0].package_path == "/Game/MuJoCoImports/ball"
+    assert rows[0].parent_class == "MjArticulation"
+
+
+@pytest.mark.parametrize(
+    "path", ["/Game/MuJoCoImports/bot", "/Game/MuJoCoImports/bot.bot_C", "/game/mujocoimports/BOT.bot_c"]
+)
+def test_a_blueprint_is_named_by_package_or_class_path(bot: str, world: World, path: str) -> None:
+    assert world.spawn_actor(path, "a").blueprint_class_path == bot
+
+
+@pytest.mark.parametrize("path", ["bot", "/Game/MuJoCoImports/bot.bot", "/Game/MuJoCoImports/robot", "/Script/Pawn_C"])
+def test_other_paths_name_no_blueprint(bot: str, world: World, path: str) -> None:
+    refused = refusal(world.spawn_actor, path, "a")
+
+    assert refused.code == "spawn_failed"
+    assert "/Game/MuJoCoImports/bot" in refused.message
+
+
+def test_actors_take_the_new_model_of_a_reimport_at_the_next_play(desk: Desk, bot: str, world: World) -> None:
+    world.spawn_actor(bot, "a")
+    before = world.freeze()
+    desk.write("bot.xml", BOT.replace('mass="1"', 'mass="3"'))
+
+    world.import_xml("bot.xml", force_reimport=True)
+
+    def mass(actors: tuple[Any, ...]) -> float:
+        return float(compile_scene(actors).model.body_mass.sum())
+
+    assert mass(world.freeze()) == pytest.approx(3.5)
+    assert mass(before) == pytest.approx(1.5)
+
+
+def test_a_blueprint_in_use_is_not_destroyed(bot: str, world: World) -> None:
+    world.spawn_actor(bot, "a")
+
+    refused = refusal(world.destroy_asset, "/Game/MuJoCoImports/bot.bot")
+
+    assert refused.code == "destroy_asset_failed"
+    assert "bot" in refused.message
+    world.destroy_actor("a")
+    assert world.destroy_asset("/Game/MuJoCoImports/bot.bot")
+    assert not world.destroy_asset("/Game/MuJoCoImports/bot.bot")
+    assert world.list_blueprints() == []
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/Game/MuJoCoImports/bot.bot_C", "/Game/MuJoCoImports/bot.ball", "/Game/Levels/none.none", "/Game/../x.x", "bot"],
+)
+def test_what_is_no_asset_is_not_found(bot: str, world: World, path: str) -> None:
+    assert world.destroy_asset(path) is False
+
+
+# Levels
+
+
+def test_a_level_without_a_name_cannot_be_saved(desk: Desk) -> None:
+    assert desk.world.current_level() == "/Temp/Untitled_1"
+
+    refused = refusal(desk.world.save_level)
+
+    assert refused.code == "save_level_failed"
+    assert "create_level" in refused.message
+
+
+def test_a_level_is_created_once_unless_forced(desk: Desk, bot: str) -> None:
+    world = desk.world
+    world.spawn_actor(bot, "a")
+
+    assert refusal(world.create_level, "lab").code == "create_level_failed"
+    assert len(world.list_actors()) == 1
+    assert world.create_level("lab", force_overwrite=True) == "/Game/Levels/lab"
+    assert world.list_actors() == []
+    assert refusal(world.create_level, "").code == "missing_field"
+    assert refusal(world.create_level, "../lab").code == "create_level_failed"
+
+
+def test_levels_keep_what_was_saved(desk: Desk, bot: str, ball: str, world: World) -> None:
+    world.ensure_manager()
+    world.spawn_actor(bot, "a", location=(1, 2, 3), rotation_euler=(0, 0, 90))
+    world.spawn_actor(ball)
+    world.spawn_light("spot", "lamp", location=(0, 0, 4), rotation_euler=(0, -90, 0), intensity=123.456)
+    before = world.list_actors()
+    world.save_level()
+    world.spawn_actor(ball, "unsaved")
+    world.create_level("other")
+    assert world.list_actors() == []
+
+    assert world.load_level("lab") == world.current_level() == "/Game/Levels/lab"
+
+    assert world.list_actors() == before
+    assert World(ContentRoot(desk.saved)).load_level("/Game/Levels/lab")
+
+
+@pytest.mark.parametrize("name", ["nowhere", "/Engine/lab", "../lab"])
+def test_a_level_that_is_not_there_is_not_loaded(bot: str, world: World, name: str) -> None:
+    world.spawn_actor(bot, "a")
+
+    assert refusal(world.load_level, name).code == "load_level_failed"
+    assert names(world.list_actors()) == ["bot"]
+
+
+def test_destroying_the_open_level_opens_an_untitled_one(bot: str, world: World) -> None:
+    world.spawn_actor(bot, "a")
+    world.save_level()
+
+    assert world.destroy_asset("/Game/Levels/lab.lab")
+
+    assert world.current_level() == "/Temp/Untitled_1"
+    assert world.list_actors() == []
+    assert refusal(world.load_level, "lab").code == "load_level_failed"
+
+
+@pytest.mark.parametrize(
+    ("op", "code"),
+    [
+        (lambda world: world.create_level("new"), "create_level_failed"),
+        (lambda world: world.load_level("lab"), "load_level_failed"),
+        (lambda world: world.save_level(), "save_level_failed"),
+    ],
+)
+def test_levels_are_not_touched_during_play(world: World, op: Callable[[World], str], code: str) -> None:
+    world.pie_running = True
+
+    assert refusal(op, world).code == code
+
+
+def test_a_save_that_fails_leaves_the_level_as_it_was(
+    desk: Desk, bot: str, world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world.save_level()
+    world.spawn_actor(bot, "a")
+
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", fail)
+        refused = refusal(world.save_level)
+
+    assert refused.code == "save_level_failed"
+    assert "No space" in refused.message
+    world.load_level("lab")
+    assert world.list_actors() == []
+
+
+def test_a_content_root_can_be_moved(desk: Desk, bot: str, world: World, tmp_path: Path) -> None:
+    world.spawn_actor(bot, "a")
+    world.save_level()
+    shutil.rmtree(desk.models)
+    moved = desk.saved.rename(tmp_path / "elsewhere")
+
+    fresh = World(ContentRoot(moved))
+    fresh.load_level("lab")
+
+    assert compile_scene(fresh.freeze()).model.nu == 1
+
+
+def test_a_level_file_with_its_models_can_be_moved(tmp_path: Path) -> None:
+    desk = Desk(tmp_path / "here")
+    bot = desk.blueprint("bot", BOT)
+    desk.world.create_level("lab")
+    desk.world.spawn_actor(bot, "a")
+    desk.world.save_level()
+    shutil.rmtree(desk.saved / "MuJoCoImports")
+    (tmp_path / "here").rename(tmp_path / "there")
+
+    fresh = World(ContentRoot(tmp_path / "fresh"))
+    fresh.load_level_file(tmp_path / "there" / "saved" / "Levels" / "lab.json")
+
+    assert names(fresh.list_actors()) == ["bot"]
+    assert compile_scene(fresh.freeze()).model.nu == 1
+
+
+def test_a_level_file_brings_its_snapshot_along(desk: Desk, bot: str, world: World, tmp_path: Path) -> None:
+    world.spawn_actor(bot, "a")
+    world.save_level()
+    shutil.rmtree(desk.models)
+
+    fresh = World(ContentRoot(tmp_path / "fresh"))
+    fresh.load_level_file(desk.saved / "Levels" / "lab.json")
+    shutil.rmtree(desk.saved)
+
+    assert compile_scene(fresh.freeze()).model.nu == 1
+    assert [item.short_name for item in fresh.list_blueprints()] == ["bot"]
+
+
+def test_a_level_file_is_saved_where_it_was_opened(desk: Desk, bot: str, world: World, tmp_path: Path) -> None:
+    world.spawn_actor(bot, "a")
+    world.save_level()
+    file = tmp_path / "elsewhere" / "my level.json"
+    file.parent.mkdir()
+    text = (desk.saved / "Levels" / "lab.json").read_text().replace("../", "../saved/").replace("../saved/../", "../")
+    file.write_text(text.replace("../models", "../models").replace("../saved/models", "../models"))
+    fresh = World(ContentRoot(tmp_path / "fresh"))
+
+    assert fresh.load_level_file(file) == "/Game/Levels/my_level"
+    fresh.set_actor_transform("a", location=(7, 0, 0))
+    fresh.save_level()
+    fresh.set_actor_transform("a", location=(8, 0, 0))
+    fresh.load_level("my_level")
+
+    assert row(fresh, "a").location == (7, 0, 0)
+    assert json.loads(file.read_text())["actors"][0]["location"] == [7.0, 0.0, 0.0]
+    assert not (tmp_path / "fresh" / "Levels").exists()
+    assert refusal(fresh.create_level, "my_level", force_overwrite=True).code == "create_level_failed"
+    assert refusal(fresh.destroy_asset, "/Game/Levels/my_level.my_level").code == "destroy_asset_failed"
+    assert file.exists()
+
+
+def test_the_levels_own_model_wins_when_the_level_was_named_by_the_user(
+    bot: str, world: World, desk: Desk, tmp_path: Path
+) -> None:
+    world.spawn_actor(bot, "a")
+    world.save_level()
+    other = Desk(tmp_path / "other")
+    other.blueprint("bot", BALL.replace('model="ball"', 'model="impostor"'))
+
+    other.world.load_level_file(desk.saved / "Levels" / "lab.json")
+
+    assert compile_scene(other.world.freeze()).model.nu == 1
+
+
+def test_bundled_models_in_a_level_are_found_on_any_machine(desk: Desk, world: World, tmp_path: Path) -> None:
+    world.import_xml("ball")
+    world.spawn_actor("/Game/MuJoCoImports/ball", "b")
+    world.save_level()
+    level = tmp_path / "level.json"
+    text = (desk.saved / "Levels" / "lab.json").read_text()
+    level.write_text(text)
+    shutil.rmtree(desk.saved)
+
+    fresh = World(ContentRoot(tmp_path / "fresh"))
+    fresh.load_level_file(level)
+
+    assert '"bundled:ball"' in text
+    assert names(fresh.list_actors()) == ["ball"]
+
+
+HEAD = {"format": "urlab-level", "version": 1, "blueprints": {}}
+BOX = {"name": "crate", "kind": "static_mesh", "mesh": {"shape": "box", "size": [0.1, 0.1, 0.1]}}
+
+
+def load(desk: Desk, level: object) -> World:
+    file = desk.saved / "Levels" / "hand.json"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(level if isinstance(level, str) else json.dumps(level))
+    desk.world.load_level("hand")
+    return desk.world
+
+
+@pytest.mark.parametrize(
+    ("level", "text"),
+    [
+        ("{", "is no level"),
+        ("[]", "is no level"),
+        ('{"format": "other"}', 'it lacks "format": "urlab-level"'),
+        (HEAD | {"version": 2, "actors": []}, "version 2"),
+        (HEAD, "actors"),
+        (HEAD | {"actors": [BOX | {"colour": "red"}]}, "colour"),
+        (HEAD | {"actors": [BOX | {"location": [0, 0]}]}, "$.actors[0].location"),
+        (HEAD | {"actors": [BOX, BOX]}, "two actors are called 'crate'"),
+        (HEAD | {"actors": [BOX | {"name": "a crate"}]}, "letters, digits and underscores"),
+        (HEAD | {"actors": [BOX | {"rotation_quat": [0, 0, 0, 0]}]}, "no rotation"),
+        (HEAD | {"actors": [BOX | {"scale": [1, 0, 1]}]}, "scale"),
+        (HEAD | {"actors": [BOX | {"parent": "nobody"}]}, "attached to 'nobody'"),
+        (HEAD | {"actors": [BOX | {"parent": "crate"}]}, "attached to itself"),
+        (HEAD | {"actors": [{"name": "r", "kind": "articulation", "blueprint": "robot"}]}, "'robot' is not imported"),
+        (HEAD | {"actors": [{"name": "r", "kind": "articulation"}]}, "needs a 'blueprint'"),
+        (HEAD | {"actors": [BOX | {"kind": "light"}]}, "needs a 'light'"),
+        (HEAD | {"actors": [BOX | {"mesh": {"shape": "box", "size": [1]}}]}, "3 positive numbers"),
+        (HEAD | {"actors": [BOX | {"mesh": {"shape": "sphere", "size": [-1]}}]}, "positive"),
+        (HEAD | {"actors": [BOX | {"mesh": {"shape": "file"}}]}, "'file'"),
+        (HEAD | {"actors": [BOX | {"mesh": {"shape": "plane", "size": [1, 1]}, "quick_convert": {}}]}, "static"),
+        (HEAD | {"actors": [BOX | {"quick_convert": {"complex_mesh": True}}]}, "convex decomposition"),
+        (HEAD | {"actors": [{"name": "m", "kind": "manager", "quick_convert": {}}]}, "only a static mesh"),
+    ],
+)
+def test_a_level_that_makes_no_sense_is_refused_with_the_place(desk: Desk, level: object, text: str) -> None:
+    desk.world.create_level("lab")
+
+    refused = refusal(load, desk, level)
+
+    assert refused.code == "load_level_failed"
+    assert text in refused.message
+    assert desk.world.current_level() == "/Game/Levels/lab"
+
+
+def test_a_level_brings_meshes_which_no_op_can(desk: Desk) -> None:
+    write_obj(desk.saved / "Levels" / "meshes" / "rock.obj", 0.5)
+    rock = {
+        "name": "rock",
+        "kind": "static_mesh",
+        "actor_id": "rock-1",
+        "mesh": {"shape": "file", "file": "meshes/rock.obj"},
+        "parent": "crate",
+    }
+    world = load(desk, HEAD | {"actors": [BOX | {"location": [1, 2, 3], "scale": [1, 2, 3]}, rock]})
+
+    rows = world.list_actors()
+    assert [item.class_name for item in rows] == ["StaticMeshActor", "StaticMeshActor"]
+    assert all(item.is_static_mesh_actor and not item.is_articulation and not item.is_light for item in rows)
+    assert rows[1].tags == ("URLab.ActorId=rock-1",)
+    box = world.get_actor_bounds("crate", components_only=True)
+    assert box.center == pytest.approx((1, 2, 3))
+    assert box.extents == pytest.approx((0.1, 0.2, 0.3))
+    rock_box = world.get_actor_bounds("rock-1")  # along the mesh's principal axes, so somewhat large
+    assert all(
+        -0.5 < low <= 0.001 and 0.499 <= high < 1.0 for low, high in zip(rock_box.min, rock_box.max, strict=True)
+    )
+    tree = world.actor_hierarchy("crate")
+    assert [child.name for child in tree.children] == ["rock"]
+
+    world.save_level()
+    saved = json.loads((desk.saved / "Levels" / "hand.json").read_text())
+    assert saved["actors"][1]["mesh"]["file"] == "meshes/rock.obj"
+
+
+identifiers = st.text("abcXYZ_09ü", min_size=1, max_size=8)
+numbers = st.floats(-1e6, 1e6)
+positions = st.tuples(numbers, numbers, numbers)
+
+
+@given(
+    st.lists(st.tuples(identifiers, positions, st.tuples(*[st.floats(-360, 360)] * 3)), max_size=5),
+    st.lists(st.tuples(st.sampled_from(["directional", "POINT", "Spot"]), st.text(max_size=8), positions), max_size=3),
+)
+@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_level_comes_back_as_it_was(
+    desk: Desk, robots: list[tuple[str, Any, Any]], lights: list[tuple[str, str, Any]]
+) -> None:
+    world = desk.world
+    world.create_level("any", force_overwrite=True)
+    bot = desk.blueprint("bot", BOT)
+    for actor_id, location, euler in robots:
+        world.spawn_actor(bot, f"bot_{actor_id}", location=location, rotation_euler=euler)
+    for kind, actor_id, location in lights:
+        world.spawn_light(kind, actor_id, location=location)
+    before = world.snapshot()
+    world.save_level()
+
+    fresh = World(ContentRoot(desk.saved))
+    fresh.load_level("any")
+
+    assert fresh.snapshot() == before
+
+
+# Spawning
+
+
+def test_the_model_name_names_actors(desk: Desk, bot: str, world: World) -> None:
+    nameless = desk.blueprint("my-file", mjcf(BALL_BODY))
+    spaced = desk.blueprint("spaced", mjcf(BALL_BODY, model="my robot!"))
+
+    placed = [world.spawn_actor(path).actor_name for path in (bot, bot, nameless, spaced, bot)]
+
+    assert placed == ["bot", "bot_1", "my_file", "my_robot_", "bot_2"]
+    world.destroy_actor("bot_1")
+    assert world.spawn_actor(bot).actor_name == "bot_1"
+
+
+def test_actors_can_be_named_as_the_plugin_does(tmp_path: Path) -> None:
+    desk = Desk(tmp_path, actor_names="plugin")
+    bot = desk.blueprint("robot", BOT)
+
+    assert [desk.world.spawn_actor(bot).actor_name for _ in range(3)] == ["robot_C_0", "robot_C_1", "robot_C_2"]
+    assert desk.world.duplicate_actor("robot_C_0", "d").actor_name == "robot_C_3"
+
+
+def test_names_whose_compiled_names_would_repeat_are_passed_over(desk: Desk, world: World) -> None:
+    tricky = desk.blueprint(
+        "tricky", mjcf('<body name="base"><geom size="0.1"/><body name="1_base"><geom size="0.1"/></body></body>')
+    )
+
+    placed = [world.spawn_actor(tricky).actor_name for _ in range(3)]
+
+    assert placed == ["tricky", "tricky_2", "tricky_3"]  # tricky_1 + base would be tricky + 1_base
+    assert compile_scene(world.freeze()).model.nbody == 7
+
+
+def test_an_id_is_placed_once_and_moved_from_then_on(bot: str, world: World) -> None:
+    first = world.spawn_actor(bot, "a", location=(1, 2, 3), rotation_euler=(0, 0, 90))
+    second = world.spawn_actor(bot, "a", location=(4, 5, 6))
+
+    assert (first.was_existing, second.was_existing) == (False, True)
+    assert second.actor_name == first.actor_name
+    assert second.location == (4, 5, 6)
+    assert [(item.actor_id, item.location) for item in world.list_actors()] == [("a", (4, 5, 6))]
+    assert row(world, "a").rotation_quat == (0, 0, 0, 1)
+    assert first.actor_path == "/Game/Levels/lab.lab:PersistentLevel.bot"
+
+
+def test_an_id_of_another_class_is_refused(bot: str, ball: str, world: World) -> None:
+    world.spawn_actor(bot, "a")
+    world.spawn_light("point", "lamp")
+
+    assert refusal(world.spawn_actor, ball, "a").code == "spawn_failed"
+    assert refusal(world.spawn_actor, bot, "LAMP").code == "spawn_failed"  # tags know no letter case
+    assert not world.spawn_actor(bot, "A").was_existing  # ids of articulations do
+    assert not world.spawn_actor(ball, "bot").was_existing  # an object name is no id
+
+
+def test_rotations_are_understood_in_mujocos_frame(bot: str, world: World) -> None:
+    world.spawn_actor(bot, "quat", rotation_quat=(0, 0, 2, 2))
+    world.spawn_actor(bot, "euler", rotation_euler=(0, 0, 90))
+    rolled = world.spawn_actor(bot, "rolled", rotation_euler=(90, 0, 0))
+    both = world.spawn_actor(bot, "both", rotation_quat=(0, 0, 0, 1), rotation_euler=(90, 0, 0))
+
+    assert same_rotation(row(world, "quat").rotation_quat, row(world, "euler").rotation_quat)
+    assert same_rotation(row(world, "rolled").rotation_quat, (-HALF, 0, 0, HALF))
+    assert same_rotation(rolled.rotation_quat, (-HALF, 0, 0, HALF))
+    assert both.rotation_quat == row(world, "both").rotation_quat == (0, 0, 0, 1)
+
+
+@pytest.mark.parametrize(
+    ("pose", "text"),
+    [
+        ({"scale": (2.0, 2.0, 2.0)}, "scale"),
+        ({"rotation_quat": (0.0, 0.0, 0.0, 0.0)}, "rotation"),
+        ({"rotation_quat": (math.nan, 0.0, 0.0, 1.0)}, "rotation"),
+        ({"rotation_euler": (math.inf, 0.0, 0.0)}, "rotation_euler"),
+        ({"location": (math.nan, 0.0, 0.0)}, "location"),
+    ],
+)
+def test_a_pose_that_is_none_is_refused(bot: str, world: World, pose: dict[str, Any], text: str) -> None:
+    refused = refusal(world.spawn_actor, bot, "a", **pose)
+
+    assert refused.code == "spawn_failed"
+    assert text in refused.message
+    assert world.list_actors() == []
+
+
+def test_what_is_missing_is_named(bot: str, world: World) -> None:
+    assert refusal(world.spawn_actor, "").code == "missing_field"
+    assert refusal(world.spawn_grid, bot, "", 1, 1).code == "missing_field"
+    for op in (world.destroy_actor, world.set_actor_transform, world.get_actor_bounds, world.select_actor):
+        assert refusal(op, "").code == "missing_field"
+    assert refusal(world.duplicate_actor, "", "b").code == "missing_field"
+    assert refusal(world.actor_hierarchy, "").code == "missing_field"
+    assert refusal(world.destroy_asset, "").code == "missing_field"
+    assert refusal(world.load_level, "").code == "missing_field"
+
+
+def test_a_grid_is_placed_x_first(ball: str, world: World) -> None:
+    placed = world.spawn_grid(ball, "g", 2, 3, spacing=(1, 2, 9), origin=(10, 20, 30))
+
+    assert [cell.actor_id for cell in placed] == ["g_0_0", "g_1_0", "g_0_1", "g_1_1", "g_0_2", "g_1_2"]
+    assert placed[3].location == (11, 22, 30)
+    assert names(world.list_actors()) == ["ball", "ball_1", "ball_2", "ball_3", "ball_4", "ball_5"]
+    again = world.spawn_grid(ball, "g", 3, 1)
+    assert [cell.was_existing for cell in again] == [True, True, False]
+    assert len(world.list_actors()) == 7
+
+
+def test_a_grid_that_cannot_be_placed_whole_is_not_placed(bot: str, ball: str, world: World) -> None:
+    world.spawn_actor(bot, "g_1_1")
+
+    assert refusal(world.spawn_grid, ball, "g", 2, 2).code == "spawn_failed"
+    assert refusal(world.spawn_grid, ball, "g", 2, 2, spacing=(math.inf, 1, 0)).code == "spawn_failed"
+    assert names(world.list_actors()) == ["bot"]
+
+
+@pytest.mark.parametrize(
+    ("counts", "code"),
+    [
+        ((0, 1), "invalid_count"),
+        ((1, -1), "invalid_count"),
+        ((33, 32), "too_many_cells"),
+        ((2**40, 2**40), "too_many_cells"),
+    ],
+)
+def test_a_grid_has_limits(ball: str, world: World, counts: tuple[int, int], code: str) -> None:
+    assert refusal(world.spawn_grid, ball, "g", *counts).code == code
+
+
+def test_the_largest_grid_fits(ball: str, world: World) -> None:
+    assert len(world.spawn_grid(ball, "g", 32, 32)) == 1024
+
+
+def test_lights_are_added_each_time(world: World) -> None:
+    first = world.spawn_light("SPOT", "lamp", location=(1, 2, 3), rotation_euler=(1, -30, 45), color=(0.1, 0.2, 0.3))
+    second = world.spawn_light("spot", "lamp")
+
+    assert (first.kind, first.actor_name, second.actor_name) == ("spot", "SpotLight_0", "SpotLight_1")
+    assert first.color == pytest.approx((0.1, 0.2, 0.3))
+    assert first.color[0] == 0.10000000149011612  # single precision, as the plugin echoes it
+    assert first.rotation_euler == (1, -30, 45)
+    listed = world.list_actors()
+    assert [item.label for item in listed] == ["SpotLight", "SpotLight2"]
+    assert all(item.is_light and item.tags == ("URLab.ActorId=lamp",) for item in listed)
+    assert refusal(world.spawn_light, "sun").code == "spawn_failed"
+    assert refusal(world.spawn_light, "point", intensity=math.nan).code == "spawn_failed"
+
+
+def test_there_is_one_manager(world: World) -> None:
+    assert not world.has_manager
+    first, existed = world.ensure_manager()
+    second, existed_again = world.ensure_manager()
+
+    assert (existed, existed_again) == (False, True)
+    assert first.name == second.name
+    assert row(world, first.name).class_name == "AMjManager"
+    assert world.has_manager
+
+
+# Editing
+
+
+def test_a_transform_changes_the_parts_it_names(bot: str, world: World) -> None:
+    world.spawn_actor(bot, "a", location=(1, 2, 3), rotation_quat=(0, 0, HALF, HALF))
+
+    world.set_actor_transform("a", location=(4, 5, 6))
+    assert row(world, "a").location == (4, 5, 6)
+    assert same_rotation(row(world, "a").rotation_quat, (0, 0, HALF, HALF))
+    world.set_actor_transform("bot", rotation_quat=(0, 3, 0, 0))
+    assert row(world, "a").location == (4, 5, 6)
+    assert row(world, "a").rotation_quat == (0, 1, 0, 0)
+    assert world.set_actor_transform("a").name == "bot"
+
+    code = "set_actor_transform_failed"
+    assert refusal(world.set_actor_transform, "nobody").code == code
+    assert refusal(world.set_actor_transform, "a", rotation_quat=(0, 0, 0, 0)).code == code
+    assert refusal(world.set_actor_transform, "a", location=(0, math.nan, 0)).code == code
+
+
+def test_the_first_actor_with_the_id_or_name_is_meant(bot: str, world: World) -> None:
+    world.spawn_actor(bot, "bot_1")
+    world.spawn_actor(bot, "other")  # its object name is bot_1
+
+    assert world.set_actor_transform("bot_1").name == "bot"
+    assert world.set_actor_transform("other").name == "bot_1"
+    assert world.actor("bot_1").name == "bot"  # type: ignore[union-attr]  # by id
+    assert world.actor("bot_1", by_name=True).actor_id == "other"  # type: ignore[union-attr]
+    assert world.actor("bot") is None
+
+
+def test_a_copy_has_the_rotation_of_its_source_and_stands_beside_it(bot: str, world: World) -> None:
+    world.spawn_actor(bot, "a", location=(1, 2, 3), rotation_quat=(0, 0, HALF, HALF))
+
+    copy = world.duplicate_actor("a", "b")
+
+    assert copy.location == (2, 2, 3)
+    assert same_rotation(row(world, "b").rotation_quat, (0, 0, HALF, HALF))
+    assert copy.blueprint_class_path == bot
+    assert world.duplicate_actor("a", "b", location=(9, 9, 9)).was_existing
+    assert row(world, "b").location == (9, 9, 9)
+    assert len(world.list_actors()) == 2
+
+
+def test_lights_can_be_copied_and_managers_cannot(bot: str, world: World) -> None:
+    world.spawn_light("point", "lamp", color=(1, 0, 0))
+    world.spawn_actor(bot, "a")
+    manager, _ = world.ensure_manager()
+
+    copy = world.duplicate_actor("lamp", "lamp2")
+
+    assert row(world, "lamp2").is_light
+    assert copy.actor_name == "PointLight_1"
+    assert refusal(world.duplicate_actor, "lamp", "a").code == "duplicate_failed"
+    assert refusal(world.duplicate_actor, manager.name, "m").code == "duplicate_failed"
+    assert refusal(world.duplicate_actor, "nobody", "n").code == "duplicate_failed"
+
+
+def test_a_destroyed_actor_is_gone(desk: Desk, bot: str) -> None:
+    world = load(desk, HEAD | {"actors": [BOX, BOX | {"name": "lid", "parent": "crate"}]})
+    world.select_actor("crate")
+
+    world.destroy_actor("crate")
+
+    assert names(world.list_actors()) == ["lid"]
+    assert world.actor("lid", by_name=True).parent == ""  # type: ignore[union-attr]
+    assert world.selected == ""
+    assert refusal(world.destroy_actor, "crate").code == "destroy_failed"
+
+
+def test_one_actor_is_selected(bot: str, world: World) -> None:
+    world.spawn_actor(bot, "a")
+    world.spawn_actor(bot, "b")
+
+    world.select_actor("a")
+    assert world.select_actor("b").name == world.selected == "bot_1"
+    assert refusal(world.select_actor, "c").code == "select_failed"
+
+
+# Looking
+
+
+def test_filters_narrow_down_together_and_know_no_letter_case(bot: str, ball: str, world: World) -> None:
+    world.spawn_actor(bot, "a")
+    world.spawn_actor(ball, "b")
+    world.spawn_light("point", "lamp")
+    world.ensure_manager()
+
+    def found(**filters: str) -> list[str]:
+        return names(world.find_actors(**filters)[0])
+
+    assert found() == ["bot", "ball", "PointLight_0", "AMjManager_0"]
+    for robots in ("AMjArticulation", "mjarticulation", "Pawn", "apawn"):
+        assert found(class_filter=robots) == ["bot", "ball"]
+    assert found(class_filter="BOT_c") == ["bot"]
+    assert found(class_filter="Light") == ["PointLight_0"]
+    assert found(class_filter="Actor", name_prefix="B") == ["bot", "ball"]
+    assert found(tag="urlab.actorid=LAMP") == ["PointLight_0"]
+    assert found(tag="urlab.actorid=a") == []
+    assert found(class_filter="Pawn", tag="urlab.actorid=lamp") == []
+    assert found(class_filter="MjManager") == []
+    assert found(class_filter="AMjManager") == ["AMjManager_0"]
+
+
+def test_play_shows_the_level_as_it_was_at_its_start(bot: str, ball: str, world: World) -> None:
+    world.spawn_actor(bot, "a")
+    editor = world.snapshot()
+    assert editor[0].names is not None
+    assert editor[0].names.joints == ("root", "j")
+    world.freeze()
+    world.pie_running = True
+    world.spawn_actor(ball, "b")
+    world.set_actor_transform("a", location=(9, 0, 0))
+
+    play = world.snapshot()
+
+    assert [item.class_name for item in play] == ["bot_C", "MjReplayManager"]
+    assert play[0].location == (0, 0, 0)
+    assert play[0].names is not None
+    assert play[0].names.joints == ("bot_root", "bot_j")
+    assert play[0].names.actuators == ("bot_m",)
+    assert play[0].names.sensors == ("bot_s",)
+    assert play[0].names.cameras == ("cam",)
+    assert names(world.list_actors()) == ["bot", "ball"]
+    rows, in_play = world.find_actors(class_filter="Pawn", in_pie=True)
+    assert (names(rows), in_play) == (["bot"], True)
+    assert (names(world.find_actors()[0]), world.find_actors()[1]) == (["bot", "ball"], False)
+    assert world.actor_hierarchy("bot").location == (0, 0, 0)
+    assert refusal(world.actor_hierarchy, "ball").code == "actor_hierarchy_failed"
+    assert world.shown_level() == "/Game/Levels/UEDPIE_0_lab"
+    assert world.current_level() == "/Game/Levels/lab"
+
+    world.pie_running = False
+    assert names(world.snapshot()) == ["bot", "ball"]
+    assert world.find_actors(in_pie=True)[1] is False
+    assert world.shown_level() == "/Game/Levels/lab"
+
+
+def test_bounds_hold_the_geoms_at_the_authored_pose(desk: Desk, world: World) -> None:
+    text = mjcf(
+        '<geom name="floor" type="plane" size="1 1 1"/>'
+        '<body name="b" pos="0 0 1"><freejoint/><geom type="box" size="0.1 0.2 0.3"/>'
+        '<geom type="sphere" size="0.1" pos="1 0 0" contype="0" conaffinity="0"/></body>'
+    )
+    world.spawn_actor(desk.blueprint("boxed", text), "a", location=(10, 0, 0), rotation_euler=(0, 0, 90))
+
+    solid = world.get_actor_bounds("a")
+    every = world.get_actor_bounds("a", components_only=True)
+
+    assert solid.min == pytest.approx((9.8, -0.1, 0.7))
+    assert solid.max == pytest.approx((10.2, 0.1, 1.3))
+    assert solid.center == pytest.approx((10, 0, 1))
+    assert solid.extents == pytest.approx((0.2, 0.1, 0.3))
+    assert every.max == pytest.approx((10.2, 1.1, 1.3))
+    assert refusal(world.get_actor_bounds, "b").code == "get_actor_bounds_failed"
+
+
+def test_bounds_of_meshes_follow_the_mesh(desk: Desk, world: World) -> None:
+    write_obj(desk.models / "part.obj", 0.4)
+    text = mjcf('<body name="b"><geom type="mesh" mesh="part"/></body>', head='<asset><mesh file="part.obj"/></asset>')
+    world.spawn_actor(desk.blueprint("meshy", text), "a", location=(0, 0, 2))
+
+    bounds = world.get_actor_bounds("a")
+
+    # MuJoCo's box is aligned with the mesh's principal axes, so it is somewhat larger than the tetrahedron.
+    assert all(low <= 0.001 for low in bounds.min[:2])
+    assert all(high >= 0.399 for high in bounds.max[:2])
+    assert bounds.max[2] < 2.7
+
+
+def test_lights_managers_and_bare_models_have_no_bounds(desk: Desk, world: World) -> None:
+    world.spawn_light(actor_id="lamp")
+    manager, _ = world.ensure_manager()
+    world.spawn_actor(desk.blueprint("floor", mjcf('<geom type="plane" size="1 1 1"/>')), "floor")
+
+    for key in ("lamp", manager.name, "floor"):
+        assert world.get_actor_bounds(key).extents == (0, 0, 0)
+
+
+# Quick Convert
+
+
+def test_a_mesh_is_converted_with_the_settings_of_the_last_call(desk: Desk) -> None:
+    world = load(desk, HEAD | {"actors": [BOX]})
+
+    world.add_quick_convert("crate", static=True, coacd_threshold=0.1, friction=(0.5, 0.1, 0.1))
+    settings_ = row(world, "crate").quick_convert
+    assert settings_ is not None
+    assert (settings_.static, settings_.friction) == (True, (0.5, 0.1, 0.1))
+    assert settings_.coacd_threshold == 0.10000000149011612
+    world.add_quick_convert("crate")
+    again = row(world, "crate").quick_convert
+    assert again is not None
+    assert (again.static, again.friction) == (False, (1, 1, 1))
+    world.remove_quick_convert("crate")
+    assert row(world, "crate").quick_convert is None
+    assert refusal(world.remove_quick_convert, "crate").code == "remove_quick_convert_failed"
+
+
+def test_only_meshes_are_converted(desk: Desk, bot: str) -> None:
+    plane = BOX | {"name": "ground", "mesh": {"shape": "plane", "size": [1, 1]}}
+    world = load(desk, HEAD | {"actors": [BOX, plane]})
+    world.spawn_actor(bot, "a")
+    code = "add_quick_convert_failed"
+
+    assert refusal(world.add_quick_convert, "a").code == code
+    assert refusal(world.add_quick_convert, "nobody").code == code
+    assert refusal(world.add_quick_convert, "crate", complex_mesh=True).code == code
+    assert refusal(world.add_quick_convert, "crate", friction=(math.nan, 0, 0)).code == code
+    assert refusal(world.add_quick_convert, "ground").code == code
+    assert world.add_quick_convert("ground", static=True).quick_convert is not None
+
+
+def test_play_gets_the_actors_in_spawn_order(bot: str, ball: str, world: World) -> None:
+    for path in (ball, bot, ball):
+        world.spawn_actor(path)
+
+    frozen = world.freeze()
+
+    assert [actor.kind for actor in frozen] == [ActorKind.ARTICULATION] * 3 + [ActorKind.REPLAY_MANAGER]
+    model = compile_scene(frozen).model
+    assert [model.body(index).name for index in range(1, model.nbody)] == [
+        "ball_ball",
+        "bot_base",
+        "bot_arm",
+        "ball_1_ball",
+    ]
+    assert model.nq == 7 + 8 + 7
+    assert mujoco.mj_version() > 0
