@@ -1,0 +1,78 @@
+"""What `import urlab_client` costs and needs: no MuJoCo, no OpenGL, no socket, no thread."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+
+REPORT = """
+import json, sys, threading
+opened = []
+sys.addaudithook(lambda event, args: opened.append(event) if event in ("socket.__new__", "subprocess.Popen") else None)
+import {module}
+from gc import get_objects
+zmq = sys.modules.get("zmq")
+print(json.dumps({{
+    "modules": sorted(name.partition(".")[0] for name in sys.modules),
+    "own": sorted(name for name in sys.modules if name.startswith("urlab_client")),
+    "opened": opened,
+    "threads": threading.active_count(),
+    "contexts": 0 if zmq is None else sum(isinstance(thing, zmq.Context) for thing in get_objects()),
+}}))
+"""
+
+
+def after_import(module: str, **environment: str) -> dict[str, Any]:
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", REPORT.format(module=module)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+        env={**os.environ, **environment},
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("module", ["urlab_client", "urlab_client.aio", "urlab_client.enums", "urlab_client.cli"])
+def test_an_import_is_light_and_silent(module: str) -> None:
+    # MuJoCo's own import fails with such a value: so the clients need neither it nor OpenGL until they get a model.
+    report = after_import(module, MUJOCO_GL="garbage")
+    assert not {"mujoco", "OpenGL", "glfw", "matplotlib", "rich", "gymnasium"} & set(report["modules"])
+    assert not [name for name in report["own"] if name.startswith("urlab_client.server")]
+    assert (report["opened"], report["contexts"], report["threads"]) == ([], 0, 1)
+
+
+def test_the_protocol_alone_needs_no_transport() -> None:
+    report = after_import("urlab_client.protocol.registry, urlab_client.protocol.codec, urlab_client.protocol.rows")
+    assert "urlab_client.protocol.registry" in report["own"]
+
+
+def test_the_public_names_are_the_documented_ones() -> None:
+    import urlab_client
+    import urlab_client.aio
+
+    for package in (urlab_client, urlab_client.aio):
+        assert len(set(package.__all__)) == len(package.__all__)
+        for name in package.__all__:
+            assert getattr(package, name) is not None
+        assert not [name for name in package.__all__ if name.startswith("_") and name != "__version__"]
+    # Two flavours, one set of names for what a client hands out.
+    shared = set(urlab_client.aio.__all__)
+    assert shared <= set(urlab_client.__all__)
+
+
+def test_the_version_is_that_of_the_distribution() -> None:
+    from importlib.metadata import version
+
+    import urlab_client
+
+    assert urlab_client.__version__ == version("urlab-client")
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        _ = urlab_client.nonsense  # type: ignore[attr-defined]

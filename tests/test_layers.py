@@ -1,0 +1,133 @@
+"""Imports between the layers point one way, whether they are made at import, in a function or for type checkers."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / "src" / "urlab_client"
+
+# Layer -> the layers it may import besides itself. The empty name is the public package, `urlab_client` itself.
+ALLOWED: dict[str, frozenset[str]] = {
+    "protocol": frozenset(),
+    "aio": frozenset({"protocol"}),
+    "sync": frozenset({"aio", "protocol"}),
+    "server": frozenset({"protocol"}),
+    "enums": frozenset({"protocol"}),
+    "": frozenset({"sync", "enums", "protocol"}),
+    "cli": frozenset({"", "aio", "enums", "protocol", "server", "sync"}),
+    "__main__": frozenset({"cli"}),
+}
+
+# `protocol` is pure: it turns values into bytes and back, and leaves waiting, threads and sockets to others.
+NO_IO = frozenset(
+    {"anyio", "asyncio", "concurrent", "multiprocessing", "selectors", "socket", "subprocess", "threading", "zmq"}
+)
+
+
+def layer_of(file: Path, package: Path) -> str:
+    top = file.relative_to(package).parts[0]
+    return "" if top == "__init__.py" else top.removesuffix(".py")
+
+
+def imports(tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """Yield line and name of each import: `m` for `import m`, `m.n` for `from m import n`; `n` may be a module."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            start = "." * node.level + (f"{node.module}." if node.module else "")
+            yield from ((node.lineno, f"{start}{alias.name}") for alias in node.names)
+
+
+def target_of(imported: str, package: Path) -> str | None:
+    """Return the layer that an imported name belongs to, None for another distribution's."""
+    name, *rest = imported.split(".")
+    if name != package.name:
+        return None
+    top = rest[0] if rest else ""
+    return top if (package / top).is_dir() or (package / f"{top}.py").is_file() else ""
+
+
+def violations(package: Path) -> list[str]:
+    found: list[str] = []
+    for file in sorted(package.rglob("*.py")):
+        layer = layer_of(file, package)
+        where = file.relative_to(package.parent).as_posix()
+        if layer not in ALLOWED:
+            found.append(f"{where}: {layer} is not a layer; say in {Path(__file__).name} what it may import")
+            continue
+        for line, imported in imports(ast.parse(file.read_text(encoding="utf-8"), str(file))):
+            target = target_of(imported, package)
+            if imported.startswith("."):
+                found.append(f"{where}:{line}: relative import of {imported}")
+            elif target is None:
+                if layer == "protocol" and imported.partition(".")[0] in NO_IO:
+                    found.append(f"{where}:{line}: protocol imports {imported}, but does no I/O")
+            elif target != layer and target not in ALLOWED[layer]:
+                found.append(f"{where}:{line}: {layer or package.name} imports {imported}")
+    return found
+
+
+def test_imports_point_one_way() -> None:
+    assert violations(PACKAGE) == []
+
+
+def test_every_layer_with_a_rule_exists() -> None:
+    assert {layer_of(file, PACKAGE) for file in PACKAGE.rglob("*.py")} == ALLOWED.keys()
+
+
+@pytest.mark.parametrize(
+    ("file", "source", "complaint"),
+    [
+        (
+            "aio/client.py",
+            "import os\nfrom urlab_client.sync import x\n",
+            "aio/client.py:2: aio imports urlab_client.sync.x",
+        ),
+        ("aio/client.py", "from urlab_client import sync\n", "aio/client.py:1: aio imports urlab_client.sync"),
+        (
+            "aio/client.py",
+            "from urlab_client import URLabClient\n",
+            "aio/client.py:1: aio imports urlab_client.URLabClient",
+        ),
+        (
+            "aio/client.py",
+            "import urlab_client.server.world as w\n",
+            "aio/client.py:1: aio imports urlab_client.server.world",
+        ),
+        ("sync/a.py", "from urlab_client.server import x\n", "sync/a.py:1: sync imports urlab_client.server.x"),
+        (
+            "server/a.py",
+            "def f():\n    from urlab_client.aio import x\n",
+            "server/a.py:2: server imports urlab_client.aio.x",
+        ),
+        (
+            "protocol/deep/a.py",
+            "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from urlab_client.aio.client import C\n",
+            "protocol/deep/a.py:3: protocol imports urlab_client.aio.client.C",
+        ),
+        ("protocol/a.py", "import asyncio.events\n", "protocol/a.py:1: protocol imports asyncio.events, but"),
+        ("protocol/a.py", "from zmq import Socket\n", "protocol/a.py:1: protocol imports zmq.Socket, but does no I/O"),
+        (
+            "__init__.py",
+            "from urlab_client.server import x\n",
+            "__init__.py:1: urlab_client imports urlab_client.server.x",
+        ),
+        ("aio/a.py", "from . import b\n", "aio/a.py:1: relative import of .b"),
+        ("gadgets/a.py", "", "gadgets/a.py: gadgets is not a layer"),
+    ],
+)
+def test_a_wrong_import_is_found_where_it_stands(tmp_path: Path, file: str, source: str, complaint: str) -> None:
+    package = tmp_path / "urlab_client"
+    for layer in ("protocol", "aio", "sync", "server", "cli"):
+        (package / layer).mkdir(parents=True)
+        (package / layer / "fine.py").write_text("from urlab_client.protocol import anything\nimport numpy\n")
+    path = package / file
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(source)
+    (found,) = violations(package)
+    assert found.startswith(f"urlab_client/{complaint}")
