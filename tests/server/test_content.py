@@ -163,6 +163,7 @@ def test_mujocos_reason_for_rejecting_a_file_is_passed_on(desk: Desk, text: str,
     assert str(path) in refused.value.message
     assert "\n" not in refused.value.message
     assert not desk.content.blueprints
+    assert not list(desk.saved.glob("MuJoCoImports/*"))
 
 
 def test_a_failed_reimport_leaves_the_blueprint_as_it_was(desk: Desk) -> None:

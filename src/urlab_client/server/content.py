@@ -263,6 +263,9 @@ class ContentRoot:
             blueprint = self._import(file, stem, source, hashlib.sha256(text).hexdigest())
         except OSError as error:
             raise Refusal("import_failed", f"cannot store the snapshot of {file} in {self.root}: {error}") from None
+        finally:
+            with contextlib.suppress(OSError):  # a folder with a blueprint in it stays
+                (self.root / IMPORTS / stem).rmdir()
         self._blueprints[stem] = blueprint
         return blueprint, True
 

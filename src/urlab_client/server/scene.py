@@ -217,10 +217,11 @@ def compile_scene(
 ) -> Scene:
     """Compile the actors of a level into one model.
 
-    Each articulation's MJCF is attached at the actor's pose with its name as prefix. Its `<option>`, `<size>`,
-    `<visual>` and `<statistic>` have no effect: the scene has MuJoCo's default options and the implicitfast integrator,
-    as in the plugin. Keyframes hold the owner's part; everything else is at its reference, and a free joint's
-    coordinates are not moved by the actor's pose. Cameras, lights and materials stay.
+    Each articulation's MJCF is attached at the actor's pose with its name as prefix. Its `<option>`, `<visual>` and
+    `<statistic>` have no effect, and of its `<size>` only the memory: the scene has MuJoCo's default options and the
+    implicitfast integrator, as in the plugin. Keyframes hold the owner's part; everything else is at its reference, and
+    a free joint's coordinates are not moved by the actor's pose. Cameras, lights and materials stay, but of floors that
+    coincide and of suns that shine alike one is drawn.
 
     Args:
         actors: In spawn order.
@@ -294,7 +295,7 @@ def actor_bounds(actor: Actor, *, every_geom: bool = False) -> tuple[Vec3, Vec3]
         return None
     turn = np.array([rotate(actor.rotation, axis) for axis in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]).T
     centers = boxes.centers[chosen] @ turn.T + np.array(actor.location)
-    halves = np.einsum("ij,njk,nk->ni", np.eye(3), np.abs(turn @ boxes.axes[chosen]), boxes.halves[chosen])
+    halves = np.einsum("nij,nj->ni", np.abs(turn @ boxes.axes[chosen]), boxes.halves[chosen])
     lower, upper = (centers - halves).min(axis=0).tolist(), (centers + halves).max(axis=0).tolist()
     return (lower[0], lower[1], lower[2]), (upper[0], upper[1], upper[2])
 
