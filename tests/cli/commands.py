@@ -43,6 +43,18 @@ def refusal(done: subprocess.CompletedProcess[str]) -> str:
     return line
 
 
+@contextlib.contextmanager
+def signals_kept() -> Generator[None]:
+    """Put back what `urlab serve` does to the process that it owns."""
+    numbers = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+    before = [signal.getsignal(number) for number in numbers]
+    try:
+        yield
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+
+
 class Server:
     """A running `urlab serve`."""
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import signal
 import socket
-import subprocess
 from pathlib import Path
 
 import pytest
-from commands import DEADLINE_S, FREE_PORTS, GYMNASIUM_MODELS, child, refusal, served, urlab
+from commands import DEADLINE_S, FREE_PORTS, GYMNASIUM_MODELS, child, refusal, served, signals_kept, urlab
 
 from urlab_client import ModeLocked, URLabClient, URLabPDController
+from urlab_client.cli import main
 from urlab_client.protocol.enums import CameraMode, StepMode
 
 READY_KEYS = [
@@ -138,27 +138,42 @@ def write(folder: Path, name: str, text: str) -> Path:
     return path
 
 
-def test_a_missing_model(tmp_path: Path) -> None:
-    line = refusal(urlab("serve", "robbot.xml", *FREE_PORTS, cwd=tmp_path))
+def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
+    """Return the line with which a command on free ports ended."""
+    with signals_kept():
+        assert main(["serve", *FREE_PORTS, *map(str, arguments)]) == 2
+    out, err = capsys.readouterr()
+    (line,) = err.splitlines()
+    assert out == ""
+    return line
+
+
+def test_a_missing_model(capsys: pytest.CaptureFixture[str]) -> None:
+    line = refused(capsys, "robbot.xml")
     assert line.startswith("urlab serve: robbot.xml: no such file")
     assert "quadruped" in line
 
 
-def test_a_broken_model(tmp_path: Path) -> None:
+def test_a_broken_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     broken = write(tmp_path, "broken.xml", "<mujoco><worldbody><geom type='potato'/></worldbody></mujoco>")
-    line = refusal(urlab("serve", broken, *FREE_PORTS, cwd=tmp_path))
+    line = refused(capsys, broken)
     assert str(broken) in line
     assert "potato" in line
     assert [*tmp_path.iterdir()] == [broken]
 
 
-def test_a_port_in_use(tmp_path: Path) -> None:
+def test_a_level_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    level = write(tmp_path, "lab.json", "{}")
+    assert str(level) in refused(capsys, level)
+
+
+@pytest.mark.parametrize("name", ["step", "camera"])
+def test_a_port_in_use(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as holder:
         port = holder.getsockname()[1]
-        for name in ("step", "camera"):
-            line = refusal(urlab("serve", "arm", *FREE_PORTS, f"--{name}-port={port}", cwd=tmp_path))
-            assert f"127.0.0.1:{port} is in use" in line
-            assert f"{name}_port" in line
+        line = refused(capsys, "ball", f"--{name}-port={port}")
+    assert f"127.0.0.1:{port} is in use" in line
+    assert f"{name}_port" in line
 
 
 @pytest.mark.parametrize(
@@ -171,8 +186,10 @@ def test_a_port_in_use(tmp_path: Path) -> None:
         (["lab.json"], ["lab.json"]),
     ],
 )
-def test_what_cannot_be_honoured_is_one_line(tmp_path: Path, arguments: list[str], words: list[str]) -> None:
-    line = refusal(urlab("serve", *FREE_PORTS, *arguments, cwd=tmp_path))
+def test_what_cannot_be_honoured_is_one_line(
+    arguments: list[str], words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = refused(capsys, *arguments)
     assert all(word in line for word in words), line
 
 
@@ -181,16 +198,11 @@ def test_needs_no_opengl(tmp_path: Path) -> None:
     assert "nothing.xml" in refusal(done)
 
 
-def test_what_reads_standard_input_does_not_hold_up_the_end(tmp_path: Path) -> None:
-    with served("ball", "--until-eof", cwd=tmp_path) as server:
-        assert server.end(signal.SIGTERM) == (0, "", "")
-
-
-def test_the_end_of_the_parent_is_the_end_of_the_server(tmp_path: Path) -> None:
+def test_input_is_not_the_end_of_input(tmp_path: Path) -> None:
     with served("ball", "--until-eof", cwd=tmp_path) as server:
         assert server.process.stdin is not None
         server.process.stdin.write("not the end\n")
         server.process.stdin.flush()
-        with pytest.raises(subprocess.TimeoutExpired):
-            server.process.wait(0.0)
-        assert server.end(None) == (0, "", "")
+        with URLabClient(**server.client_options) as client:
+            client.discover()
+        assert server.end(signal.SIGTERM) == (0, "", "")

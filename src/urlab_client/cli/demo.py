@@ -12,7 +12,7 @@ import hashlib
 import importlib.util
 import logging
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -97,11 +97,10 @@ def run(arguments: DemoArguments) -> int:
     from urlab_client.server.simulated import SimulatedServer  # noqa: PLC0415
 
     robot = read_robot(arguments.model)
-    if robot.bundled:  # of its warnings, about the floor that each copy brings, nothing can be done
-        logging.getLogger("urlab_client.server").setLevel(logging.ERROR)
     steps, fewer = arguments.steps, max(1, arguments.steps // _ASYNC_SHARE)
     console = _console()
-    with SimulatedServer(model_roots=[robot.path.parent], mjcf_options=True) as server, _progress(console) as progress:
+    server = SimulatedServer(model_roots=[robot.path.parent], mjcf_options=True)
+    with _warnings_of(robot), server, _progress(console) as progress:
         one = drive_one(server, robot, steps, _bar(progress, "blocking client, one robot", steps))
         two = asyncio.run(drive_two(server, robot, fewer, _bar(progress, "async client, two robots", fewer)))
     console.print(_table(robot, [one.outcome, two.outcome]))
@@ -109,6 +108,19 @@ def run(arguments: DemoArguments) -> int:
     for file, note in written.items():
         console.print(f"{file}  {note}", soft_wrap=True, highlight=False)
     return 0
+
+
+@contextlib.contextmanager
+def _warnings_of(robot: RobotFile) -> Generator[None]:
+    """Keep quiet about bundled robots: their only warning is about the floor that each copy brings."""
+    logger = logging.getLogger("urlab_client.server")
+    before = logger.level
+    if robot.bundled:
+        logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
 
 
 def _writable(folder: Path) -> Path:
@@ -159,7 +171,7 @@ def _table(robot: RobotFile, outcomes: list[Outcome]) -> Table:
 
     table = Table(title=f"{robot.name}, direct mode", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
     table.add_column("client")
-    for heading in ("robots", "steps", "sim (s)", "steps/s", "real-time\nfactor"):
+    for heading in ("robots", "steps", "sim (s)", "steps/s", "real-\ntime\nfactor"):
         table.add_column(heading, justify="right")
     table.add_column("final base pose\nx y z (m)\nquaternion w x y z", no_wrap=True)
     for outcome in outcomes:
