@@ -120,4 +120,7 @@ def served(*arguments: str | Path, cwd: Path, json: bool = True) -> Generator[Se
         assert process.stderr is not None
         line = process.stdout.readline()
         assert line, process.stderr.read()
-        yield Server(process, line)
+        server = Server(process, line)
+        yield server
+        if process.poll() is None:
+            server.end(signal.SIGTERM)

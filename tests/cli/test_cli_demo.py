@@ -178,10 +178,11 @@ def test_a_model_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     broken = tmp_path / "broken.xml"
     broken.write_text("<mujoco><worldbody><geom type='potato'/></worldbody></mujoco>")
     for model, words in (("robbot", ["robbot", "quadruped"]), (broken, [str(broken), "potato"])):
-        assert main(["demo", str(model), "--output", str(tmp_path)]) == 2
+        assert main(["demo", str(model), "--output", str(tmp_path / "output")]) == 2
         out, err = capsys.readouterr()
         assert (out, err.count("\n")) == ("", 1)
         assert all(word in err for word in words), err
+    assert [*tmp_path.iterdir()] == [broken]
 
 
 def test_an_output_folder_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

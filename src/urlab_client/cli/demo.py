@@ -89,7 +89,6 @@ def run(arguments: DemoArguments) -> int:
     missing = [name for name in ("matplotlib", "rich") if importlib.util.find_spec(name) is None]
     if missing:
         raise CommandError(f"{' and '.join(missing)} not installed; run: pip install 'urlab-client[demo]'")
-    folder = _writable(arguments.output)
     import_mujoco()
 
     from urlab_client.cli.demo_runs import drive_one, drive_two  # noqa: PLC0415
@@ -97,6 +96,7 @@ def run(arguments: DemoArguments) -> int:
     from urlab_client.server.simulated import SimulatedServer  # noqa: PLC0415
 
     robot = read_robot(arguments.model)
+    folder = _writable(arguments.output)
     steps, fewer = arguments.steps, max(1, arguments.steps // _ASYNC_SHARE)
     console = _console()
     server = SimulatedServer(model_roots=[robot.path.parent], mjcf_options=True)
