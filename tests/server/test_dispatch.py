@@ -11,11 +11,13 @@ from typing import Any
 
 import msgspec
 import pytest
+from hypothesis import HealthCheck, given, settings
+from odd_requests import mangled_requests, plain_requests
 from wire import Wire, check_numbers, pack, write_level
 
 from urlab_client.protocol.base import Needs
 from urlab_client.protocol.codec import MAX_REQUEST_BYTES
-from urlab_client.protocol.enums import Transport
+from urlab_client.protocol.enums import PIEState, Transport
 from urlab_client.protocol.messages.runtime import SetPaused, SetPausedOk
 from urlab_client.protocol.messages.scene import CurrentLevel, CurrentLevelOk
 from urlab_client.protocol.messages.session import Meta, MetaOk
@@ -344,6 +346,35 @@ def test_handlers_run_one_at_a_time_whatever_the_transport(core: ServerCore) -> 
     for thread in threads:
         thread.join(60)
     assert replies == [{"op": "meta_ok", "ops": []}] * len(threads)
+
+
+@pytest.fixture(scope="module")
+def fuzzed(models: Path) -> Iterator[tuple[Dispatcher, ServerCore]]:
+    with SimulatedServer(models / "bot.xml", models / "hand.xml", play=True) as server:
+        opened = server._opened
+        assert opened is not None
+        core = opened._core
+        assert core is not None
+        yield Dispatcher(core, HANDLERS), core
+
+
+@given(request_=plain_requests | mangled_requests)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+def test_no_request_makes_the_server_fail(fuzzed: tuple[Dispatcher, ServerCore], request_: dict[str, Any]) -> None:
+    dispatcher, core = fuzzed
+    core.session.json = False
+    core.session.id = "s"
+    if core.play.state is not PIEState.READY:
+        core.begin_play()
+        core.play.wait(60.0)
+    frame = dispatcher.answer(pack({**request_, "session_id": "s"}))
+    if core.session.json:
+        reply = msgspec.json.decode(frame)
+    else:
+        check_numbers(frame)
+        reply = msgspec.msgpack.decode(frame)
+    assert reply["op"] == "error" or reply["op"].endswith("_ok")
+    assert reply.get("code") != "internal_error"
 
 
 def test_registration_mistakes() -> None:

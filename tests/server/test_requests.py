@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import contextlib
-import datetime as dt
 import math
 import struct
 from typing import Any
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from odd_requests import every_kind, mangled_requests, plain_requests
 
 from urlab_client.protocol.codec import MAX_REQUEST_BYTES, encode_request
 from urlab_client.protocol.messages import runtime, scene, session
@@ -45,7 +45,7 @@ def refused(frame: bytes) -> str:
 
 
 def as_plain(value: object) -> object:
-    return msgspec.to_builtins(value, enc_hook=lambda array: array.tolist())
+    return msgspec.to_builtins(value, enc_hook=lambda array: array.tolist(), order="sorted")
 
 
 def same(one: Incoming, other: Incoming) -> bool:
@@ -95,20 +95,6 @@ def test_bytes_after_a_msgpack_map_are_ignored(surplus: bytes) -> None:
     incoming = read(pack({"op": "set_paused", "session_id": "s", "paused": True}) + surplus)
     assert incoming.op is OPS["set_paused"]
     assert incoming.session_id == "s"
-
-
-every_kind = st.recursive(
-    st.none()
-    | st.booleans()
-    | st.integers(-(2**63), 2**64 - 1)
-    | st.floats()
-    | st.text(max_size=300)
-    | st.binary(max_size=300)
-    | st.builds(msgspec.msgpack.Ext, st.integers(0, 127), st.binary(max_size=40))
-    | st.datetimes(timezones=st.just(dt.UTC)),
-    lambda inner: st.lists(inner, max_size=20) | st.dictionaries(st.text(max_size=40), inner, max_size=20),
-    max_leaves=40,
-)
 
 
 @given(st.dictionaries(st.text(max_size=5), every_kind), st.binary(max_size=9))
@@ -465,61 +451,6 @@ def test_a_wider_struct_must_derive_from_the_declared_one() -> None:
 
 
 # Both ways agree
-
-names = st.sampled_from(["a", "A", "b", "op", "n_steps", "ß", "SS"]) | st.text(max_size=3)
-numbers = st.integers(-(2**63), 2**64 - 1) | st.floats(allow_nan=False) | st.integers(-5, 5)
-
-
-def plausible(annotation: msgspec.inspect.Type) -> st.SearchStrategy[Any]:
-    """Values that often fit a field's type."""
-    match annotation:
-        case msgspec.inspect.Metadata(type=inner):
-            return plausible(inner)
-        case msgspec.inspect.StrType():
-            return st.text(max_size=5)
-        case msgspec.inspect.BoolType():
-            return st.booleans()
-        case msgspec.inspect.IntType():
-            return st.integers(-3, 9) | numbers
-        case msgspec.inspect.FloatType():
-            return numbers
-        case msgspec.inspect.NoneType():
-            return st.none()
-        case msgspec.inspect.CustomType():
-            return st.lists(numbers, max_size=4)
-        case msgspec.inspect.LiteralType(values=values):
-            return st.sampled_from(values)
-        case msgspec.inspect.UnionType(types=types):
-            return st.one_of(map(plausible, types))
-        case msgspec.inspect.TupleType(item_types=items):
-            return st.lists(numbers, min_size=len(items), max_size=len(items))
-        case msgspec.inspect.ListType(item_type=item):
-            return st.lists(plausible(item), max_size=4)
-        case msgspec.inspect.DictType(value_type=item):
-            return st.dictionaries(names, plausible(item), max_size=3)
-        case msgspec.inspect.StructType(fields=struct_fields):
-            return st.fixed_dictionaries({}, optional={f.encode_name: plausible(f.type) for f in struct_fields})
-        case _:
-            return every_kind
-
-
-def plain_request(name: str) -> st.SearchStrategy[dict[str, Any]]:
-    op = OPS[name]
-    info = {f.encode_name: plausible(msgspec.inspect.type_info(f.type)) for f in msgspec.structs.fields(op.request)}
-    required = {field: info.pop(field) for field in op.required}
-    return st.fixed_dictionaries({"op": st.just(name), **required}, optional=info)
-
-
-plain_requests = st.sampled_from(sorted(OPS)).flatmap(plain_request)
-
-
-def mangle(request: dict[str, Any], key: str, value: object, where: int) -> dict[str, Any]:
-    """Put `value` at `key`, or over one of the request's own fields."""
-    keys = [*request, key]
-    return {**request, keys[where % len(keys)]: value}
-
-
-mangled_requests = st.builds(mangle, plain_requests, names, every_kind, st.integers(0, 9))
 
 
 def agree(frame: bytes) -> None:

@@ -185,13 +185,17 @@ class RpcEndpoint:
         return not self._thread.is_alive()
 
     def _run(self) -> None:
+        receive, send, answer, option = self._socket.recv, self._socket.send, self._answer, self._socket.getsockopt
         try:
             while True:
-                frames = self._socket.recv_multipart()
+                frame = receive()
+                # A request of several frames is none: to execute the first one would be a guess.
+                while option(zmq.RCVMORE):
+                    receive()
+                    frame = b""
                 if self._stopping:
                     break
-                # A request of several frames is none; executing the first part would be a guess.
-                self._socket.send(self._answer(frames[0] if len(frames) == 1 else b""))
+                send(answer(frame))
         except zmq.ZMQError:
             logger.exception("the request socket failed; the server answers no longer")
         finally:

@@ -233,12 +233,8 @@ class SimulatedServer:
 
     def __del__(self) -> None:
         if getattr(self, "_opened", None) is not None:
-            warnings.warn(
-                f"{self!r} was not closed; it was opened at {self._made_at}",
-                ResourceWarning,
-                source=self,
-                stacklevel=2,
-            )
+            # Without `source`, which would keep the object from its finalizer for as long as the warning is kept.
+            warnings.warn(f"{self!r} was not closed; it was made at {self._made_at}", ResourceWarning, stacklevel=2)
 
     # Where it is
 
