@@ -11,16 +11,17 @@ from urlab_client.aio.controllers import URLabController, make_controller
 from urlab_client.aio.handles import Actuator, Body, Handles, Joint, Sensor, make_handles
 from urlab_client.aio.layout import ArticulationLayout
 from urlab_client.aio.records import ArticulationRecord, EntityRecord
-from urlab_client.aio.rotation import rotate, rotate_inverse
 from urlab_client.aio.session import Session
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.enums import ControlMode
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import ControllerInfo
 from urlab_client.protocol.names import NameMap
+from urlab_client.protocol.rotation import rotate
 
 __all__ = ["URLabArticulation", "URLabEntity"]
 
+_CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 _DOWN = np.array([0.0, 0.0, -1.0])
 
 
@@ -90,7 +91,7 @@ class URLabEntity:
     def root_lin_vel_b(self) -> Floats:
         """Velocity of the body frame's origin, shape (3,), m/s, body frame."""
         with self._record.mirror.lock:
-            return rotate_inverse(self.root_quat_w, self.root_lin_vel_w)
+            return _to_body(self.root_quat_w, self.root_lin_vel_w)
 
     @property
     def projected_gravity_b(self) -> Floats:
@@ -99,7 +100,7 @@ class URLabEntity:
             model = self._record.mirror.model
             gravity = _DOWN if model is None else model.opt.gravity
             strength = float(np.linalg.norm(gravity))
-            return rotate_inverse(self.root_quat_w, gravity / strength if strength > 0 else _DOWN)
+            return _to_body(self.root_quat_w, gravity / strength if strength > 0 else _DOWN)
 
     def apply_xfrc(self, *, force: Sequence[float] = (0, 0, 0), torque: Sequence[float] = (0, 0, 0)) -> None:
         """Buffer a wrench at the body's centre of mass for the next `step()`, which clears it.
@@ -280,14 +281,14 @@ class URLabArticulation(URLabEntity):
         """Angular velocity of the root, shape (3,), rad/s, world frame."""
         with self._record.mirror.lock:
             qvel = self._record.root_qvel()
-            return rotate(self.root_quat_w, qvel[3:6]) if qvel is not None else self._derived_velocity()[:3]
+            return _to_world(self.root_quat_w, qvel[3:6]) if qvel is not None else self._derived_velocity()[:3]
 
     @property
     def root_ang_vel_b(self) -> Floats:
         """Angular velocity of the root, shape (3,), rad/s, body frame (as MuJoCo stores it)."""
         with self._record.mirror.lock:
             qvel = self._record.root_qvel()
-            return qvel[3:6] if qvel is not None else rotate_inverse(self.root_quat_w, self.root_ang_vel_w)
+            return qvel[3:6] if qvel is not None else _to_body(self.root_quat_w, self.root_ang_vel_w)
 
     def set_ctrl(self, values: Mapping[str, float]) -> None:
         """Set some set-points by actuator name; the others keep their last value.
@@ -362,3 +363,15 @@ def _wrench(force: Sequence[float], torque: Sequence[float]) -> list[float]:
     if len(force) != 3 or len(torque) != 3:
         raise ValueError(f"force and torque need three components each, got {len(force)} and {len(torque)}")
     return [float(v) for v in (*force, *torque)]
+
+
+def _to_world(quat: Floats, vector: Floats) -> Floats:
+    """Rotate a vector of the body frame into the world frame; `quat` is (w, x, y, z)."""
+    w, x, y, z = quat.tolist()
+    a, b, c = vector.tolist()
+    return np.array(rotate((x, y, z, w), (a, b, c)))
+
+
+def _to_body(quat: Floats, vector: Floats) -> Floats:
+    """Rotate a vector of the world frame into the body frame; `quat` is (w, x, y, z)."""
+    return _to_world(quat * _CONJUGATE, vector)

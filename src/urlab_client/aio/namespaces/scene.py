@@ -7,7 +7,6 @@ from collections.abc import Iterable
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.namespaces._base import Vector, as_quat, as_vec3, target_by
 from urlab_client.aio.namespaces._ops import SceneOps
-from urlab_client.protocol.base import Quat, Vec3
 from urlab_client.protocol.errors import CreateLevelFailed
 from urlab_client.protocol.messages.outliner import ListActors
 from urlab_client.protocol.messages.scene import (
@@ -19,6 +18,7 @@ from urlab_client.protocol.messages.scene import (
     SpawnGrid,
     SpawnLight,
 )
+from urlab_client.protocol.rotation import IDENTITY, euler_to_quat
 from urlab_client.protocol.types import (
     SceneActor,
     SceneSnapshot,
@@ -29,8 +29,6 @@ from urlab_client.protocol.types import (
 )
 
 __all__ = ["SceneNamespace"]
-
-_IDENTITY: Quat = (0.0, 0.0, 0.0, 1.0)
 
 
 class SceneNamespace(SceneOps):
@@ -200,7 +198,7 @@ class SceneNamespace(SceneOps):
             actor_path=reply.actor_path,
             blueprint_class_path=reply.blueprint_class_path,
             location=request.location or (copy.location if copy else (0.0, 0.0, 0.0)),
-            rotation_quat=copy.rotation_quat if copy else _IDENTITY,
+            rotation_quat=copy.rotation_quat if copy else IDENTITY,
             was_existing=any(row.name == reply.actor_name for row in before.actors),
             requires_pie_restart=after.in_pie,
         )
@@ -240,7 +238,9 @@ class SceneNamespace(SceneOps):
             TooManyCells: More than 1024 cells.
             SpawnFailed: A cell could not be placed; the plugin keeps the cells placed before it.
         """
-        rotation = as_quat("rotation_quat", rotation_quat)
+        given = as_quat("rotation_quat", rotation_quat)
+        euler = as_vec3("rotation_euler", rotation_euler)
+        rotation = given or (IDENTITY if euler is None else euler_to_quat(euler))
         request = SpawnGrid(
             blueprint=_class_path(blueprint),
             base_actor_id=base_actor_id,
@@ -248,8 +248,8 @@ class SceneNamespace(SceneOps):
             count_y=count_y,
             spacing=as_vec3("spacing", spacing),
             origin=as_vec3("origin", origin),
-            rotation_quat=rotation,
-            rotation_euler=as_vec3("rotation_euler", rotation_euler),
+            rotation_quat=given,
+            rotation_euler=euler,
             scale=as_vec3("scale", scale),
         )
         reply = await self._call(request, timeout)
@@ -260,7 +260,7 @@ class SceneNamespace(SceneOps):
                 actor_path=cell.actor_path,
                 blueprint_class_path=reply.blueprint_class_path,
                 location=cell.location,
-                rotation_quat=rotation or _quat_of_euler(request.rotation_euler),
+                rotation_quat=rotation,
                 was_existing=cell.was_existing,
                 requires_pie_restart=reply.requires_pie_restart,
             )
@@ -337,7 +337,3 @@ def _scene_actor(row: SnapshotRow) -> SceneActor:
         sensors=tuple(block.sensors) if block else (),
         cameras=tuple(block.cameras) if block else (),
     )
-
-
-def _quat_of_euler(euler: Vec3 | None) -> Quat:
-    return _IDENTITY

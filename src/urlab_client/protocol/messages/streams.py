@@ -52,7 +52,7 @@ class StreamItem(Struct, kw_only=True, omit_defaults=True):
         int,
         doc(
             "Messages received and not handed out since the previous item: superseded, overflowed or malformed. "
-            "With `latest_per_key`, since the previous item of the same topic."
+            "With `latest_per_key`, what was superseded counts on the item of the same topic."
         ),
     ] = 0
     gap: Annotated[
