@@ -13,8 +13,8 @@ from typing import Final, Literal
 from msgspec import Struct
 
 from urlab_client.protocol.base import Quat, Vec3
+from urlab_client.protocol.rotation import IDENTITY
 from urlab_client.server.content import PARENT_CLASS, Blueprint
-from urlab_client.server.rotation import IDENTITY
 
 __all__ = ["ORIGIN", "UNIT_SCALE", "Actor", "ActorKind", "Light", "Mesh", "QuickConvert"]
 

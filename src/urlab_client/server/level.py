@@ -17,11 +17,11 @@ import msgspec
 from msgspec import Struct
 
 from urlab_client.protocol.base import Quat, Vec3
+from urlab_client.protocol.rotation import IDENTITY, normalized
 from urlab_client.server.actors import ORIGIN, UNIT_SCALE, Actor, ActorKind, Light, Mesh, QuickConvert
 from urlab_client.server.bundled import BUNDLED_PREFIX
 from urlab_client.server.content import Blueprint, ContentRoot, sanitized, write_atomic
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.rotation import IDENTITY, normalized
 
 __all__ = ["LevelError", "read_level", "write_level"]
 

@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client.protocol.base import Vec3
+from urlab_client.protocol.rotation import rotate, wxyz
 from urlab_client.server.actors import Actor, Mesh
 from urlab_client.server.content import Blueprint, mujoco_messages, one_line
-from urlab_client.server.rotation import rotate, wxyz
 
 __all__ = [
     "ArticulationIndex",

@@ -18,11 +18,11 @@ from pathlib import Path
 from typing import Final, Literal
 
 from urlab_client.protocol.base import Quat, Vec3
+from urlab_client.protocol.rotation import IDENTITY, euler_to_quat, normalized, swap_frame
 from urlab_client.server.actors import ORIGIN, UNIT_SCALE, Actor, ActorKind, Light, Mesh, QuickConvert
 from urlab_client.server.content import PARENT_CLASS, Blueprint, ContentRoot, level_package, sanitized
 from urlab_client.server.level import LevelError, read_level, write_level
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.rotation import IDENTITY, euler_to_quat, normalized, swap_frame
 from urlab_client.server.scene import CompileFailed, actor_bounds
 
 __all__ = [
