@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import cached_property
 from typing import Annotated, Any, Generic, Literal, TypeAlias, TypeVar
 
 import msgspec
@@ -141,17 +142,17 @@ class Op:
         """`op` of the successful reply. Not always the op's name plus `_ok`: see `set_viewport_mode`."""
         return str(self.reply.__struct_config__.tag)
 
-    @property
+    @cached_property
     def required(self) -> tuple[str, ...]:
         """Wire names of the request fields that have no default, in order of declaration."""
         return tuple(f.encode_name for f in msgspec.structs.fields(self.request) if f.required)
 
-    @property
+    @cached_property
     def declared_required(self) -> tuple[str, ...]:
         """The required fields that `meta` lists and the dispatcher checks."""
         return tuple(name for name in self.required if name not in self.undeclared)
 
-    @property
+    @cached_property
     def declared_reply(self) -> tuple[str, ...]:
         """Reply fields as `meta` lists them, `name:type` with `?` for optional ones."""
         if self.declares is not None:
