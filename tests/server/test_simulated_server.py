@@ -5,9 +5,11 @@ from __future__ import annotations
 import asyncio
 import itertools
 import logging
+import os
 import pickle
 import socket
 import threading
+import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -187,6 +189,20 @@ def test_our_client_finds_it(models: Path) -> None:
         assert list(client.articulations) == ["bot"]
 
 
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this platform")
+def test_a_forked_child_leaves_the_server_alone(models: Path, connect: Connect) -> None:
+    with SimulatedServer(models / "bot.xml", play=True) as server:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # forking with threads is what is tested
+            child = os.fork()
+        if child == 0:
+            server.close()
+            os._exit(0)
+        assert os.waitpid(child, 0)[1] == 0
+        assert connect(server).hello()["manager_present"] is True
+        assert server.saved_dir.is_dir()
+
+
 # Closing while something is under way
 
 
@@ -287,11 +303,11 @@ def test_ports_that_are_not_served_refuse_connections() -> None:
 
 
 @pytest.mark.parametrize(
-    ("host", "address"), [("localhost", None), ("0.0.0.0", "tcp://127.0.0.1"), ("*", "tcp://127.0.0.1")]
+    ("host", "address"), [("localhost", "tcp://127.0.0.1"), ("0.0.0.0", "tcp://127.0.0.1"), ("*", "tcp://127.0.0.1")]
 )
-def test_hosts(host: str, address: str | None, connect: Connect) -> None:
+def test_hosts(host: str, address: str, connect: Connect) -> None:
     with SimulatedServer(host=host) as server:
-        assert address in (None, server.address)
+        assert server.address == address
         connect(server).hello()
 
 
@@ -395,7 +411,7 @@ def test_edited_models_are_read_again(tmp_path: Path, connect: Connect) -> None:
         ("nothing.xml", "does not exist"),
         ("broken.xml", "MuJoCo rejects"),
         ("nothing.json", "nothing.json"),
-        ("robot", "robot"),
+        ("robot", "neither a file nor a bundled model"),
     ],
 )
 def test_models_that_cannot_be_used(models: Path, name: str, text: str) -> None:
@@ -447,6 +463,11 @@ def test_where_clients_may_import_from(
 def test_options_that_are_none(options: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=r".+"):
         SimulatedServer(**options)
+
+
+def test_a_name_without_a_file_lists_the_bundled_models() -> None:
+    with pytest.raises(ModelError, match=r"robot is neither .* arm, .*quadruped"):
+        SimulatedServer("robot").start()
 
 
 def test_one_level_at_most() -> None:

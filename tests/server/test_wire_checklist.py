@@ -758,6 +758,19 @@ def test_sim_70_71_control_source(direct: Wire) -> None:
     assert direct.refusal("set_control_source", source="ui", articulation="no") == ("unknown_articulation", "no")
 
 
+@pytest.mark.parametrize(("sent", "paused"), [(True, True), (0, False), ("YES", True), ("no", False)])
+def test_pausing_reads_loosely(direct: Wire, sent: object, paused: bool) -> None:
+    assert direct.ask("set_paused", paused=sent) == {"op": "set_paused_ok", "paused": paused}
+
+
+@pytest.mark.parametrize("sent", [None, [], {}])
+def test_pausing_needs_a_flag(direct: Wire, sent: object) -> None:
+    code, message = direct.refusal("set_paused", paused=sent)
+    assert code == "missing_field"
+    assert "set_paused" in message
+    assert "'paused'" in message
+
+
 @pytest.fixture
 def ball(serve: Serve) -> Wire:
     """A free ball above a floor, key `ball`, in direct mode."""

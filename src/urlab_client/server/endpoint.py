@@ -69,9 +69,12 @@ def numeric_host(host: str) -> str:
     if host in ("", "*"):
         return "0.0.0.0"  # noqa: S104 - asked for
     try:
-        return str(socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0][4][0])
+        found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
     except socket.gaierror as error:
         raise OSError(error.errno, f"cannot bind to {host!r}: {error.strerror}") from error
+    # IPv4 first, as clients do: they look for `localhost` at 127.0.0.1.
+    family_first = sorted(found, key=lambda entry: entry[0] != socket.AF_INET)
+    return str(family_first[0][4][0])
 
 
 def connect_host(host: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import logging
 import os
+import shutil
 import tempfile
 import threading
 import time
@@ -190,7 +191,7 @@ class SimulatedServer:
         with self._lock:
             if self._opened is None:
                 self._opened = _Opened.open(self._config)
-                self._finalizer = weakref.finalize(self, _Opened.close_here, self._opened, os.getpid())
+                self._finalizer = weakref.finalize(self, self._opened.close)
         return self
 
     def close(self) -> None:
@@ -297,10 +298,11 @@ class _Opened:
     def __init__(self, config: _Config) -> None:
         self.host = numeric_host(config.host)
         self.reserved: dict[str, ReservedPort] = {}
-        self._scratch: tempfile.TemporaryDirectory[str] | None = None
+        self._scratch: Path | None = None
         self._endpoint: RpcEndpoint | None = None
         self._core: ServerCore | None = None
         self._closed = False
+        self._pid = os.getpid()
 
     @classmethod
     def open(cls, config: _Config) -> _Opened:
@@ -352,23 +354,17 @@ class _Opened:
     def _content(self, config: _Config) -> ContentRoot:
         folder = config.saved_dir
         if folder is None:
-            self._scratch = tempfile.TemporaryDirectory(prefix="urlab-", ignore_cleanup_errors=True)
-            folder = Path(self._scratch.name)
+            # Not a TemporaryDirectory, which a forked child would remove.
+            folder = self._scratch = Path(tempfile.mkdtemp(prefix="urlab-"))
         roots = config.model_roots
         if roots is None:
-            files = [Path(model).resolve() for model in config.models if Path(model).exists()]
+            files = [Path(model).resolve() for model in config.models if Path(model).is_file()]
             roots = tuple(dict.fromkeys(file.parent for file in files)) or (Path.cwd(),)
         return ContentRoot(folder, model_roots=roots)
 
-    @staticmethod
-    def close_here(opened: _Opened, pid: int) -> None:
-        """Close, unless this is a forked child, to which neither threads nor sockets belong."""
-        if os.getpid() == pid:
-            opened.close()
-
     def close(self) -> None:
-        """Release everything. Safe to call twice."""
-        if self._closed:
+        """Release everything. Safe to call twice; a forked child, which has none of it, leaves it alone."""
+        if self._closed or os.getpid() != self._pid:
             return
         self._closed = True
         deadline = time.monotonic() + CLOSE_S
@@ -384,7 +380,7 @@ class _Opened:
         for port in self.reserved.values():
             port.release()
         if self._scratch is not None:
-            self._scratch.cleanup()
+            shutil.rmtree(self._scratch, ignore_errors=True)
 
 
 def _is_level(model: str) -> bool:
@@ -406,14 +402,19 @@ def _populate(world: World, models: Sequence[str]) -> None:
 
 
 def _place(world: World, model: str, sources: dict[str, str], edge: float | None) -> float | None:
-    """Import a model and place it beyond `edge`, the largest y in use; return the new one."""
-    path = model if model in bundled_models() and not Path(model).exists() else os.fspath(Path(model).absolute())
+    """Import a model and place it beyond `edge`, the largest y in use; return the new one.
+
+    `sources` holds the files imported so far by blueprint.
+    """
+    bundled = bundled_models()
+    if not Path(model).suffix and not Path(model).is_file() and model not in bundled:
+        raise ModelError(f"{model} is neither a file nor a bundled model; those are {', '.join(bundled)}")
+    path = model if model in bundled and not Path(model).is_file() else str(Path(model).absolute())
     # What whoever runs the server names is meant as it is now, whatever an earlier run imported.
-    blueprint, _ = world.import_xml(path, force_reimport=path not in sources, trusted=True)
-    stem = blueprint.stem
-    if sources.setdefault(path, stem) != stem or any(s == stem and p != path for p, s in sources.items()):
-        others = [p for p, s in sources.items() if s == stem and p != path]
-        raise ModelError(f"{model} and {others[0]} would both become blueprint '{stem}': rename one of the files")
+    blueprint, _ = world.import_xml(path, force_reimport=path not in sources.values(), trusted=True)
+    other = sources.setdefault(blueprint.stem, path)
+    if other != path:
+        raise ModelError(f"{model} and {other} would both become blueprint '{blueprint.stem}': rename one of the files")
     placed = world.spawn_actor(blueprint.class_path, _free_id(world, Path(path).stem))
     bounds = world.get_actor_bounds(placed.actor_name, components_only=True)
     if bounds.extents != (0.0, 0.0, 0.0) and edge is not None:
