@@ -7,6 +7,7 @@ server: what the wire cannot tell without a change (the step mode, the control s
 from __future__ import annotations
 
 import asyncio
+import os
 from collections.abc import AsyncIterator, Iterator
 
 import numpy as np
@@ -64,7 +65,7 @@ async def _reachability(config: ClientConfig, session: Session) -> AsyncIterator
     if scheme != "tcp":
         return
     ports = {"RPC": int(rest.rpartition(":")[2])}
-    if config.step_mode in (StepMode.LIVE, StepMode.AUTO):
+    if config.step_mode in (StepMode.LIVE, StepMode.AUTO) and config.address.startswith("tcp://"):
         ports |= {"state stream": config.state_port}
     for what, port in ports.items():
         problem = await _connect(host, port)
@@ -72,7 +73,7 @@ async def _reachability(config: ClientConfig, session: Session) -> AsyncIterator
             yield Finding(Verdict.OK, what, f"{host}:{port} accepts connections.")
         else:
             need = Verdict.PROBLEM if what == "RPC" else Verdict.NOTE
-            yield Finding(need, what, f"{host}:{port}: {problem}.")
+            yield Finding(need, what, f"{host}:{port}: {problem}")
 
 
 async def _connect(host: str, port: int) -> str | None:
@@ -82,7 +83,8 @@ async def _connect(host: str, port: int) -> str | None:
     except TimeoutError:
         return f"no answer within {_PROBE_S:g} s; is a firewall in between?"
     except OSError as error:
-        return f"{error.strerror or error}; is the server running, and on this port?"
+        reason = os.strerror(error.errno) if error.errno else str(error)
+        return f"{reason}; is the server running, and on this port?"
     writer.close()
     return None
 

@@ -1,4 +1,4 @@
-"""The `urlab` command: a simulated server, a look at who answers, a demonstration.
+"""The `urlab` command: a simulated server, a look at who answers, a diagnosis, a demonstration.
 
 Each command has a module of its own and imports what is heavy (MuJoCo, the server, the demo's libraries) when it
 runs. A failure that can be foreseen is one line on standard error and exit code 2.
@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
 
-from urlab_client.cli import demo, ping, serve
+from urlab_client.cli import demo, doctor, ping, serve
 from urlab_client.cli._arguments import Parser
 from urlab_client.cli._failure import CommandError, one_line
 from urlab_client.protocol.errors import URLabError
@@ -55,11 +55,12 @@ def _parser() -> Parser:
     parser = Parser(
         prog="urlab",
         description="Clients and a simulated server for URLab, the Unreal plugin that embeds MuJoCo.",
-        epilog="Exit codes: 0 success, 2 wrong usage or a failure explained on standard error, 130 Ctrl-C.",
+        epilog="Exit codes: 0 success, 1 a diagnosis with problems, 2 wrong usage or a failure explained on standard "
+        "error, 130 Ctrl-C.",
     )
     parser.add_argument("--version", action="version", version=f"urlab_client {version('urlab-client')}")
     commands = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND", required=True)
-    for module in (serve, ping, demo):
+    for module in (serve, ping, doctor, demo):
         module.add_parser(commands)
     return parser
 

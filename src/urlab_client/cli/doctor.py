@@ -1,0 +1,89 @@
+"""`urlab doctor`: why is my robot not moving?"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import sys
+
+import msgspec
+
+from urlab_client.cli._arguments import Commands, port, seconds
+from urlab_client.cli._mujoco import import_mujoco
+from urlab_client.protocol.enums import StepMode
+from urlab_client.protocol.errors import URLabError
+from urlab_client.protocol.types import Diagnosis
+
+__all__ = ["add_parser", "run"]
+
+_UNHEALTHY = 1
+
+
+class DoctorArguments(argparse.Namespace):
+    """What the command line says."""
+
+    address: str
+    step_port: int
+    state_port: int
+    step_mode: StepMode
+    timeout: float
+    json: bool
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command to the parser."""
+    parser = commands.add_parser(
+        "doctor",
+        help="find out why a robot does not move",
+        description="Examine a server from its sockets to the set-points and say what keeps robots from moving. "
+        "Opens a session, which takes the server over from the client that drives it; a program of your own can call "
+        "client.explain() without doing so. Exit code 0 when nothing is in the way, 1 when something is.",
+    )
+    parser.add_argument(
+        "address",
+        nargs="?",
+        default="tcp://localhost",
+        help="tcp://HOST, tcp://HOST:PORT or sim://MODEL (default: %(default)s)",
+    )
+    parser.add_argument("--step-port", type=port, default=5559, metavar="PORT", help="RPC port (default: %(default)s)")
+    parser.add_argument(
+        "--state-port", type=port, default=5555, metavar="PORT", help="state stream (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--step-mode",
+        type=StepMode,
+        choices=list(StepMode),
+        default=StepMode.AUTO,
+        help="the mode your program asks for (default: %(default)s)",
+    )
+    parser.add_argument("--timeout", type=seconds, default=2.0, metavar="S", help="deadline (default: %(default)s)")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: DoctorArguments) -> int:
+    """Print the diagnosis and return 0 when nothing keeps robots from moving, else 1."""
+    import_mujoco()
+    diagnosis = asyncio.run(_diagnose(arguments))
+    sys.stdout.write(f"{msgspec.json.encode(diagnosis).decode() if arguments.json else diagnosis}\n")
+    return 0 if diagnosis.healthy else _UNHEALTHY
+
+
+async def _diagnose(arguments: DoctorArguments) -> Diagnosis:
+    from urlab_client.aio import URLabClient  # noqa: PLC0415
+
+    client = URLabClient(
+        arguments.address,
+        step_port=arguments.step_port,
+        state_port=arguments.state_port,
+        step_mode=arguments.step_mode,
+        # Promoting the server would mend what is to be found.
+        auto_promote_step_mode=False,
+        mujoco_version_check=False,
+        rcv_timeout_ms=round(arguments.timeout * 1000),
+    )
+    async with client:
+        with contextlib.suppress(URLabError):  # the diagnosis says it
+            await client.discover()
+        return await client.explain()
