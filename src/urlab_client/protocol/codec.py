@@ -265,7 +265,7 @@ def _widen_sequence(value: Any) -> Any:
 
 
 def _each(widen: Widener | None) -> Widener | None:
-    return None if widen is None else lambda values: [widen(v) for v in values]
+    return None if widen is None else lambda values: list(map(widen, values))
 
 
 def _each_value(widen: Widener | None) -> Widener | None:

@@ -31,6 +31,7 @@ __all__ = [
     "GameThreadTimeout",
     "GetActorBoundsFailed",
     "ImportFailed",
+    "InternalError",
     "InvalidCount",
     "InvalidMode",
     "ListActorsFailed",
@@ -283,6 +284,10 @@ class WrongTransport(URLabRPCError, code="wrong_transport"):
 
 class ReplyTooLarge(URLabRPCError, code="reply_too_large"):
     """The reply does not fit a shared-memory slot; the message says whether the op was executed."""
+
+
+class InternalError(URLabRPCError, code="internal_error", advice="The server's log has the details."):
+    """The simulated server failed in a way that nobody foresaw; it goes on serving."""
 
 
 class Unsupported(URLabRPCError, code="unsupported"):
