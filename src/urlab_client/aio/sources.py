@@ -1,0 +1,331 @@
+"""What feeds the streams: the state socket, the cameras' sockets, and what happens to the client itself."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Collection
+from typing import Protocol
+
+import msgspec
+
+from urlab_client.aio.streams import Stream
+from urlab_client.aio.transport.subscriber import Sink, Subscription, Subscriptions, client_closed
+from urlab_client.protocol.enums import CameraMode
+from urlab_client.protocol.errors import ProtocolError
+from urlab_client.protocol.messages.session import CameraInfo
+from urlab_client.protocol.messages.streams import (
+    CameraSample,
+    ClientEvent,
+    PlayEnded,
+    PlayStarted,
+    RowSample,
+    ServerConnected,
+    ServerLost,
+    ServerReconnected,
+    SessionLost,
+    SessionOpened,
+    StateSnapshot,
+    StreamPolicy,
+)
+from urlab_client.protocol.rows import (
+    STATE_FULL,
+    BytesLike,
+    Topic,
+    TopicKind,
+    articulation_filter,
+    camera_filter,
+    decode_camera,
+    decode_row,
+    resolve_endpoint,
+    scene_filter,
+)
+
+__all__ = ["CameraSource", "EventBus", "RowSource", "StateSource"]
+
+_OF_COMPONENT = frozenset({TopicKind.JOINT, TopicKind.BASE_STATE, TopicKind.SENSOR})
+_OF_ARTICULATION = _OF_COMPONENT | {TopicKind.TWIST, TopicKind.ACTIONS}
+_OF_SCENE = frozenset({TopicKind.XPOS, TopicKind.XQUAT, TopicKind.QPOS, TopicKind.QVEL})
+_WITH_ID = frozenset({TopicKind.JOINT, TopicKind.SENSOR})
+
+_EVENTS = msgspec.msgpack.Decoder(
+    ServerConnected | ServerLost | ServerReconnected | SessionOpened | SessionLost | PlayStarted | PlayEnded
+)
+
+
+class _SocketSource:
+    """What a subscription brings.
+
+    Attributes:
+        name: The call that made the stream, for messages.
+        unreachable: What to look at when there is no connection.
+        silent: What to look at when there is one and nothing comes.
+    """
+
+    name: str
+    unreachable: str
+    silent: str
+
+    def __init__(self, subscriptions: Subscriptions) -> None:
+        self._subscriptions = subscriptions
+
+    def subscription(self) -> Subscription:
+        """Say what to receive, from where, as things stand."""
+        raise NotImplementedError
+
+    def attach(self, sink: Sink) -> None:
+        """Begin to feed `sink`, from the event loop."""
+        self._subscriptions.attach(sink, self.subscription)
+
+    def detach(self, sink: Sink) -> None:
+        """Stop feeding `sink`. Idempotent."""
+        self._subscriptions.detach(sink)
+
+    def wants(self, topic: bytes, payload: BytesLike) -> bool:
+        """Return whether a message is anything to the reader at all."""
+        return True
+
+    def silence(self, sink: Sink, seconds: float) -> tuple[str, str]:
+        """Return why nothing came for so long, and what to do about it."""
+        within = f"within {seconds * 1000:.0f} ms"
+        line = self._subscriptions.line(sink)
+        if line is None:
+            return f"nothing {within}.", ""
+        if not line.connected:
+            return f"no connection to {line.endpoint} {within}: {line.obstacle}.", self.unreachable
+        filters = [repr(prefix.decode()) for prefix in self.subscription().filters]
+        topics = ", ".join(filters[:3]) + (f" and {len(filters) - 3} more" if len(filters) > 3 else "")
+        return f"connected to {line.endpoint}, but nothing came {within} on topics {topics}.", self.silent
+
+
+class StateSource(_SocketSource):
+    """The snapshots of the state socket.
+
+    Args:
+        subscriptions: The client's.
+        endpoint: Tells where the state socket is.
+    """
+
+    name = "state_stream"
+    unreachable = "The port is open only while play runs: client.sim.start(). Is it the server's state port?"
+    silent = (
+        "While play runs a snapshot comes at least every 100 ms, in every mode and paused, too: is this the server's "
+        "state port?"
+    )
+
+    def __init__(self, subscriptions: Subscriptions, endpoint: Callable[[], str]) -> None:
+        super().__init__(subscriptions)
+        self._endpoint = endpoint
+
+    def subscription(self) -> Subscription:
+        """See the base class."""
+        return Subscription(self._endpoint(), (STATE_FULL,), STATE_FULL.__eq__)
+
+    def decode(self, topic: bytes, payload: BytesLike) -> StateSnapshot:
+        """Read a snapshot. Raises `ProtocolError`."""
+        return StateSnapshot.decode(payload, topic.decode())
+
+
+class RowSource(_SocketSource):
+    """The binary rows of the state socket.
+
+    Args:
+        subscriptions: The client's.
+        endpoint: Tells where the state socket is.
+        articulations: Keys of the articulations whose rows are wanted.
+        kinds: Kinds of rows; empty for all that the other arguments allow.
+        components: Component names of joints, free joints and sensors; empty for all.
+        entities: Whether `kinds` left empty includes the scene rows.
+
+    Raises:
+        ValueError: A kind is not one of rows, a name cannot stand in a topic, or nothing is left to receive.
+    """
+
+    name = "row_stream"
+    unreachable = StateSource.unreachable
+    silent = (
+        "Rows come in live mode only: client.runtime.set_mode('live'); paused they repeat. Component names are the "
+        "engine's, not always the compiled ones."
+    )
+
+    def __init__(
+        self,
+        subscriptions: Subscriptions,
+        endpoint: Callable[[], str],
+        articulations: Collection[str],
+        kinds: Collection[str | TopicKind] = (),
+        components: Collection[str] = (),
+        *,
+        entities: bool = False,
+    ) -> None:
+        super().__init__(subscriptions)
+        self._endpoint = endpoint
+        self._articulations = frozenset(articulations)
+        self._components = frozenset(components)
+        self._kinds = frozenset(TopicKind(kind) for kind in kinds)
+        if not self._kinds:
+            self._kinds = _OF_COMPONENT if components else _OF_ARTICULATION
+            self._kinds |= _OF_SCENE if entities and not components else frozenset()
+        no_rows = self._kinds - _OF_ARTICULATION - _OF_SCENE
+        if no_rows:
+            raise ValueError(f"there are no rows of kind {', '.join(sorted(no_rows))}")
+        self._filters = tuple(sorted(self._narrow()))
+        if not self._filters:
+            raise ValueError("row_stream: there is no articulation to receive rows of; has discover() found any?")
+
+    def _narrow(self) -> set[bytes]:
+        filters = {scene_filter()} if self._kinds & _OF_SCENE else set[bytes]()
+        for key in self._articulations:
+            if not self._components and self._kinds >= _OF_ARTICULATION:
+                filters.add(articulation_filter(key))
+                continue
+            for kind in self._kinds & _OF_ARTICULATION:
+                if self._components and kind in _OF_COMPONENT:
+                    filters |= {Topic(kind, key, component).encode() for component in self._components}
+                else:
+                    filters.add(articulation_filter(key, kind))
+        return filters
+
+    def subscription(self) -> Subscription:
+        """See the base class."""
+        return Subscription(self._endpoint(), self._filters, self._accepts)
+
+    def _accepts(self, topic: bytes) -> bool:
+        try:
+            found = Topic.parse(topic)
+        except ProtocolError:
+            return False  # a kind of topic that a newer server has
+        if found.kind not in self._kinds:
+            return False
+        if found.kind in _OF_SCENE:
+            return True
+        named = found.kind not in _OF_COMPONENT or not self._components or found.name in self._components
+        return named and found.owner in self._articulations
+
+    def wants(self, topic: bytes, payload: BytesLike) -> bool:
+        """Leave out components that are not in the compiled model: their rows carry a negative id and zeros."""
+        return not (len(payload) >= 4 and payload[3] & 0x80 and Topic.parse(topic).kind in _WITH_ID)
+
+    def decode(self, topic: bytes, payload: BytesLike) -> RowSample:
+        """Read a row. Raises `ProtocolError`."""
+        found = Topic.parse(topic)
+        row = decode_row(found, payload)
+        return RowSample(kind=found.kind, owner=found.owner, component=found.name, row=row)
+
+
+class HasCamera(Protocol):
+    """A camera as the client knows it; what it says may change with each handshake."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def info(self) -> CameraInfo: ...
+    @property
+    def mode(self) -> CameraMode | str: ...
+
+
+class CameraSource(_SocketSource):
+    """The pictures of one camera.
+
+    Args:
+        subscriptions: The client's.
+        view: The camera.
+        host: Tells under which name or address the server was reached.
+    """
+
+    name = "frames"
+    unreachable = (
+        "The port is open while play runs and the camera streams. A camera that found no free port reports one that "
+        "it does not serve: the plugin serves nine."
+    )
+    silent = (
+        "Pictures are published in live mode only, and while the camera is switched on in the editor; in the other "
+        "modes ask for them with client.step(include_cameras=…)."
+    )
+
+    def __init__(self, subscriptions: Subscriptions, view: HasCamera, host: Callable[[], str]) -> None:
+        super().__init__(subscriptions)
+        self._view = view
+        self._host = host
+
+    def subscription(self) -> Subscription:
+        """See the base class."""
+        info = self._view.info
+        topic = camera_filter(info.zmq_topic)
+        return Subscription(resolve_endpoint(info.zmq_endpoint, self._host()), (topic,), topic.__eq__, pictures=True)
+
+    def decode(self, topic: bytes, payload: BytesLike) -> CameraSample:
+        """Read a picture. Raises `ProtocolError`."""
+        view = self._view
+        width, height = view.info.resolution
+        frame = decode_camera(payload, view.mode, width, height, where=topic.decode(errors="replace"))
+        return CameraSample(
+            camera=view.name,
+            mode=view.mode,
+            pixels=frame.pixels,
+            frame_id=frame.frame_id,
+            sim_time=frame.sim_time,
+            capture_time=frame.capture_time,
+        )
+
+
+class EventBus:
+    """Tells whoever listens what happens to a client. Publishing without listeners costs nothing and keeps nothing."""
+
+    name = "events"
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._sinks: dict[Sink, None] = {}
+        self._closed = False
+
+    def stream(self, buffer: int) -> Stream[ClientEvent]:
+        """Return a stream of the events from now on, the last `buffer` of which wait for the reader. From any thread.
+
+        Raises:
+            ClientClosed: The client was closed.
+        """
+        return Stream(self, policy=StreamPolicy.ALL, buffer=buffer, timeout=None, eager=True, tolerant=True)
+
+    def publish(self, event: ClientEvent) -> None:
+        """Let the listeners know; from the event loop."""
+        with self._lock:
+            sinks = tuple(self._sinks)
+        if not sinks:
+            return
+        message = msgspec.msgpack.encode(event)  # each listener gets an event of its own
+        for sink in sinks:
+            sink.on_message(b"", message)
+            sink.on_drained()
+
+    def close(self) -> None:
+        """End every stream with `ClientClosed`, from the event loop. Idempotent."""
+        with self._lock:
+            self._closed = True
+            sinks = tuple(self._sinks)
+            self._sinks.clear()
+        for sink in sinks:
+            sink.on_end(client_closed)
+
+    def attach(self, sink: Sink) -> None:
+        """Begin to feed `sink`, from any thread."""
+        with self._lock:
+            if self._closed:
+                raise client_closed()
+            self._sinks[sink] = None
+
+    def detach(self, sink: Sink) -> None:
+        """Stop feeding `sink`, from any thread. Idempotent."""
+        with self._lock:
+            self._sinks.pop(sink, None)
+
+    def wants(self, topic: bytes, payload: BytesLike) -> bool:
+        """Return True: every event is wanted."""
+        return True
+
+    def decode(self, topic: bytes, payload: BytesLike) -> ClientEvent:
+        """Read an event."""
+        return _EVENTS.decode(payload)
+
+    def silence(self, sink: Sink, seconds: float) -> tuple[str, str]:
+        """Return that nothing happened."""
+        return f"nothing happened within {seconds * 1000:.0f} ms.", ""

@@ -1,0 +1,437 @@
+"""Streams: what the server publishes, as asynchronous iterators that are context managers, too."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import threading
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any, Generic, Protocol, Self, TypeVar
+
+from urlab_client.aio.buffers import Buffer, Entry
+from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.transport.subscriber import Sink
+from urlab_client.protocol.errors import (
+    ConcurrentReadError,
+    ProtocolError,
+    StreamOverflow,
+    URLabError,
+    URLabTimeoutError,
+)
+from urlab_client.protocol.messages.streams import StreamItem, StreamPolicy, StreamStats
+from urlab_client.protocol.rows import BytesLike
+
+__all__ = ["BUFFER_BYTES", "BUFFER_ITEMS", "Stream"]
+
+log = logging.getLogger("urlab_client.streams")
+
+T = TypeVar("T", bound=StreamItem)
+T_co = TypeVar("T_co", bound=StreamItem, covariant=True)
+
+BUFFER_ITEMS = 1000
+"""Default limit of a stream's buffer, items."""
+
+BUFFER_BYTES = 64 * 1024 * 1024
+"""Default limit of a stream's buffer, bytes."""
+
+
+class _Source(Protocol[T_co]):
+    """Where a stream's messages come from and what they mean."""
+
+    name: str
+
+    def attach(self, sink: Sink) -> None:
+        """Begin to feed `sink`, from the event loop."""
+        ...
+
+    def detach(self, sink: Sink) -> None:
+        """Stop feeding `sink`. Idempotent."""
+        ...
+
+    def wants(self, topic: bytes, payload: Any) -> bool:
+        """Return whether a message is anything to the reader at all."""
+        ...
+
+    def decode(self, topic: bytes, payload: Any) -> T_co:
+        """Make an item of a message. Raises `ProtocolError`."""
+        ...
+
+    def silence(self, sink: Sink, seconds: float) -> tuple[str, str]:
+        """Return why nothing came for so long, and what to do about it."""
+        ...
+
+
+class _Channel(Generic[T]):
+    """Buffer, reader and end of one stream. What receives holds it, and it does not hold the stream: a stream that is
+    dropped without being closed can so be collected, and stops receiving then.
+
+    Messages are pushed on the event loop. Everything that does not wait may be called from any thread: in the façade
+    it is, so the buffer and the counters are guarded by a lock, which is never held while decoding.
+    """
+
+    def __init__(
+        self, source: _Source[T], buffer: Buffer, *, tolerant: bool, timeout: Timeout, default_timeout: float | None
+    ) -> None:
+        self.closed = False
+        self._source = source
+        self._buffer = buffer
+        self._tolerant = tolerant
+        self._timeout = timeout
+        self._default_timeout = default_timeout
+        self._lock = threading.Lock()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._attached = False
+        self._reading = self._expired = False
+        self._waiter: asyncio.Future[None] | None = None
+        self._end: Callable[[], URLabError] | None = None
+        self._last: T | None = None
+        self._arrived: float | None = None
+        self._delivered = self._malformed = self._gaps = 0
+
+    # What the source calls
+
+    def on_message(self, topic: bytes, payload: BytesLike) -> None:
+        if self._source.wants(topic, payload):
+            self.push(topic, payload, len(payload))
+
+    def push(self, topic: bytes, payload: Any, size: int) -> None:
+        now, wall_ns = time.monotonic(), time.time_ns()
+        with self._lock:
+            self._arrived = now
+            self._buffer.push(topic, payload, size, wall_ns)
+
+    def on_malformed(self, problem: str) -> None:
+        with self._lock:
+            self._buffer.reject()
+            self._malformed += 1
+            first = self._malformed == 1
+        if first:
+            self._warn(problem)
+
+    def on_drained(self) -> None:
+        if self._waiter is not None and not self._waiter.done():
+            self._waiter.set_result(None)
+
+    def on_lost(self) -> None:
+        pass  # the gap tells, once there is something to tell it with
+
+    def on_gap(self, why: str) -> None:
+        with self._lock:
+            self._gaps += 1
+            self._buffer.note_gap(why)
+
+    def on_end(self, error: Callable[[], URLabError]) -> None:
+        self._end = error
+        self.on_drained()
+
+    # What the reader calls
+
+    def open(self) -> None:
+        """Begin to receive, if that has not been done yet."""
+        if self.closed:
+            raise StopAsyncIteration
+        loop = asyncio.get_running_loop()
+        if self._loop is None:
+            self._loop = loop
+        elif self._loop is not loop:
+            raise URLabError(
+                f"{self._source.name}: this stream belongs to another event loop.", hint="Open one per loop."
+            )
+        self.attach()
+
+    def attach(self) -> None:
+        """Let the source feed this."""
+        if not self._attached and self._end is None:
+            self._source.attach(self)
+            self._attached = True
+
+    async def next(self) -> T:
+        """Return the next item, within the stream's own limit."""
+        limit = self._timeout
+        if limit is DEFAULT:
+            limit = None if self._delivered else self._default_timeout
+        return await self.receive(limit)
+
+    async def receive(self, timeout: Timeout) -> T:
+        """Return the next item within `timeout` seconds."""
+        self._refuse_second_reader()
+        self._reading = True
+        try:
+            self.open()
+            item = self._take()
+            return await self._wait(timeout) if item is None else item
+        finally:
+            self._reading = False
+
+    def receive_nowait(self) -> T | None:
+        """Return the next item if one waits."""
+        self._refuse_second_reader()
+        return self._take()
+
+    def latest(self) -> T | None:
+        """Return the newest item there is, without taking it away from the reader."""
+        with self._lock:
+            entry = self._buffer.newest
+            last = self._last
+        if entry is None:
+            return last
+        item = self._decoded(entry)
+        return last if item is None else item
+
+    def stats(self) -> StreamStats:
+        with self._lock:
+            buffer = self._buffer
+            return StreamStats(
+                received=buffer.received,
+                delivered=self._delivered,
+                dropped=buffer.dropped,
+                malformed=self._malformed,
+                waiting=len(buffer),
+                gaps=self._gaps,
+                received_bytes=buffer.received_bytes,
+                last_age_s=None if self._arrived is None else time.monotonic() - self._arrived,
+            )
+
+    def close(self) -> None:
+        """Stop receiving, on the event loop."""
+        if self.closed:
+            return
+        self.closed = True
+        self._source.detach(self)
+        with self._lock:
+            self._buffer.clear()
+        self.on_drained()
+
+    def abandon(self) -> None:
+        """Stop receiving, from whichever thread collects garbage."""
+        if self.closed or not self._attached:
+            return
+        if self._loop is None:
+            self._source.detach(self)
+        else:
+            with contextlib.suppress(RuntimeError):  # the loop is closed, and with it everything that received
+                self._loop.call_soon_threadsafe(self._source.detach, self)
+
+    def _refuse_second_reader(self) -> None:
+        if self._reading:
+            raise ConcurrentReadError(
+                f"{self._source.name}: somebody already waits for the next item of this stream.",
+                hint="Open a stream for each reader: they share one connection.",
+            )
+
+    def _take(self) -> T | None:
+        """Return the next item, None if there is none yet; raise what ends the stream."""
+        while True:
+            if self.closed:
+                raise StopAsyncIteration
+            with self._lock:
+                lost = self._buffer.take_overflow()
+                entry = None if lost and not self._tolerant else self._buffer.pop()
+                waiting = len(self._buffer)
+            if lost and not self._tolerant:
+                raise StreamOverflow(
+                    f"{self._source.name}: the reader fell behind: {lost} messages were lost, {waiting} wait.",
+                    hint="Reading goes on with the oldest that waits. Read faster, or allow a larger buffer=….",
+                )
+            if entry is None:
+                if self._end is not None:
+                    raise self._end()
+                return None
+            item = self._decoded(entry)
+            with self._lock:
+                if item is None:
+                    self._buffer.skip(entry)
+                    continue
+                self._delivered += 1
+            # Messages may have been lost in front of it since `latest` looked at it.
+            item.dropped, item.gap = entry.dropped, entry.gap
+            return item
+
+    def _decoded(self, entry: Entry) -> T | None:
+        """Return the item of a message, None if it is malformed. Each failure is counted once."""
+        with self._lock:
+            if entry.item is not None or entry.malformed:
+                return entry.item
+            payload = entry.payload
+        try:
+            item = self._source.decode(entry.topic, payload)
+        except ProtocolError as error:
+            with self._lock:
+                self._malformed += not entry.malformed
+                entry.malformed = True
+                first = self._malformed == 1
+            if first:
+                self._warn(str(error))
+            return None
+        item.seq, item.dropped, item.gap, item.recv_wall_time_ns = entry.seq, entry.dropped, entry.gap, entry.wall_ns
+        with self._lock:
+            if entry.item is None:
+                entry.item, entry.payload = item, None
+                if self._last is None or self._last.seq < item.seq:
+                    self._last = item
+            return entry.item
+
+    async def _wait(self, timeout: Timeout) -> T:
+        loop = asyncio.get_running_loop()
+        seconds = self._default_timeout if timeout is DEFAULT else timeout
+        self._expired = False
+        timer = None if seconds is None else loop.call_later(seconds, self._expire)
+        try:
+            while True:
+                self._waiter = loop.create_future()
+                await self._waiter
+                item = self._take()
+                if item is not None:
+                    return item
+                if self._expired and seconds is not None:
+                    problem, advice = self._source.silence(self, seconds)
+                    raise URLabTimeoutError(f"{self._source.name}: {problem}", hint=advice)
+        finally:
+            self._waiter = None
+            if timer is not None:
+                timer.cancel()
+
+    def _expire(self) -> None:
+        self._expired = True
+        self.on_drained()
+
+    def _warn(self, problem: str) -> None:
+        log.warning("%s: skipped a malformed message: %s More of them are only counted.", self._source.name, problem)
+
+
+class Stream(Generic[T]):
+    """Items the server publishes, as they come.
+
+    It opens with the first use or on entering a `with` block, and reconnects by itself. Iteration ends when the
+    stream is closed here; when the client is closed, it raises `ClientClosed` after the items that had arrived.
+
+    What waits for a busy reader is decided by the policy. `latest` keeps the newest item. `latest_per_key` keeps the
+    newest of each topic. `all` keeps everything up to a limit; beyond it the oldest items are lost and the next read
+    raises `StreamOverflow` once. The stream goes on after that, as after `URLabTimeoutError`.
+
+    Each item carries `seq`, `dropped` and `gap`, so that a reader sees what it missed. What is lost before it reaches
+    this process, in the queues of the server or the network, cannot be seen: the wire has no numbers.
+
+    One reader at a time; `latest`, `stats` and `closed` are for everybody. An item that nobody reads is not decoded.
+
+    Example:
+        async with client.state_stream() as states:
+            async for state in states:
+                print(state.time, state.per_articulation["arm"].qpos)
+    """
+
+    def __init__(
+        self,
+        source: _Source[T],
+        *,
+        policy: str | StreamPolicy,
+        buffer: int = BUFFER_ITEMS,
+        buffer_bytes: int = BUFFER_BYTES,
+        timeout: Timeout = DEFAULT,
+        default_timeout: float | None = None,
+        eager: bool = False,
+        tolerant: bool = False,
+    ) -> None:
+        """Make a stream; nothing is received before its first use.
+
+        Args:
+            source: What feeds it.
+            policy: What to keep for a busy reader.
+            buffer: Items kept at most.
+            buffer_bytes: Bytes kept at most.
+            timeout: Seconds that iterating waits for an item; by default `default_timeout` for the first item and
+                without limit for those after it.
+            default_timeout: Seconds that `receive` waits by default; None waits.
+            eager: Receive from now on. The source must allow it from any thread.
+            tolerant: Let an overflow show in the next item's `dropped` only.
+
+        Raises:
+            ValueError: Unknown policy, or a limit below 1.
+        """
+        kept = Buffer(StreamPolicy(policy), buffer, buffer_bytes)
+        self._channel = _Channel(source, kept, tolerant=tolerant, timeout=timeout, default_timeout=default_timeout)
+        if eager:
+            self._channel.attach()
+
+    @property
+    def closed(self) -> bool:
+        """Whether it was closed here."""
+        return self._channel.closed
+
+    @property
+    def stats(self) -> StreamStats:
+        """Counters up to now."""
+        return self._channel.stats()
+
+    def latest(self) -> T | None:
+        """Return the newest item without waiting and without taking it away from the reader; None before the first.
+
+        The reader gets the same object.
+        """
+        return self._channel.latest()
+
+    def receive_nowait(self) -> T | None:
+        """Return the next item if one waits, else None. Does not open the stream.
+
+        Raises:
+            StreamOverflow: Items were lost; see the class.
+            ConcurrentReadError: Somebody waits for the next item.
+            ClientClosed: The client was closed, and what had arrived is read.
+            URLabError: The stream was closed.
+        """
+        try:
+            return self._channel.receive_nowait()
+        except StopAsyncIteration:
+            raise self._was_closed() from None
+
+    async def receive(self, *, timeout: Timeout = DEFAULT) -> T:
+        """Return the next item.
+
+        Args:
+            timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            URLabTimeoutError: Nothing came in time; says at which stage, and what to look at.
+            StreamOverflow: Items were lost; see the class.
+            ConcurrentReadError: Somebody else waits for the next item.
+            ClientClosed: The client was closed, and what had arrived is read.
+            URLabError: The stream was closed.
+        """
+        try:
+            return await self._channel.receive(timeout)
+        except StopAsyncIteration:
+            raise self._was_closed() from None
+
+    async def aclose(self) -> None:
+        """Stop receiving and drop what waits. A reader's iteration ends. Idempotent."""
+        self._channel.close()
+
+    async def __aenter__(self) -> Self:
+        try:
+            self._channel.open()
+        except StopAsyncIteration:
+            raise self._was_closed() from None
+        return self
+
+    async def __aexit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._channel.close()
+
+    def __aiter__(self) -> Self:
+        return self
+
+    async def __anext__(self) -> T:
+        """Return the next item; see `receive` for what it raises."""
+        return await self._channel.next()
+
+    def __del__(self) -> None:
+        channel: _Channel[T] | None = getattr(self, "_channel", None)  # None if the constructor failed
+        if channel is not None:
+            channel.abandon()
+
+    def _was_closed(self) -> URLabError:
+        return URLabError("The stream was closed.", hint="Open a new one.")
