@@ -200,10 +200,8 @@ async def test_what_this_server_cannot_do_yet_says_so(connect: Any) -> None:
         await client.discover()
         with pytest.raises(Unsupported, match="recording_start"):
             await client.recording.start()
-        with pytest.raises(Unsupported, match="draw_marker"):
-            await client.debug.draw_marker((0, 0, 1), (1, 0, 0))
-        with pytest.raises(Unsupported, match="get_camera"):
-            await client.viewport.get_camera()
+        with pytest.raises(Unsupported, match="reflections"):
+            await client.viewport.set_mode("reflections")
 
 
 async def test_meta_lists_the_ops(connect: Any, empty: Any) -> None:

@@ -12,10 +12,12 @@ from dataclasses import dataclass, field
 from urlab_client.protocol.enums import CameraMode, StepMode
 from urlab_client.server.controllers import ControllerConfig
 from urlab_client.server.engine import Engine
+from urlab_client.server.markers import Drawings
 from urlab_client.server.observe import Observer
 from urlab_client.server.play import Play, Running
 from urlab_client.server.scene import ArticulationIndex, Scene, compile_scene
 from urlab_client.server.session import Session
+from urlab_client.server.viewport import Viewport
 from urlab_client.server.world import World
 
 __all__ = ["PhysicsConfig", "ServerCore"]
@@ -68,6 +70,8 @@ class ServerCore:
         camera_endpoint: Where camera images will be published.
         session: The client's session.
         play: The play session.
+        viewport: The viewport's camera.
+        drawings: Debug drawing.
     """
 
     world: World
@@ -75,6 +79,8 @@ class ServerCore:
     camera_endpoint: str
     session: Session = field(default_factory=Session)
     play: Play = field(default_factory=Play)
+    viewport: Viewport = field(default_factory=Viewport)
+    drawings: Drawings = field(default_factory=Drawings)
 
     def begin_play(self) -> None:
         """Start play with the level as it is now; `play.wait` says how it ends."""
@@ -92,6 +98,7 @@ class ServerCore:
         """End play, if it runs."""
         self.play.stop()
         self.world.pie_running = False
+        self.drawings.clear(in_play=True)
 
 
 def _run(scene: Scene, physics: PhysicsConfig) -> Running:

@@ -1,6 +1,6 @@
 """The op handlers. Importing this package registers all of them; ops without one answer `unsupported`."""
 
 from urlab_client.server.dispatch import HANDLERS
-from urlab_client.server.handlers import outliner, runtime, scene, session, sim
+from urlab_client.server.handlers import debug, outliner, runtime, scene, session, sim, viewport
 
-__all__ = ["HANDLERS", "outliner", "runtime", "scene", "session", "sim"]
+__all__ = ["HANDLERS", "debug", "outliner", "runtime", "scene", "session", "sim", "viewport"]

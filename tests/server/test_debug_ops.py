@@ -1,0 +1,143 @@
+"""Debug drawing: the ops over a bare socket, and what is kept of it."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from wire import Wire
+
+from urlab_client.server import SimulatedServer
+from urlab_client.server.handlers.debug import _color
+from urlab_client.server.markers import MAX_PRIMITIVES, Drawings, Line, Sphere
+
+COLOR = [1, 0, 0]
+VALID: dict[str, dict[str, Any]] = {
+    "draw_marker": {"location": [0, 0, 1], "color": COLOR},
+    "draw_line": {"from": [0, 0, 0], "to": [1, 0, 0], "color": COLOR},
+    "draw_box": {"center": [0, 0, 0], "half_extents": [-1, 1, 1], "color": COLOR},
+    "draw_arrow": {"from": [0, 0, 0], "to": [1, 0, 0], "color": COLOR},
+    "draw_axes": {"location": [0, 0, 0]},
+    "clear_markers": {},
+    "set_overlay_text": {"text": "hello"},
+}
+REQUIRED = [(op, field) for op, fields in VALID.items() for field in fields]
+VECTORS = [(op, field) for op, field in REQUIRED if field not in ("color", "text")]
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture(scope="module")
+def wire() -> Iterator[Wire]:
+    with SimulatedServer() as server, Wire(server) as bare:
+        bare.hello()
+        yield bare
+
+
+@pytest.mark.parametrize("op", VALID)
+def test_replies_say_nothing_else(wire: Wire, op: str) -> None:
+    extras = {"ttl": 2.5, "tag": "t", "label": "x", "thickness": 3, "arrow_size": 0.1, "scale": -1, "anchor": "nowhere"}
+    extras |= {"rotation_quat": [0, 0, 1, 0], "rotation_euler": [1, 2, 3]}
+    assert wire.ask(op, **VALID[op]) == {"op": f"{op}_ok"}
+    assert wire.ask(op, **VALID[op], **extras) == {"op": f"{op}_ok"}
+
+
+@pytest.mark.parametrize(("op", "field"), REQUIRED)
+def test_required_fields(wire: Wire, op: str, field: str) -> None:
+    code, message = wire.refusal(op, **{key: value for key, value in VALID[op].items() if key != field})
+    assert code == "missing_field"
+    assert field in message
+
+
+@pytest.mark.parametrize(("op", "field"), VECTORS)
+@pytest.mark.parametrize("value", [[1, 2], [], None, "x", [0, 0, math.nan]])
+def test_malformed_vectors(wire: Wire, op: str, field: str, value: object) -> None:
+    assert wire.refused(op, **{**VALID[op], field: value}) == "missing_field"
+
+
+@pytest.mark.parametrize("color", [[1], None, "red", [2, -1, math.nan]])
+def test_malformed_colors_are_accepted(wire: Wire, color: object) -> None:
+    wire.ask("draw_marker", location=[0, 0, 0], color=color)
+
+
+@pytest.mark.parametrize("op", ["draw_box", "draw_axes"])
+def test_rotations_that_are_none(wire: Wire, op: str) -> None:
+    assert wire.refused(op, **VALID[op], rotation_quat=[0, 0, 0, 0]) == "missing_field"
+    assert wire.refused(op, **VALID[op], rotation_euler=[math.inf, 0, 0]) == "missing_field"
+    wire.ask(op, **VALID[op], rotation_quat=[0, 0, 1])
+
+
+def test_overlay_text_may_be_empty(wire: Wire) -> None:
+    wire.ask("set_overlay_text", text="")
+    wire.ask("set_overlay_text", text=None)
+
+
+def test_drawing_works_during_play(serve: Callable[..., Wire]) -> None:
+    playing = serve("ball", play=True)
+    for op, fields in VALID.items():
+        playing.ask(op, **fields)
+
+
+def test_colors_are_bytes_cut_off() -> None:
+    assert _color((0.5, 2.0, -1.0)) == (127 / 255, 1.0, 0.0)
+
+
+def sphere(x: float) -> Sphere:
+    return Sphere(center=(x, 0.0, 0.0), color=(1.0, 0.0, 0.0))
+
+
+def test_time_to_live() -> None:
+    clock = Clock()
+    drawings = Drawings(clock)
+    drawings.add([sphere(0)], ttl=0.0, in_play=False)
+    drawings.add([sphere(1)], ttl=2.0, in_play=False)
+    drawings.add([sphere(2)], ttl=-1.0, in_play=False)
+    assert drawings.take_frame(in_play=False) == [sphere(0), sphere(1), sphere(2)]
+    assert drawings.take_frame(in_play=False) == [sphere(1), sphere(2)]
+    clock.now = 2.0
+    assert drawings.take_frame(in_play=False) == [sphere(2)]
+    drawings.clear(in_play=False)
+    assert drawings.take_frame(in_play=False) == []
+
+
+def test_worlds_are_apart() -> None:
+    drawings = Drawings(Clock())
+    drawings.add([sphere(0)], ttl=-1.0, in_play=False)
+    drawings.add([sphere(1)], ttl=-1.0, in_play=True)
+    drawings.clear(in_play=True)
+    assert drawings.take_frame(in_play=True) == []
+    assert drawings.take_frame(in_play=False) == [sphere(0)]
+
+
+def test_overlay_lasts_ten_seconds() -> None:
+    clock = Clock()
+    drawings = Drawings(clock)
+    assert drawings.overlay == ""
+    drawings.set_overlay("one")
+    drawings.set_overlay("two")
+    clock.now = 9.9
+    assert drawings.overlay == "two"
+    clock.now = 10.0
+    assert drawings.overlay == ""
+    drawings.set_overlay("three")
+    drawings.set_overlay("")
+    assert drawings.overlay == ""
+
+
+def test_the_oldest_gives_way(caplog: pytest.LogCaptureFixture) -> None:
+    drawings = Drawings(Clock())
+    line = Line(start=(0.0, 0.0, 0.0), end=(1.0, 0.0, 0.0), color=(1.0, 1.0, 1.0))
+    drawings.add([sphere(0)], ttl=-1.0, in_play=False)
+    with caplog.at_level(logging.WARNING, logger="urlab_client.server"):
+        drawings.add([line] * MAX_PRIMITIVES, ttl=-1.0, in_play=False)
+    assert drawings.take_frame(in_play=False) == [line] * MAX_PRIMITIVES
+    assert "clear_markers" in caplog.text
