@@ -96,7 +96,7 @@ def test_framing_keeps_the_direction_and_fits_the_box(robots: Wire) -> None:
 
 
 def test_framing_finds_by_id_unless_told_otherwise(robots: Wire) -> None:
-    name = robots.ask("spawn_actor", blueprint="bot", actor_id="second")["actor_name"]
+    name = robots.ask("spawn_actor", blueprint="/Game/MuJoCoImports/bot", actor_id="second")["actor_name"]
     assert name != "second"
     assert robots.refusal("frame_actor", target=name) == ("unknown_actor", name)
     by_id = robots.ask("frame_actor", target="second")
