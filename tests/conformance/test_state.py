@@ -1,0 +1,225 @@
+"""Session state, clocks, runtime ops and per-kind handles, in both flavours."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from urlab_client import DimMismatch, NotMocapBody, UnknownArticulation, UnknownBody
+from urlab_client.enums import ActuatorType, CameraMode
+from urlab_client.server import ControllerConfig, SimulatedServer
+
+BOT = """
+<mujoco model="bot"><compiler angle="radian"/><worldbody>
+  <geom name="floor" type="plane" size="5 5 .1"/>
+  <camera name="overview" pos="0 -3 2"/>
+  <body name="base" pos="0 0 .1"><freejoint name="root"/><geom name="ball" size=".1" mass="1"/>
+    <body name="arm" pos="0 0 .3"><joint name="swing" type="hinge" axis="0 1 0" range="-1 1" limited="true"/>
+      <geom name="rod" type="capsule" fromto="0 0 0 0 0 .2" size=".02" mass=".1"/>
+      <body name="slider"><joint name="slide" type="slide"/><geom size=".02" mass=".05" pos=".1 0 .2"/></body>
+    </body></body>
+  <body name="target" mocap="true" pos="0 1 1"><geom size=".05" contype="0" conaffinity="0"/></body>
+</worldbody><actuator>
+  <motor name="swing" joint="swing" ctrlrange="-1 1" ctrllimited="true" forcerange="-2 2" forcelimited="true"/>
+  <general name="slide" joint="slide" dyntype="filter" dynprm=".1"/>
+</actuator><sensor><framequat name="attitude" objtype="body" objname="base"/></sensor>
+<keyframe><key name="home" time="1.5" qpos="0 0 .1 1 0 0 0 .5 0"/></keyframe></mujoco>
+"""
+
+
+@pytest.fixture
+def bot(tmp_path: Path) -> str:
+    path = tmp_path / "bot.xml"
+    path.write_text(BOT)
+    return str(path)
+
+
+async def test_who_answers(connect: Any, bot: str) -> None:
+    with SimulatedServer(bot, play=True) as server:
+        client = connect(server, step_mode="direct")
+        assert (client.urlab_version, client.mujoco_version, client.session_id) == ("", "", "")
+        await client.discover()
+        assert client.urlab_version.startswith("urlab/")
+        assert client.mujoco_version == mujoco.mj_versionString()
+        assert client.manager_present
+        assert not client.model_is_approximate
+        assert len(client.global_cameras) == 0
+        assert client.transport_stats.received >= 3
+        assert repr(getattr(client, "twin", client)).endswith("connected>")
+
+
+async def test_clocks(connect: Any, bot: str) -> None:
+    with SimulatedServer(bot, play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        before = time.time()
+        reply = await client.step(700)
+        after = time.time()
+        assert client.sim_time == reply.time == client.data.time
+        assert abs(client.sim_time_sec + 1e-9 * client.sim_time_nsec - client.sim_time) < 2e-9
+        assert client.sim_time_sec == 1
+        assert before <= client.wall_time_sec + 1e-9 * client.wall_time_nsec <= after
+        assert before <= 1e-9 * client.recv_wall_time_ns <= after + 1
+        assert client.step_count == 700
+
+
+async def test_arrays_follow_the_model(connect: Any, bot: str) -> None:
+    with SimulatedServer(bot, play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        (art,) = client.articulations.values()
+        art.set_ctrl({"slide": 0.5, "swing": 0.2})
+        await client.step(50)
+        assert np.array_equal(art.qpos_array, client.data.qpos)
+        assert np.array_equal(art.qvel_array, client.data.qvel)
+        assert art.dof_qpos.shape == art.dof_qvel.shape == (2,)
+        assert np.array_equal(art.dof_qvel, art.qvel_array[6:])
+        assert art.act_array[0] == 0.0
+        assert art.act_array[1] == pytest.approx(client.data.act[0])
+        assert 0 < art.act_array[1] < 0.5
+        kept = art.qpos_array
+        copy = kept.copy()
+        await client.step(10)
+        assert np.array_equal(kept, copy), "an array handed out is the user's to keep"
+        assert not np.array_equal(art.qpos_array, copy)
+
+
+async def test_handles(connect: Any, bot: str) -> None:
+    with SimulatedServer(bot, play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover(observations="full")
+        (art,) = client.articulations.values()
+        assert [joint.jnt_type for joint in art.joints.values()] == [0, 3, 2]
+        assert [joint.qvel_local_offset for joint in art.joints.values()] == [0, 6, 7]
+        assert [joint.qvel_offset for joint in art.joints.values()] == [0, 6, 7]
+        assert art.joints["swing"].range == (-1.0, 1.0)
+        swing, slide = art.actuators["swing"], art.actuators["slide"]
+        assert (swing.ctrlrange, swing.forcerange) == ((-1.0, 1.0), (-2.0, 2.0))
+        assert (slide.ctrlrange, slide.forcerange) == (None, None)
+        assert (swing.type, swing.joint, swing.kp, swing.kv) == (ActuatorType.MOTOR, "swing", 1.0, 0.0)
+        swing.set_control(5.0)
+        await client.step()
+        assert art.last_applied_ctrl[0] == 5.0, "the echo is unclamped"
+        assert swing.force == 1.0
+        assert swing.value == 5.0
+        assert art.sensors["attitude"].dim == 4
+        camera = art.cameras["overview"]
+        assert (camera.mode, camera.resolution, camera.fovy) == (CameraMode.REAL, (640, 480), 45.0)
+        assert (camera.dtype, camera.latest_frame, camera.sim_time) == (np.dtype(np.uint8), None, None)
+
+
+async def test_set_qpos_is_mirrored(connect: Any, bot: str) -> None:
+    with SimulatedServer(bot, play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        (art,) = client.articulations.values()
+        await client.runtime.set_qpos("bot", [0, 0, 2, 1, 0, 0, 0])
+        assert art.root_pos_w[2] == client.data.qpos[2] == 2.0
+        await client.runtime.set_qpos(art.prefix, np.array([0, 0, 3, 1, 0, 0, 0, 0.25, 0]), by_name=True)
+        assert art.get_qpos()["swing"] == client.data.qpos[7] == 0.25
+        reply = await client.runtime.forward()
+        assert reply.per_articulation[art.prefix].qpos[2] == 3.0
+        assert reply.time == 0.0
+        assert np.allclose(art.bodies["base"].xpos, [0, 0, 3])
+        with pytest.raises(DimMismatch):
+            await client.runtime.set_qpos("bot", [1, 2, 3])
+        with pytest.raises(UnknownArticulation):
+            await client.runtime.set_qpos("ghost", [0] * 9)
+
+
+async def test_contacts(connect: Any, bot: str) -> None:
+    with SimulatedServer(bot, play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        (art,) = client.articulations.values()
+        await client.step(500)
+        result = await client.runtime.get_contacts()
+        assert result.n_contacts == len(result.contacts) >= 1
+        assert not result.truncated
+        contact = result.contacts[0]
+        assert contact.body2.startswith(f"{art.prefix}_")
+        assert np.allclose(contact.normal, [0, 0, 1], atol=1e-6)
+        assert contact.force[0] > 0
+        none = await client.runtime.get_contacts(body1=contact.body2, body2=contact.body1)
+        assert none.n_contacts == 0, "filters are positional"
+        one = await client.runtime.get_contacts(geom2=contact.geom2, max_contacts=1)
+        assert one.contacts[0].geom2 == contact.geom2
+
+
+async def test_mocap_keyframes_twist_and_speed(connect: Any, bot: str) -> None:
+    with SimulatedServer(bot, play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        (art,) = client.articulations.values()
+        body = f"{art.prefix}_target"
+        pose = await client.runtime.set_mocap_pose(body, pos=(0, 0, 4))
+        assert pose.pos == (0.0, 0.0, 4.0)
+        assert (await client.runtime.read_mocap_pose(body)).quat == (1.0, 0.0, 0.0, 0.0)
+        with pytest.raises(NotMocapBody):
+            await client.runtime.read_mocap_pose(f"{art.prefix}_base")
+        with pytest.raises(UnknownBody):
+            await client.runtime.read_mocap_pose("ghost")
+        (key,) = await client.runtime.list_keyframes()
+        assert (key.name, key.time, len(key.qpos)) == (f"{art.prefix}_home", 1.5, client.model.nq)
+        await client.runtime.set_twist(art.prefix, linear=(0.5, 0.25, 9), angular=(9, 9, 1.5))
+        await client.step()
+        assert art.twist_linear.tolist() == [0.5, 0.25, 0.0]
+        assert art.twist_angular.tolist() == [0.0, 0.0, 1.5]
+        assert await client.runtime.set_sim_speed(1) == 5.0
+        assert await client.runtime.set_sim_speed(250) == 100.0
+
+
+async def test_looking_around(connect: Any, bot: str) -> None:
+    with SimulatedServer(bot, "ball", play=True) as server:
+        client = connect(server)
+        await client.discover()
+        robots = await client.outliner.find_actors(class_filter="AMjArticulation")
+        assert {row.actor_id for row in robots} == {"bot", "ball"}
+        assert all(row.is_articulation for row in robots)
+        assert [row.actor_id for row in await client.outliner.find_actors(name_prefix="ba")] == ["ball"]
+        bounds = await client.outliner.get_actor_bounds("ball")
+        assert np.allclose(bounds.extents, 0.1)
+        assert {b.short_name for b in await client.outliner.list_blueprints()} == {"bot", "ball"}
+
+
+async def test_the_controller_knows_its_articulation(connect: Any, bot: str) -> None:
+    with SimulatedServer(bot, play=True, controllers={"bot": ControllerConfig(kp=7)}) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        (art,) = client.articulations.values()
+        assert art.controller.articulation_prefix == art.prefix
+        assert art.controller.schema["kp"]["type"] == "per_joint"
+        assert dict(art.controller.kp) == {"swing": 7.0, "slide": 7.0}
+        assert set(art.controller.torque_limit.values()) == {200.0}
+        assert set(art.controller.kv.values()) == {5.0}
+        configured = await art.controller.configure(default_kp=9.0)
+        assert configured["default_kp"] == 9.0
+
+
+async def test_state_belongs_together_under_the_lock(connect: Any, bot: str) -> None:
+    with SimulatedServer(bot, play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        torn: list[float] = []
+        stop = threading.Event()
+        twin = getattr(client, "twin", client)
+
+        def watch() -> None:
+            while not stop.is_set():
+                with twin._data_lock, twin._data_lock:
+                    if twin.data.time != twin.sim_time:
+                        torn.append(twin.sim_time)
+
+        watcher = threading.Thread(target=watch)
+        watcher.start()
+        for _ in range(100):
+            await client.step()
+        stop.set()
+        watcher.join(5)
+        assert torn == []
