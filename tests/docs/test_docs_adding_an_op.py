@@ -1,0 +1,116 @@
+"""The walkthrough `docs/adding-an-op.md`, done as written in a copy of the repository."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from pages import ROOT, Block, blocks
+from test_docs_code import assert_output
+
+PAGE = ROOT / "docs" / "adding-an-op.md"
+TOOLS = ("gen_ops.py", "gen_sync.py", "gen_docs.py")
+
+
+def of(kind: str) -> list[Block]:
+    return [block for block in blocks(PAGE) if block.directive.partition(":")[0] == kind]
+
+
+def run(tree: Path, arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, *arguments],
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+        cwd=tree,
+        env={**os.environ, "PYTHONPATH": str(tree / "src"), "PYTHONDONTWRITEBYTECODE": "1"},
+    )
+
+
+def apply(tree: Path, block: Block) -> None:
+    kind, _, rest = block.directive.partition(": ")
+    name, _, anchor = rest.partition(" before: ")
+    path = tree / name
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    where = len(lines)
+    if kind == "insert":
+        (where,) = [number for number, line in enumerate(lines) if line.strip() == anchor]
+    path.write_text("".join([*lines[:where], block.code, *lines[where:]]), encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a copy of the repository after all edits, with everything generated."""
+    copy = tmp_path_factory.mktemp("walkthrough")
+    for folder in ("src", "tools", "docs", "tests/data", "tests/server"):
+        shutil.copytree(ROOT / folder, copy / folder, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "pyproject.toml", copy)
+    for block in blocks(PAGE):
+        if block.directive.startswith(("append:", "insert:")):
+            apply(copy, block)
+    for tool in TOOLS:
+        stale = run(copy, [f"tools/{tool}", "--check"])
+        assert stale.returncode == 1, f"{tool} --check does not notice the new op: {stale.stderr}"
+        written = run(copy, [f"tools/{tool}"])
+        assert written.returncode == 0, written.stderr
+    return copy
+
+
+def test_the_page_has_all_kinds_of_steps() -> None:
+    assert {kind: len(of(kind)) for kind in ("append", "insert", "shows", "use")} == {
+        "append": 3,
+        "insert": 3,
+        "shows": 2,
+        "use": 1,
+    }
+    commands = "".join(block.code for block in blocks(PAGE) if block.language == "console")
+    assert [line.rpartition("/")[2] for line in commands.splitlines()] == list(TOOLS)
+
+
+@pytest.mark.parametrize("block", of("shows"), ids=str)
+def test_generated_code_is_as_shown(tree: Path, block: Block) -> None:
+    file = tree / block.directive.partition(": ")[2]
+    assert block.code in file.read_text(encoding="utf-8")
+
+
+def test_the_op_works_in_both_flavours(tree: Path) -> None:
+    (block,) = of("use")
+    done = run(tree, ["-W", "error", "-c", block.code])
+    assert (done.returncode, done.stderr) == (0, "")
+    assert_output(block, done.stdout)
+    asynchronous = """
+        import asyncio
+        from urlab_client.aio import URLabClient
+
+        async def main():
+            async with URLabClient("sim://ball") as client:
+                await client.discover()
+                print(await client.runtime.get_mass("ball"))
+
+        asyncio.run(main())
+    """
+    done = run(tree, ["-W", "error", "-c", textwrap.dedent(asynchronous)])
+    assert (done.returncode, done.stdout, done.stderr) == (0, "1.0\n", "")
+
+
+def test_meta_and_the_reference_have_their_row(tree: Path) -> None:
+    reference = (tree / "docs" / "reference" / "ops.md").read_text(encoding="utf-8")
+    row = next(line for line in reference.splitlines() if line.startswith("| `get_mass` |"))
+    assert "`client.runtime.get_mass()`" in row
+    assert "| play | read |" in row
+    catalogue = run(tree, ["-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/server/test_meta.py"])
+    assert catalogue.returncode == 0, catalogue.stdout
+
+
+def test_what_is_written_passes_the_linter(tree: Path) -> None:
+    done = run(tree, ["-m", "ruff", "check", "--no-cache", "src"])
+    assert done.returncode == 0, done.stdout
+    done = run(tree, ["-m", "ruff", "format", "--no-cache", "--check", "src"])
+    assert done.returncode == 0, done.stdout
