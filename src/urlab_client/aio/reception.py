@@ -5,16 +5,17 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
-from threading import RLock
+from threading import Lock, RLock
 
 from msgspec import Struct
 
-from urlab_client.aio.sources import StateSource
+from urlab_client.aio.sources import CameraSource, StateSource
+from urlab_client.aio.transport.subscriber import Sink
 from urlab_client.protocol.errors import ProtocolError, URLabError
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.protocol.rows import BytesLike
+from urlab_client.protocol.rows import BytesLike, Pixels
 
-__all__ = ["LiveReception", "ReceptionStats"]
+__all__ = ["LiveReception", "Pictures", "ReceptionStats"]
 
 log = logging.getLogger("urlab_client.streams")
 
@@ -35,7 +36,7 @@ class ReceptionStats(Struct):
     refused: int = 0
 
 
-class LiveReception:
+class LiveReception(Sink):
     """Takes over the newest snapshot of each batch, right where it is received: no task, no thread, no queue.
 
     Args:
@@ -76,11 +77,13 @@ class LiveReception:
         self._source.detach(self)
         self._forget()
 
-    def on_message(self, topic: bytes, payload: BytesLike) -> None:  # noqa: D102  # see `Sink`
+    def on_message(self, topic: bytes, payload: BytesLike) -> None:
+        """Take one message."""
         self.stats.received += 1
         self._payload = payload
 
-    def on_drained(self) -> None:  # noqa: D102
+    def on_drained(self) -> None:
+        """Take the newest one over."""
         try:
             if self._payload is not None:
                 payload, self._payload = self._payload, None
@@ -91,17 +94,13 @@ class LiveReception:
             self._snapshot = None
             self._refuse(str(error))
 
-    def on_malformed(self, problem: str) -> None:  # noqa: D102
+    def on_malformed(self, problem: str) -> None:
+        """Take note of a message that is none."""
         self.stats.received += 1
         self._refuse(problem)
 
-    def on_lost(self) -> None:  # noqa: D102
-        pass
-
-    def on_gap(self, why: str) -> None:  # noqa: D102
-        pass
-
-    def on_end(self, error: Callable[[], URLabError]) -> None:  # noqa: D102
+    def on_end(self, error: Callable[[], URLabError]) -> None:
+        """Take note that the client was closed."""
         self._running = False
         self._forget()
 
@@ -132,3 +131,70 @@ class LiveReception:
         if self._retry is not None:
             self._retry.cancel()
             self._retry = None
+
+
+class Pictures(Sink):
+    """The newest picture of a camera: from replies and, in live mode, by itself. Converted when somebody looks at it.
+
+    Args:
+        source: The camera.
+    """
+
+    def __init__(self, source: CameraSource) -> None:
+        self._source = source
+        self._lock = Lock()
+        self._message: tuple[bytes, BytesLike] | None = None
+        self._pixels: Pixels | None = None
+        self._sim_time: float | None = None
+        self._running = False
+        self._warned = False
+
+    def start(self) -> None:
+        """Receive from now on; from the event loop. Idempotent."""
+        if not self._running:
+            self._source.attach(self)
+            self._running = True
+
+    def stop(self) -> None:
+        """Receive no longer; from the event loop. Idempotent."""
+        self._running = False
+        self._source.detach(self)
+        self.newest()  # what the camera is like now may not hold when somebody looks
+
+    def deliver(self, pixels: Pixels, sim_time: float) -> None:
+        """Take over a picture that a reply carried."""
+        with self._lock:
+            self._message = None
+            self._pixels, self._sim_time = pixels, sim_time
+
+    def newest(self) -> tuple[Pixels | None, float | None]:
+        """Return the newest picture and its simulation time, as far as there is one and it has one. From any thread."""
+        with self._lock:
+            if self._message is not None:
+                (topic, payload), self._message = self._message, None
+                try:
+                    sample = self._source.decode(topic, payload)
+                except ProtocolError as error:
+                    self._warn(str(error))
+                else:
+                    self._pixels, self._sim_time = sample.pixels, sample.sim_time
+            return self._pixels, self._sim_time
+
+    def on_message(self, topic: bytes, payload: BytesLike) -> None:
+        """Take one message."""
+        if self._lock.acquire(blocking=False):  # held while converting: the next message will do as well
+            self._message = topic, payload
+            self._lock.release()
+
+    def on_malformed(self, problem: str) -> None:
+        """Take note of a message that is none."""
+        self._warn(problem)
+
+    def on_end(self, error: Callable[[], URLabError]) -> None:
+        """Take note that the client was closed."""
+        self._running = False
+
+    def _warn(self, problem: str) -> None:
+        if not self._warned:
+            self._warned = True
+            log.warning("skipped a malformed picture: %s More of them are skipped silently.", problem)

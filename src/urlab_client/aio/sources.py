@@ -40,7 +40,7 @@ from urlab_client.protocol.rows import (
     scene_filter,
 )
 
-__all__ = ["CameraSource", "EventBus", "RowSource", "StateSource"]
+__all__ = ["CameraSource", "EventBus", "HasCamera", "RowSource", "StateSource"]
 
 _OF_COMPONENT = frozenset({TopicKind.JOINT, TopicKind.BASE_STATE, TopicKind.SENSOR})
 _OF_ARTICULATION = _OF_COMPONENT | {TopicKind.TWIST, TopicKind.ACTIONS}
@@ -216,11 +216,19 @@ class HasCamera(Protocol):
     """A camera as the client knows it; what it says may change with each handshake."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """Its name."""
+        ...
+
     @property
-    def info(self) -> CameraInfo: ...
+    def info(self) -> CameraInfo:
+        """The handshake's description."""
+        ...
+
     @property
-    def mode(self) -> CameraMode | str: ...
+    def mode(self) -> CameraMode | str:
+        """What its pixels mean."""
+        ...
 
 
 class CameraSource(_SocketSource):

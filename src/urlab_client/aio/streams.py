@@ -64,7 +64,7 @@ class _Source(Protocol[T_co]):
         ...
 
 
-class _Channel(Generic[T]):
+class _Channel(Sink, Generic[T]):
     """Buffer, reader and end of one stream. What receives holds it, and it does not hold the stream: a stream that is
     dropped without being closed can so be collected, and stops receiving then.
 
@@ -114,9 +114,6 @@ class _Channel(Generic[T]):
     def on_drained(self) -> None:
         if self._waiter is not None and not self._waiter.done():
             self._waiter.set_result(None)
-
-    def on_lost(self) -> None:
-        pass  # the gap tells, once there is something to tell it with
 
     def on_gap(self, why: str) -> None:
         with self._lock:
@@ -374,18 +371,17 @@ class Stream(Generic[T]):
         return self._channel.latest()
 
     def receive_nowait(self) -> T | None:
-        """Return the next item if one waits, else None. Does not open the stream.
+        """Return the next item if one waits, else None, as before the stream is opened and after it is closed.
 
         Raises:
             StreamOverflow: Items were lost; see the class.
             ConcurrentReadError: Somebody waits for the next item.
             ClientClosed: The client was closed, and what had arrived is read.
-            URLabError: The stream was closed.
         """
         try:
             return self._channel.receive_nowait()
         except StopAsyncIteration:
-            raise self._was_closed() from None
+            return None
 
     async def receive(self, *, timeout: Timeout = DEFAULT) -> T:
         """Return the next item.

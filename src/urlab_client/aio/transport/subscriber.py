@@ -14,7 +14,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import zmq
 from msgspec import Struct
@@ -62,32 +62,26 @@ _OBSTACLES = {
 _REMEMBERED_TOPICS = 4096
 
 
-class Sink(Protocol):
+class Sink:
     """Takes what a subscription brings. Called on the event loop; must not block and must not raise."""
 
     def on_message(self, topic: bytes, payload: BytesLike) -> None:
         """Take one message."""
-        ...
+        raise NotImplementedError
 
     def on_malformed(self, problem: str) -> None:
         """Take note of a message that is none."""
-        ...
-
-    def on_drained(self) -> None:
-        """Act on the messages that just came, after the last of a batch."""
-        ...
-
-    def on_lost(self) -> None:
-        """Take note that the connection broke."""
-        ...
-
-    def on_gap(self, why: str) -> None:
-        """Take note that messages are missing before the next one."""
-        ...
+        raise NotImplementedError
 
     def on_end(self, error: Callable[[], URLabError]) -> None:
         """Take note that nothing will come any more, and why."""
-        ...
+        raise NotImplementedError
+
+    def on_drained(self) -> None:
+        """Act on the messages that just came, after the last of a batch."""
+
+    def on_gap(self, why: str) -> None:
+        """Take note that messages are missing before the next one."""
 
 
 class Subscription(Struct, frozen=True):
@@ -268,8 +262,6 @@ class _Subscriber:
                 log.info("lost %s; reconnecting", self.endpoint)
                 self.connected = False
                 self._down_since = self._loop.time()
-                for sink in tuple(self._sinks):
-                    sink.on_lost()
         elif event in _OBSTACLES and self.connects == 0:
             self.obstacle = _OBSTACLES[event]
 
