@@ -8,13 +8,16 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from urlab_client.protocol.enums import CameraMode, StepMode
+from urlab_client.server.actors import Actor
 from urlab_client.server.controllers import ControllerConfig
 from urlab_client.server.engine import Engine
 from urlab_client.server.markers import Drawings
 from urlab_client.server.observe import Observer
 from urlab_client.server.play import Play, Running
+from urlab_client.server.rendering import CameraStudio
 from urlab_client.server.scene import ArticulationIndex, Scene, compile_scene
 from urlab_client.server.session import Session
 from urlab_client.server.viewport import Viewport
@@ -89,7 +92,7 @@ class ServerCore:
 
         def build() -> Running:
             scene = compile_scene(actors, honour_mjcf_options=physics.mjcf_options, camera_size=physics.camera_size)
-            return _run(scene, physics)
+            return _run(scene, physics, {actor.name: _kind(actor) for actor in actors})
 
         self.play.begin(build)
         self.world.pie_running = True
@@ -101,11 +104,22 @@ class ServerCore:
         self.drawings.clear(in_play=True)
 
 
-def _run(scene: Scene, physics: PhysicsConfig) -> Running:
+def _kind(actor: Actor) -> str:
+    """Return what has one colour in a semantic image: the class, or the mesh."""
+    mesh = actor.mesh
+    return actor.class_name if mesh is None else Path(mesh.file).stem or mesh.shape
+
+
+def _run(scene: Scene, physics: PhysicsConfig, classes: Mapping[str, str]) -> Running:
     controllers = {index.key: config for index in scene.articulations if (config := physics.controller(index))}
     _warn_of_strangers(scene, physics)
     engine = Engine(scene, pinned_mode=physics.step_mode, paused=not physics.unpaused, controllers=controllers)
-    return Running(scene, engine.start(), Observer(scene, engine.controls))
+    modes = {
+        (index.key, camera.name): physics.camera_mode(index, camera.name)
+        for index in scene.articulations
+        for camera in index.cameras
+    }
+    return Running(scene, engine.start(), Observer(scene, engine.controls), CameraStudio(scene, modes, classes))
 
 
 def _warn_of_strangers(scene: Scene, physics: PhysicsConfig) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
@@ -16,6 +17,7 @@ from urlab_client.protocol.enums import PIEState
 from urlab_client.server.engine import Engine
 from urlab_client.server.observe import Observer
 from urlab_client.server.refusal import Refusal
+from urlab_client.server.rendering import CameraStudio
 from urlab_client.server.scene import CompileFailed, Scene
 
 __all__ = ["Play", "Running"]
@@ -33,11 +35,19 @@ class Running:
         scene: What was compiled.
         engine: What steps it; started.
         observer: What reads its state.
+        cameras: What draws its cameras.
     """
 
     scene: Scene
     engine: Engine
     observer: Observer
+    cameras: CameraStudio
+
+    def close(self, timeout: float = 1.0) -> bool:
+        """End it within about `timeout` seconds; return False when something was still busy then."""
+        deadline = time.monotonic() + timeout
+        drawn = self.cameras.close(timeout / 2.0)
+        return self.engine.close(max(0.0, deadline - time.monotonic())) and drawn
 
 
 class _Attempt:
@@ -56,9 +66,15 @@ class _Attempt:
 
 
 class Play:
-    """The play session of a server: at most one at a time. Safe to use from several threads."""
+    """The play session of a server: at most one at a time. Safe to use from several threads.
+
+    Attributes:
+        listeners: Called with the simulation when it is ready and with None when it goes, in order; must return at
+            once.
+    """
 
     def __init__(self) -> None:
+        self.listeners: list[Callable[[Running | None], None]] = []
         self._changed = threading.Condition()
         self._attempt: _Attempt | None = None
         self._closing = False
@@ -134,8 +150,9 @@ class Play:
             attempt, self._attempt = self._attempt, None
             if attempt is not None:
                 attempt.abandoned = True
+                self._announce(None)
         if attempt is not None and attempt.running is not None:
-            attempt.running.engine.close()
+            attempt.running.close()
 
     def close(self, timeout: float) -> bool:
         """End play for good and release whoever waits, with `shutting_down`.
@@ -153,7 +170,7 @@ class Play:
                 attempt.abandoned = True
             self._changed.notify_all()
         running = self.current
-        return running is None or running.engine.close(timeout)
+        return running is None or running.close(timeout)
 
     def _build(self, attempt: _Attempt, build: Callable[[], Running]) -> None:
         running: Running | None = None
@@ -169,7 +186,12 @@ class Play:
             if not attempt.abandoned:
                 attempt.running = running
                 attempt.error = None if running is not None else error
+                self._announce(running)
                 running = None
             self._changed.notify_all()
         if running is not None:
-            running.engine.close()
+            running.close()
+
+    def _announce(self, running: Running | None) -> None:
+        for listener in self.listeners:
+            listener(running)

@@ -35,6 +35,7 @@ from urlab_client.server.core import ServerCore
 from urlab_client.server.dispatch import handles
 from urlab_client.server.observe import sim_clock, wall_clock
 from urlab_client.server.play import Running
+from urlab_client.server.rendering import Exposure
 from urlab_client.server.scene import EntityIndex
 
 logger = logging.getLogger("urlab_client.server")
@@ -161,7 +162,19 @@ def step(server: ServerCore, request: Step) -> StepOk:
     if running.engine.mode in (StepMode.DIRECT, StepMode.PUPPET):
         server.session.adopt_level(request.observations)
     level = server.session.level
-    return running.engine.step(request, lambda _: _observe_step(running, level))
+    shots = running.cameras.shots(request.include_cameras)
+
+    if not shots:
+        return running.engine.step(request, lambda _: _observe_step(running, level))
+
+    def observe(mode: StepMode) -> tuple[StepOk, StepMode, Exposure | None]:
+        stepped = mode in (StepMode.DIRECT, StepMode.PUPPET)
+        return _observe_step(running, level), mode, running.cameras.capture(shots) if stepped else None
+
+    reply, mode, exposure = running.engine.step(request, observe)
+    if mode in (StepMode.DIRECT, StepMode.PUPPET):
+        reply.cameras = running.cameras.frames(shots, exposure)
+    return reply
 
 
 def _observe_step(running: Running, level: ObservationLevel) -> StepOk:

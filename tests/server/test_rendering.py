@@ -1,0 +1,278 @@
+"""Camera images in step replies, over a bare socket and drawn for real, and their colours."""
+
+from __future__ import annotations
+
+import logging
+import math
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from wire import Wire
+
+from urlab_client.server import SimulatedServer, rendering
+from urlab_client.server.rendering import NO_HIT_CM, find_backend, tint
+
+# Looks along +x at a wall 2 m away, whose upper half is red and whose lower half is blue.
+WALL = """
+<mujoco model="wall">
+  <compiler angle="degree"/>
+  <worldbody>
+    <light pos="0 0 0" dir="1 0 0" directional="true"/>
+    <camera name="eye" xyaxes="0 -1 0 0 0 1" fovy="60" resolution="40 30"/>
+    <camera name="away" xyaxes="0 1 0 0 0 1" resolution="8 4"/>
+    <geom name="upper" type="box" pos="2.5 0 5" size="0.5 9 5" rgba="1 0 0 1"/>
+    <geom name="lower" type="box" pos="2.5 0 -5" size="0.5 9 5" rgba="0 0 1 1"/>
+    <site name="mark" pos="1 0 0" size="0.3"/>
+  </worldbody>
+</mujoco>
+"""
+
+# Looks down from 10 m at a ball, which falls.
+DROP = """
+<mujoco model="drop">
+  <worldbody>
+    <camera name="above" pos="0 0 10" fovy="20" resolution="31 31"/>
+    <camera name="plain" pos="0 0 10"/>
+    <body name="ball" pos="0 0 2"><freejoint name="root"/><geom name="ball" size="0.5" mass="1"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+# Two blocks on one robot, seen from above.
+PAIR = """
+<mujoco model="pair">
+  <worldbody>
+    <camera name="above" pos="0 0 4" fovy="45" resolution="64 48"/>
+    <body name="left" pos="-0.5 0 0"><joint name="l" type="slide"/><geom type="box" size=".3 .3 .3"/></body>
+    <body name="right" pos="0.5 0 0"><joint name="r" type="slide"/><geom type="box" size=".3 .3 .3"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("scenes")
+    for name, text in {"wall": WALL, "drop": DROP, "pair": PAIR}.items():
+        (folder / f"{name}.xml").write_text(text)
+    return folder
+
+
+Play = Callable[..., Wire]
+
+
+@pytest.fixture
+def play(scenes: Path, connect: Callable[[SimulatedServer], Wire]) -> Iterator[Play]:
+    servers: list[SimulatedServer] = []
+
+    def start(*names: str, modes: dict[str, str] | None = None, step_mode: str = "direct", **options: Any) -> Wire:
+        paths = [scenes / f"{name}.xml" for name in names]
+        server = SimulatedServer(
+            *paths, play=True, unpaused=True, step_mode=step_mode, camera_modes=modes or {}, **options
+        )
+        servers.append(server.start())
+        wire = connect(server)
+        wire.hello()
+        return wire
+
+    yield start
+    for server in servers:
+        server.close()
+
+
+def pixels(frame: dict[str, Any]) -> np.ndarray[Any, Any]:
+    """Check a frame's form and return its pixels."""
+    assert set(frame) == {"width", "height", "dtype", "data"}
+    width, height = int(frame["width"]), int(frame["height"])
+    assert len(frame["data"]) == width * height * 4
+    if frame["dtype"] == "float32":
+        return np.frombuffer(frame["data"], "<f4").reshape(height, width)
+    assert frame["dtype"] == "bgra8"
+    image = np.frombuffer(frame["data"], np.uint8).reshape(height, width, 4)
+    assert (image[:, :, 3] == 255).all()
+    return image
+
+
+def test_colors_come_as_bgra_from_the_top(play: Play) -> None:
+    image = pixels(play("wall").ask("step", include_cameras={"wall/eye": "sync"})["cameras"]["wall/eye"])
+    assert image.shape == (30, 40, 4)
+    blue, _, red = (image[:, :, channel].astype(int) for channel in range(3))
+    assert (red[:14] > blue[:14] + 50).all()
+    assert (blue[16:] > red[16:] + 50).all()
+
+
+def test_depth_is_planar_and_in_centimetres(play: Play) -> None:
+    wire = play("wall", modes={"wall/eye": "depth", "wall/away": "depth"})
+    cameras = wire.ask("step", include_cameras={"eye": "sync", "away": "sync"})["cameras"]
+    assert pixels(cameras["eye"]) == pytest.approx(np.full((30, 40), 200.0), rel=1e-4)
+    assert (pixels(cameras["away"]) == np.float32(NO_HIT_CM)).all()
+
+
+def test_the_vertical_field_of_view_is_true(play: Play) -> None:
+    wire = play("drop", modes={"drop/above": "semantic"})
+    image = pixels(wire.ask("step", include_cameras={"above": "sync"})["cameras"]["above"])
+    rows = np.flatnonzero(image[:, :, :3].any(axis=2).any(axis=1))
+    angle = 2 * math.degrees(math.asin(0.5 / 8.0))
+    assert len(rows) == pytest.approx(31 * angle / 20, abs=1.5)
+
+
+def test_sync_shows_the_state_after_the_step(play: Play) -> None:
+    wire = play("drop", modes={"drop/above": "depth"})
+    for _ in range(5):
+        reply = wire.ask("step", n_steps=50, include_cameras={"above": "SYNC"})
+        top = reply["per_articulation"]["drop"]["qpos"][2] + 0.5
+        assert pixels(reply["cameras"]["above"])[15, 15] == pytest.approx(100 * (10 - top), abs=0.02)
+
+
+def test_a_long_step_shows_its_end(play: Play) -> None:
+    wire = play("drop", modes={"drop/above": "depth"})
+    wire.ask("reset")
+    reply = wire.ask("step", n_steps=400, include_cameras={"above": "sync"})
+    top = reply["per_articulation"]["drop"]["qpos"][2] + 0.5
+    assert pixels(reply["cameras"]["above"])[15, 15] == pytest.approx(100 * (10 - top), rel=1e-4)
+
+
+def test_puppet_shows_what_was_pushed(play: Play) -> None:
+    wire = play("drop", modes={"drop/above": "depth"}, step_mode="puppet")
+    for height in (0.0, 5.0):
+        reply = wire.ask("step", qpos=[0, 0, height, 1, 0, 0, 0], include_cameras={"drop/above": "sync"})
+        assert pixels(reply["cameras"]["drop/above"])[15, 15] == pytest.approx(100 * (9.5 - height), rel=1e-4)
+
+
+def test_keys_are_those_of_the_request(play: Play) -> None:
+    wire = play("drop", "wall")
+    wanted = {
+        "drop/above": "sync",
+        "above": "latest",
+        "eye": "anything",
+        "nobody": "sync",
+        "x/eye": "sync",
+        "away": None,
+    }
+    assert set(wire.ask("step", include_cameras=wanted)["cameras"]) == {"drop/above", "above", "eye"}
+    assert set(wire.ask("step", include_cameras=True)["cameras"]) == {"above", "plain", "eye", "away"}
+
+
+@pytest.mark.parametrize("wanted", [False, {}, {"nobody": "sync"}, {"above": None}, None])
+def test_without_a_frame_there_is_no_block(play: Play, wanted: object) -> None:
+    assert "cameras" not in play("drop").ask("step", include_cameras=wanted)
+
+
+def test_live_ignores_cameras(play: Play) -> None:
+    assert "cameras" not in play("drop", step_mode="live").ask("step", include_cameras={"above": "sync"})
+
+
+def test_a_bare_name_means_the_last_robot(play: Play) -> None:
+    wire = play("wall", "wall", modes={"wall/eye": "depth", "wall_1/eye": "real"})
+    frame = wire.ask("step", include_cameras={"eye": "sync", "wall/eye": "sync"})["cameras"]
+    assert frame["eye"]["dtype"] == "bgra8"
+    assert frame["wall/eye"]["dtype"] == "float32"
+
+
+def test_latest_is_always_there(play: Play) -> None:
+    wire = play("drop")
+    for _ in range(3):
+        frames = wire.ask("step", include_cameras={"above": "latest"})["cameras"]
+        assert set(frames) == {"above"}
+
+
+def test_handshake_and_frames_agree(play: Play) -> None:
+    wire = play("drop", camera_size=(24, 16))
+    topics = wire.hello()["articulations"][0]["camera_topics"]
+    assert topics["plain"]["resolution"] == [24, 16]
+    assert topics["plain"]["fovy"] == 45.0
+    assert topics["plain"]["mode"] == "real"
+    assert pixels(wire.ask("step", include_cameras={"plain": "sync"})["cameras"]["plain"]).shape == (16, 24, 4)
+
+
+def colors(image: np.ndarray[Any, Any]) -> set[tuple[int, int, int]]:
+    """Return red, green, blue of all pixels."""
+    return {(int(red), int(green), int(blue)) for blue, green, red, _ in image.reshape(-1, 4)}
+
+
+def test_one_class_has_one_semantic_color(play: Play) -> None:
+    wire = play("pair", "pair", modes={"pair/above": "semantic", "pair_1/above": "semantic"})
+    frames = wire.ask("step", include_cameras={"pair/above": "sync", "pair_1/above": "sync"})["cameras"]
+    expected = {(0, 0, 0), tint(zlib.crc32(b"pair_C"), None)}
+    assert [colors(pixels(frame)) for frame in frames.values()] == [expected, expected]
+
+
+def test_each_body_has_an_instance_color(play: Play) -> None:
+    wire = play("pair", "pair", modes={"pair/above": "instance", "pair_1/above": "instance"})
+    frames = wire.ask("step", include_cameras={"pair/above": "sync", "pair_1/above": "sync"})["cameras"]
+    group = zlib.crc32(b"pair_C")
+    first, second = (colors(pixels(frame)) - {(0, 0, 0)} for frame in frames.values())
+    assert {tint(group, 1), tint(group, 2)} <= first
+    assert {tint(group, 3), tint(group, 4)} <= second
+
+
+def test_tints_follow_the_formula() -> None:
+    # Seed 1: hue 1/7, saturation 2/3, value 0.68; seed 2: 2/7, 5/6, 0.76.
+    assert tint(0, None) == (173, 157, 58)
+    assert tint(1, None) == (78, 194, 32)
+    assert tint(0, 1) == tint(1, None)
+    assert tint(0x80000000, None) == tint(0, None)
+
+
+def test_without_opengl_frames_are_left_out(
+    play: Play, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "off")
+    wire = play("drop")
+    with caplog.at_level(logging.WARNING, logger="urlab_client.server"):
+        for _ in range(3):
+            reply = wire.ask("step", n_steps=2, include_cameras={"above": "sync"})
+            assert "cameras" not in reply
+    assert reply["step"] == 6
+    assert [record.message for record in caplog.records if "camera images" in record.message] == [
+        "camera images are left out: MUJOCO_GL=off disables OpenGL; unset it"
+    ]
+
+
+def test_a_machine_without_opengl_is_told_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(rendering.sys, "platform", "linux")
+    monkeypatch.setattr(rendering, "_PROBE", "raise SystemExit('no {name} today')")
+    with caplog.at_level(logging.WARNING, logger="urlab_client.server"):
+        assert rendering._find.__wrapped__("") is None
+    (message,) = [record.message for record in caplog.records]
+    assert "apt install libegl1" in message
+    assert "egl: no egl today; osmesa: no osmesa today" in message
+
+
+def test_a_driver_that_kills_its_process_kills_no_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rendering, "_PROBE", "import os; os.abort()  # {name}")
+    assert "ended with code" in str(rendering._probe("egl"))
+
+
+def test_drawing_that_fails_later_leaves_frames_out(
+    play: Play, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(*arguments: object) -> None:
+        raise RuntimeError("the driver is gone")
+
+    wire = play("drop")
+    monkeypatch.setattr(rendering._Stage, "draw", fail)
+    with caplog.at_level(logging.ERROR, logger="urlab_client.server"):
+        assert "cameras" not in wire.ask("step", include_cameras={"above": "sync"})
+        assert "cameras" not in wire.ask("step", include_cameras={"above": "sync"})
+    assert caplog.text.count("drawing failed") == 1
+    wire.ask("stop_pie")
+
+
+def test_the_backend_is_looked_for_once() -> None:
+    assert find_backend() is not None
+    assert find_backend() is find_backend()
+
+
+def test_play_can_start_again(play: Play) -> None:
+    wire = play("drop")
+    for _ in range(2):
+        assert wire.ask("step", include_cameras={"above": "sync"})["cameras"]
+        wire.ask("stop_pie")
+        wire.ask("begin_pie")
