@@ -1,4 +1,4 @@
-"""The request socket of a server: one ZeroMQ REP socket, served by one thread.
+"""The request socket of a server: one ZeroMQ REP socket, served by one thread. Also what all its sockets need to bind.
 
 For `SimulatedServer`. Knows frames, not their meaning: whoever opens it says how to answer one.
 """
@@ -18,7 +18,7 @@ import zmq
 
 from urlab_client.protocol.codec import MAX_REQUEST_BYTES
 
-__all__ = ["PortInUse", "ReservedPort", "RpcEndpoint", "connect_host", "numeric_host", "tcp"]
+__all__ = ["PortInUse", "ReservedPort", "RpcEndpoint", "bind_tcp", "connect_host", "numeric_host", "tcp"]
 
 logger = logging.getLogger("urlab_client.server")
 
@@ -121,6 +121,27 @@ def _bind_error(code: int | None, host: str, port: int, option: str) -> OSError:
     return OSError(code, f"cannot bind {tcp(host)}:{port}: {os.strerror(code or 0)}")
 
 
+def bind_tcp(socket: zmq.Socket[bytes], host: str, port: int, option: str) -> int:
+    """Bind a ZeroMQ socket and return its port.
+
+    Args:
+        socket: The socket; options that count from the first connection are set.
+        host: IP address of the interface.
+        port: TCP port; 0 picks a free one.
+        option: Name of the setting, for the error.
+
+    Raises:
+        PortInUse: Somebody has the port.
+        OSError: The address is not one of this machine.
+    """
+    socket.ipv6 = ":" in host
+    try:
+        socket.bind(f"{tcp(host)}:{port}")
+    except zmq.ZMQError as error:
+        raise _bind_error(error.errno, host, port, option) from error
+    return int(socket.get_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
+
+
 class RpcEndpoint:
     """Receives requests one at a time and sends what `answer` returns.
 
@@ -148,14 +169,12 @@ class RpcEndpoint:
         self._socket = self._context.socket(zmq.REP)
         # A frame between the two limits is answered with the reason, one beyond both costs the sender its connection.
         self._socket.maxmsgsize = 2 * MAX_REQUEST_BYTES
-        self._socket.ipv6 = ":" in host
         try:
-            self._socket.bind(f"{tcp(host)}:{port}")
-            self.port = int(self._socket.get_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
-            self._socket.bind(_WAKE)
-        except zmq.ZMQError as error:
+            self.port = bind_tcp(self._socket, host, port, "step_port")
+        except BaseException:
             self._context.destroy(linger=0)
-            raise _bind_error(error.errno, host, port, "step_port") from error
+            raise
+        self._socket.bind(_WAKE)
         self._waker = self._context.socket(zmq.DEALER)
         self._waker.connect(_WAKE)
         self._stopping = False

@@ -22,6 +22,7 @@ import anyio.to_thread
 
 from urlab_client.protocol.enums import CameraMode, PIEState, StepMode
 from urlab_client.protocol.errors import URLabError
+from urlab_client.protocol.rows import CameraEndpoint
 from urlab_client.server.bundled import bundled_models
 from urlab_client.server.content import ContentRoot
 from urlab_client.server.controllers import ControllerConfig
@@ -29,6 +30,7 @@ from urlab_client.server.core import PhysicsConfig, ServerCore
 from urlab_client.server.dispatch import Dispatcher
 from urlab_client.server.endpoint import ReservedPort, RpcEndpoint, connect_host, numeric_host, tcp
 from urlab_client.server.handlers import HANDLERS
+from urlab_client.server.publishing import StreamServer
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.world import World
 
@@ -120,11 +122,11 @@ class SimulatedServer:
             step_mode: `live`, `direct` or `puppet` pins the mode; `auto` starts live and lets clients choose.
             host: Interface to bind, an address or a name.
             step_port: Port of requests; 0 picks a free one, here and below.
-            state_port: Port of the state stream. This version reserves it without serving it, like the next three: a
-                connection is refused.
+            state_port: Port of the state stream. Like the next two it is bound while the server is open, and silent
+                outside play.
             ctrl_port: Port of streamed controls.
             info_port: Port of the info stream.
-            camera_port: Port of camera images.
+            camera_port: Port of camera images. This version reserves it without serving it: a connection is refused.
             saved_dir: Folder of levels and imported models; None for a temporary one that goes when the server closes.
             model_roots: Folders below which clients may import MJCF files. None for the folders of `models`, or the
                 current folder where those name none.
@@ -251,23 +253,23 @@ class SimulatedServer:
 
     @property
     def state_port(self) -> int:
-        """Port of the state stream; reserved, not served yet."""
-        return self._running.reserved["state"].port
+        """Port of the state stream."""
+        return self._running.streams.state_port
 
     @property
     def ctrl_port(self) -> int:
-        """Port of streamed controls; reserved, not served yet."""
-        return self._running.reserved["ctrl"].port
+        """Port of streamed controls."""
+        return self._running.streams.ctrl_port
 
     @property
     def info_port(self) -> int:
-        """Port of the info stream; reserved, not served yet."""
-        return self._running.reserved["info"].port
+        """Port of the info stream."""
+        return self._running.streams.info_port
 
     @property
     def camera_port(self) -> int:
         """Port of camera images; reserved, not served yet."""
-        return self._running.reserved["camera"].port
+        return self._running.camera.port
 
     @property
     def saved_dir(self) -> Path:
@@ -297,7 +299,8 @@ class _Opened:
 
     def __init__(self, config: _Config) -> None:
         self.host = numeric_host(config.host)
-        self.reserved: dict[str, ReservedPort] = {}
+        self._camera: ReservedPort | None = None
+        self._streams: StreamServer | None = None
         self._scratch: Path | None = None
         self._endpoint: RpcEndpoint | None = None
         self._core: ServerCore | None = None
@@ -323,6 +326,20 @@ class _Opened:
         return self._endpoint
 
     @property
+    def streams(self) -> StreamServer:
+        """The sockets of state, controls and info."""
+        if self._streams is None:
+            raise RuntimeError("the server is still starting")
+        return self._streams
+
+    @property
+    def camera(self) -> ReservedPort:
+        """The port of camera images."""
+        if self._camera is None:
+            raise RuntimeError("the server is still starting")
+        return self._camera
+
+    @property
     def saved_dir(self) -> Path:
         """Folder of the content root."""
         if self._core is None:
@@ -330,16 +347,30 @@ class _Opened:
         return self._core.world.content.root
 
     def _start(self, config: _Config) -> None:
-        for name in ("state", "ctrl", "info", "camera"):
-            self.reserved[name] = ReservedPort(self.host, getattr(config.ports, name), f"{name}_port")
+        ports = config.ports
+        self._camera = ReservedPort(self.host, ports.camera, "camera_port")
+        camera_endpoint = f"{tcp(self.host)}:{self._camera.port}"
+        self._streams = StreamServer(
+            lambda scene: [
+                CameraEndpoint(camera.name, camera_endpoint)
+                for index in scene.articulations
+                for camera in index.cameras
+            ],
+            host=self.host,
+            state_port=ports.state,
+            ctrl_port=ports.ctrl,
+            info_port=ports.info,
+        )
         core = ServerCore(
             world=World(self._content(config), actor_names=config.actor_names),
             physics=config.physics,
-            camera_endpoint=f"{tcp(self.host)}:{self.reserved['camera'].port}",
+            camera_endpoint=camera_endpoint,
         )
         self._core = core
+        core.play.listeners.append(self._streams.show)
+        self._streams.start()
         # Bound before the models are read, which takes longer, and answering after: requests wait in the socket.
-        self._endpoint = RpcEndpoint(Dispatcher(core, HANDLERS).answer, host=self.host, port=config.ports.step)
+        self._endpoint = RpcEndpoint(Dispatcher(core, HANDLERS).answer, host=self.host, port=ports.step)
         try:
             _populate(core.world, config.models)
         except Refusal as refusal:
@@ -370,15 +401,19 @@ class _Opened:
         deadline = time.monotonic() + CLOSE_S
         if self._endpoint is not None:
             self._endpoint.stop()
+        if self._streams is not None:
+            self._streams.stop()
         idle = True
         if self._core is not None:
             idle = self._core.play.close(CLOSE_S / 2)
         if self._endpoint is not None:
             idle = self._endpoint.join(max(0.0, deadline - time.monotonic())) and idle
+        if self._streams is not None:
+            idle = self._streams.join(max(0.0, deadline - time.monotonic())) and idle
         if not idle:
             logger.warning("a request was still under way when the server closed; its thread ends after it")
-        for port in self.reserved.values():
-            port.release()
+        if self._camera is not None:
+            self._camera.release()
         if self._scratch is not None:
             shutil.rmtree(self._scratch, ignore_errors=True)
 

@@ -1,0 +1,461 @@
+"""The state, info and control sockets, seen by plain ZeroMQ sockets that know nothing of the package's client."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import logging
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+import zmq
+from wire import Wire, check_numbers, float32, write_level
+
+from urlab_client.protocol.messages.streams import StateSnapshot
+from urlab_client.protocol.rows import (
+    ActionsRow,
+    BaseStateRow,
+    ControlPayload,
+    JointRow,
+    SceneRow,
+    SensorRow,
+    Topic,
+    TwistRow,
+    decode_row,
+    encode_gains,
+)
+from urlab_client.server import SimulatedServer, publishing
+from urlab_client.server.controllers import ControllerConfig
+from urlab_client.server.engine import Engine
+
+Tick = list[tuple[bytes, bytes]]
+
+ROWS = [b"bot/base_state/root", b"bot/joint/j", b"bot/sensor/s", b"bot/twist"]
+
+
+class Bench:
+    """A playing server, an RPC client of it and raw sockets at its other ports."""
+
+    def __init__(self, stack: ExitStack, server: SimulatedServer, wire: Wire) -> None:
+        self.server = server
+        self.wire = wire
+        self._stack = stack
+        self._context = stack.enter_context(zmq.Context())
+
+    def open(self, kind: int, port: int, **options: int) -> zmq.Socket[bytes]:
+        socket = self._stack.enter_context(self._context.socket(kind))
+        socket.linger = 0
+        socket.rcvtimeo = 30_000
+        for name, value in options.items():
+            setattr(socket, name, value)
+        socket.connect(f"{self.server.address}:{port}")
+        return socket
+
+    def subscribe(self, *topics: bytes, **options: int) -> zmq.Socket[bytes]:
+        """Subscribe to the state socket."""
+        socket = self.open(zmq.SUB, self.server.state_port, **options)
+        for topic in topics:
+            socket.subscribe(topic)
+        return socket
+
+    def control(self) -> zmq.Socket[bytes]:
+        """Return a publisher that the server has subscribed to."""
+        publisher = self.open(zmq.XPUB, self.server.ctrl_port)
+        assert {publisher.recv(), publisher.recv()} == {b"\x01bot/control ", b"\x01bot/set_gains "}
+        return publisher
+
+    def hurry(self) -> None:
+        """Have physics tick every 0.1 ms."""
+        with self.engine.lock:
+            self.engine.scene.model.opt.timestep = 1e-4
+
+    @property
+    def engine(self) -> Engine:
+        running = self.server._running._core.play.current
+        assert running is not None
+        return running.engine
+
+
+Play = Callable[..., Bench]
+
+
+@pytest.fixture
+def play(models: Path, connect: Callable[[SimulatedServer], Wire]) -> Iterator[Play]:
+    with ExitStack() as stack:
+
+        def start(*names: str | Path, **options: Any) -> Bench:
+            paths = [models / f"{name}.xml" if isinstance(name, str) else name for name in names or ("bot",)]
+            server = stack.enter_context(SimulatedServer(*paths, play=True, **options))
+            wire = connect(server)
+            wire.hello()
+            return Bench(stack, server, wire)
+
+        yield start
+
+
+def ticks(socket: zmq.Socket[bytes]) -> Iterator[Tick]:
+    """Yield what comes up to and with each snapshot, beginning after the first one."""
+    tick: Tick = []
+    whole = False
+    while True:
+        topic, payload = socket.recv_multipart()
+        tick.append((topic, payload))
+        if topic == b"state/full":
+            if whole:
+                yield tick
+            whole, tick = True, []
+
+
+def snapshot(tick: Tick) -> StateSnapshot:
+    assert tick[-1][0] == b"state/full"
+    return StateSnapshot.decode(tick[-1][1])
+
+
+def rows(tick: Tick) -> list[Any]:
+    return [decode_row(Topic.parse(topic), payload) for topic, payload in tick[:-1]]
+
+
+# The state socket
+
+
+def test_a_live_tick_brings_the_rows_of_each_articulation_and_then_the_snapshot(play: Play) -> None:
+    bench = play("bot", unpaused=True)
+    bench.wire.ask("set_twist", articulation="bot", linear=[0.5, 0.25, 0], angular=[0, 0, -1])
+    stream = ticks(bench.subscribe(b""))
+    tick = next(tick for tick in stream if snapshot(tick).per_articulation["bot"].twist.linear[0])
+    assert [topic for topic, _ in tick] == [*ROWS, b"state/full"]
+    base, joint, sensor, twist = rows(tick)
+    state = snapshot(tick).per_articulation["bot"]
+    assert isinstance(base, BaseStateRow)
+    np.testing.assert_array_equal(base.position, state.qpos[:3].astype(np.float32))
+    np.testing.assert_array_equal(base.quat_xyzw, state.qpos[[4, 5, 6, 3]].astype(np.float32))
+    np.testing.assert_array_equal(base.linear_velocity, state.qvel[:3].astype(np.float32))
+    np.testing.assert_array_equal(base.angular_velocity, state.qvel[3:6].astype(np.float32))
+    assert isinstance(joint, JointRow)
+    assert joint.id == 1
+    assert (joint.position, joint.velocity) == (float32(state.qpos[7]), float32(state.qvel[6]))
+    assert isinstance(sensor, SensorRow)
+    assert sensor.id == 0
+    assert sensor.values.tolist() == [float32(state.sensors["s"][0])]
+    assert twist == TwistRow(0.5, 0.25, -1.0)
+
+
+def test_rows_have_the_sizes_and_ids_of_the_wire(play: Play) -> None:
+    tick = next(ticks(play().subscribe(b"")))
+    assert {topic: len(payload) for topic, payload in tick[:-1]} == dict(zip(ROWS, (52, 16, 12, 12), strict=True))
+    assert tick[0][1] == np.array([0, 0, 1, 0, 0, 0, 1, *[0] * 6], "<f4").tobytes()
+
+
+def test_action_keys_travel_only_while_one_is_down(play: Play) -> None:
+    bench = play()
+    stream = ticks(bench.subscribe(b""))
+    assert b"bot/actions" not in dict(next(stream))
+    twist = bench.engine.control("bot").twist
+    twist.actions = 0b101
+    tick = next(tick for tick in stream if b"bot/actions" in dict(tick))
+    assert [topic for topic, _ in tick] == [*ROWS, b"bot/actions", b"state/full"]
+    assert rows(tick)[-1] == ActionsRow(0b101)
+    assert snapshot(tick).per_articulation["bot"].actions == 0b101
+
+
+def test_scene_rows_come_after_all_articulations_and_in_double_precision(play: Play, tmp_path: Path) -> None:
+    bench = play("bot", "ball", write_level(tmp_path / "level.json", size=0.5, quick_convert=True))
+    tick = next(ticks(bench.subscribe(b"")))
+    topics = [topic for topic, _ in tick]
+    assert topics[: len(ROWS)] == ROWS
+    assert topics[len(ROWS)].startswith(b"ball/base_state/")
+    ((name, crate),) = snapshot(tick).entities.items()
+    scene = topics[topics.index(b"ball/twist") + 1 : -1]
+    assert [topic.decode() for topic in scene] == [f"scene/{name}/{part}" for part in ("xpos", "xquat", "qpos", "qvel")]
+    xpos, xquat, qpos, qvel = (row for row in rows(tick) if isinstance(row, SceneRow))
+    assert tuple(xpos.values) == crate.xpos
+    assert tuple(xquat.values) == crate.xquat
+    np.testing.assert_array_equal(qpos.values, crate.qpos)
+    np.testing.assert_array_equal(qvel.values, crate.qvel)
+
+
+def test_the_snapshot_is_standard_msgpack_of_float64_whatever_the_session_asked_for(play: Play) -> None:
+    bench = play()
+    bench.wire.raw({"op": "hello", "observations": "full"})
+    _, payload = next(ticks(bench.subscribe(b"state/full")))[-1]
+    check_numbers(payload)
+    plain = msgspec.msgpack.decode(payload)
+    assert list(plain) == ["op", "time", "step", "sim_time", "wall_time", "per_articulation", "entities"]
+    assert plain["op"] == "state_full"
+    assert plain["entities"] == {}
+    block = plain["per_articulation"]["bot"]
+    assert set(block) == {"qpos", "qvel", "ctrl", "act", "sensors", "twist", "actions"}
+    assert plain["wall_time"]["nsec"] % 100 == 0
+
+
+def test_live_time_moves_with_every_tick_and_the_counter_does_not(play: Play) -> None:
+    bench = play("bot", unpaused=True)
+    seen = [snapshot(tick) for tick in itertools.islice(ticks(bench.subscribe(b"state/full")), 20)]
+    counts = [round(s.time / 0.002) for s in seen]
+    assert counts == list(range(counts[0], counts[0] + 20))
+    assert {s.step for s in seen} == {0}
+
+
+def test_paused_live_repeats_the_state(play: Play) -> None:
+    stream = ticks(play().subscribe(b""))
+    seen = list(itertools.islice(stream, 5))
+    assert {snapshot(tick).time for tick in seen} == {0.0}
+    assert all([topic for topic, _ in tick] == [*ROWS, b"state/full"] for tick in seen)
+
+
+def test_direct_mode_sends_one_snapshot_per_step_and_no_rows(play: Play) -> None:
+    bench = play()
+    bench.wire.ask("set_mode", mode="direct")
+    stream = ticks(bench.subscribe(b""))
+    next(stream)
+    replies = [bench.wire.ask("step", n_steps=3) for _ in range(5)]
+    seen: dict[float, Tick] = {}
+    while replies[-1]["time"] not in seen:
+        tick = next(stream)
+        seen[snapshot(tick).time] = tick
+    assert {reply["time"] for reply in replies} <= set(seen)
+    assert {topic for tick in seen.values() for topic, _ in tick} == {b"state/full"}
+    last = snapshot(seen[replies[-1]["time"]])
+    assert last.step == 15
+    assert last.per_articulation["bot"].qpos.tolist() == replies[-1]["per_articulation"]["bot"]["qpos"]
+
+
+def test_puppet_mode_shows_the_last_push_and_no_rows(play: Play) -> None:
+    bench = play()
+    bench.wire.ask("set_mode", mode="puppet")
+    stream = ticks(bench.subscribe(b""))
+    next(stream)
+    pushed = [0.0, 0.0, 3.0, 1.0, 0.0, 0.0, 0.0, 0.5]
+    bench.wire.ask("step", qpos=pushed, time=7.0)
+    tick = next(tick for tick in stream if snapshot(tick).step)
+    assert len(tick) == 1
+    assert snapshot(tick).time == 7.0
+    assert snapshot(tick).per_articulation["bot"].qpos.tolist() == pushed
+
+
+def test_rows_return_with_live_mode(play: Play) -> None:
+    bench = play()
+    bench.wire.ask("set_mode", mode="direct")
+    stream = ticks(bench.subscribe(b""))
+    assert len(next(stream)) == 1
+    bench.wire.ask("set_mode", mode="live")
+    assert next(len(tick) for tick in stream if len(tick) > 1) == len(ROWS) + 1
+
+
+def test_a_subscriber_stays_through_play_sessions(play: Play) -> None:
+    bench = play()
+    stream = ticks(bench.subscribe(b"state/full"))
+    bench.wire.ask("set_mode", mode="direct")
+    bench.wire.ask("step")
+    assert next(snapshot(tick).step for tick in stream if snapshot(tick).step) == 1
+    bench.wire.ask("stop_pie")
+    bench.wire.ask("begin_pie")
+    assert next(snapshot(tick).step for tick in stream if not snapshot(tick).step) == 0
+
+
+def test_a_state_beyond_float32_does_not_stop_the_stream(play: Play) -> None:
+    bench = play()
+    bench.wire.ask("set_mode", mode="puppet")
+    bench.wire.ask("step", qpos=[0, 0, 1, 1, 0, 0, 0, 1e300])
+    bench.wire.ask("set_mode", mode="live")
+    bench.wire.ask("set_paused", paused=True)
+    row = decode_row(Topic.parse(b"bot/joint/j"), bench.subscribe(b"bot/joint/j").recv_multipart()[1])
+    assert isinstance(row, JointRow)
+
+
+# What it costs
+
+
+def test_only_what_is_subscribed_to_is_encoded(play: Play, monkeypatch: pytest.MonkeyPatch) -> None:
+    encoded: list[str] = []
+
+    def count(kind: type[Any], name: str) -> None:
+        encode = kind.encode
+        monkeypatch.setattr(kind, "encode", lambda row: encoded.append(name) or encode(row))
+
+    for kind in (JointRow, SensorRow, TwistRow):
+        count(kind, kind.__name__)
+    monkeypatch.setattr(publishing, "encode_reply", lambda reply: encoded.append("snapshot"))
+    socket = play().subscribe(b"bot/joint/")
+    assert {socket.recv_multipart()[0] for _ in range(20)} == {b"bot/joint/j"}
+    assert set(encoded) == {"JointRow"}
+
+
+def test_physics_is_left_alone_while_nobody_subscribes(play: Play) -> None:
+    bench = play("bot", unpaused=True)
+    hooks = bench.engine.on_tick
+    idle = hooks.copy()
+    socket = bench.subscribe(b"bot/joint/", b"state/full")
+    socket.recv_multipart()
+    assert len(hooks) == len(idle) + 1
+    socket.unsubscribe(b"state/full")
+    while socket.recv_multipart()[0] == b"state/full":
+        pass
+    socket.close()
+    assert next(True for _ in bench.wire.until("pie_status") if hooks == idle)
+
+
+def test_a_subscriber_that_never_reads_slows_nobody(play: Play) -> None:
+    bench = play("bot", unpaused=True)
+    bench.hurry()
+    lazy = bench.subscribe(b"", rcvhwm=1, rcvbuf=4096)
+    lazy.recv_multipart()
+    reader = bench.subscribe(b"state/full")
+    first = StateSnapshot.decode(reader.recv_multipart()[1]).time
+    read = 0
+    time = first
+    while time < first + 0.4:  # 4000 ticks of 5 messages; 1000 and what the kernel holds can wait for the lazy one
+        time = StateSnapshot.decode(reader.recv_multipart()[1]).time
+        read += 1
+    sent = read * (len(ROWS) + 1)
+    kept = sum(1 for _ in itertools.takewhile(lambda _: lazy.poll(0) and lazy.recv_multipart(), range(sent)))
+    assert kept < sent
+
+
+def test_closing_does_not_wait_for_subscribers(play: Play) -> None:
+    before = set(threading.enumerate())
+    bench = play("bot", unpaused=True)
+    bench.subscribe(b"", rcvhwm=1).recv_multipart()
+    bench.control()
+    bench.server.close()
+    assert {thread for thread in threading.enumerate() if thread.name.startswith("urlab")} <= before
+
+
+# The control socket
+
+
+def test_streamed_set_points_reach_the_actuators_by_global_id(play: Play) -> None:
+    bench = play()
+    payload = ControlPayload(np.array([99, 0, -1]), np.array([5.0, 0.1, 7.0], np.float32)).encode()
+    bench.control().send_multipart([b"bot/control ", payload + b"surplus"])
+    for reply in bench.wire.until("forward"):
+        (ctrl,) = reply["per_articulation"]["bot"]["ctrl"]
+        if ctrl:
+            assert ctrl == float32(0.1)
+            break
+
+
+def test_ids_are_global_whatever_the_topic_says(play: Play, models: Path) -> None:
+    bench = play("bot", "limited")
+    publisher = bench.open(zmq.XPUB, bench.server.ctrl_port)
+    assert len({publisher.recv() for _ in range(4)}) == 4
+    payload = ControlPayload(np.array([1]), np.array([0.5], np.float32)).encode()
+    publisher.send_multipart([b"bot/control ", payload])
+    for reply in bench.wire.until("forward"):
+        if reply["per_articulation"]["bot_1"]["ctrl"] == [0.5]:
+            assert reply["per_articulation"]["bot"]["ctrl"] == [0.0]
+            break
+
+
+def test_set_points_streamed_outside_live_mode_are_lost(play: Play, caplog: pytest.LogCaptureFixture) -> None:
+    bench = play()
+    bench.wire.ask("set_mode", mode="direct")
+    stream = ticks(bench.subscribe(b"state/full"))
+    next(stream)
+    publisher = bench.control()
+    with caplog.at_level(logging.WARNING, "urlab_client.server"):
+        publisher.send_multipart([b"bot/control ", ControlPayload(np.array([0]), np.array([0.5])).encode()])
+        publisher.send_multipart([b"bot/control ", b"\x05"])
+        assert next(True for _ in bench.wire.until("pie_status") if "control message is ignored" in caplog.text)
+    # A snapshot made after that was published after the commands were dealt with.
+    bench.wire.ask("step")
+    assert next(True for tick in stream if snapshot(tick).step)
+    bench.wire.ask("set_mode", mode="live")
+    moved = next(s for s in map(snapshot, stream) if s.time > 0.01)
+    assert moved.per_articulation["bot"].ctrl.tolist() == [0.0]
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [
+        [b"bot/control "],
+        [b"bot/control ", b""],
+        [b"bot/control ", b"\x02\0\0\0\0\0\0\0"],
+        [b"bot/control ", b"\xff\xff\xff\xff"],
+        [b"bot/set_gains ", b"{"],
+        [b"bot/set_gains ", b'{"m": 3}'],
+        [b"bot/set_gains ", b'{"nobody": {"kp": 3}}'],
+    ],
+)
+def test_a_bad_message_disturbs_nothing(play: Play, frames: list[bytes]) -> None:
+    bench = play()
+    publisher = bench.control()
+    publisher.send_multipart(frames)
+    publisher.send_multipart([b"bot/control ", ControlPayload(np.array([0]), np.array([0.5])).encode()])
+    assert next(True for reply in bench.wire.until("forward") if reply["per_articulation"]["bot"]["ctrl"] == [0.5])
+
+
+def test_streamed_gains_reach_the_controller(play: Play) -> None:
+    bench = play(controllers={"*": ControllerConfig()})
+    gains = {"m": {"kp": 7.0, "torque_limit": 0.1}}
+    bench.control().send_multipart([b"bot/set_gains ", encode_gains(msgspec.convert(gains, dict[str, Any]))])
+    for reply in bench.wire.until("configure_controller", articulation="bot", params={}):
+        if reply["params"]["kp"] == {"m": 7.0}:
+            assert reply["params"]["torque_limit"] == {"m": float32(0.1)}
+            assert reply["params"]["kv"] == {"m": 5.0}
+            break
+
+
+def test_the_server_listens_only_while_play_lasts(play: Play) -> None:
+    bench = play()
+    publisher = bench.control()
+    bench.wire.ask("stop_pie")
+    assert {publisher.recv(), publisher.recv()} == {b"\x00bot/control ", b"\x00bot/set_gains "}
+    bench.wire.ask("begin_pie")
+    assert {publisher.recv(), publisher.recv()} == {b"\x01bot/control ", b"\x01bot/set_gains "}
+
+
+# The info socket
+
+
+def test_info_describes_every_articulation_in_one_frame_each(play: Play) -> None:
+    bench = play("bot", "limited")
+    bench.hurry()
+    socket = bench.open(zmq.SUB, bench.server.info_port)
+    socket.subscribe(b"")
+    frames = [socket.recv_multipart() for _ in range(2)]
+    assert [len(message) for message in frames] == [1, 1]
+    bot, limited = (json.loads(message[0]) for message in frames)
+    endpoint = f"tcp://127.0.0.1:{bench.server.camera_port}"
+    assert bot == {
+        "type": "actuator_list",
+        "robot": "bot",
+        "names": ["bot_m"],
+        "ids": [0],
+        "mins": [-1.0],
+        "maxs": [1.0],
+        "camera_list": [{"name": "cam", "endpoint": endpoint}, {"name": "cam", "endpoint": endpoint}],
+    }
+    assert (limited["robot"], limited["ids"], limited["mins"], limited["maxs"]) == ("bot_1", [1], [-100.0], [100.0])
+
+
+def test_info_pauses_outside_live_mode(play: Play) -> None:
+    bench = play()
+    bench.wire.ask("set_mode", mode="direct")
+    socket = bench.open(zmq.SUB, bench.server.info_port)
+    socket.subscribe(b"")
+    stream = ticks(bench.subscribe(b"state/full"))
+    next(stream)
+    for _ in range(60):
+        bench.wire.ask("step")
+    assert next(True for tick in stream if snapshot(tick).step == 60)
+    assert not socket.poll(0)
+
+
+def test_info_comes_often_at_first_and_rarely_later() -> None:
+    due = list(itertools.takewhile(lambda tick: tick <= 4000, _info_ticks()))
+    assert due[:3] == [50, 100, 150]
+    assert due[49:] == [2500, 3000, 3500, 4000]
+
+
+def _info_ticks() -> Iterator[int]:
+    tick = 0
+    while True:
+        tick = publishing.next_info(tick)
+        yield tick
