@@ -39,10 +39,10 @@ def apply(tree: Path, block: Block) -> None:
     name, _, anchor = rest.partition(" before: ")
     path = tree / name
     lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
-    where = len(lines)
+    where, gap = len(lines), "\n\n" if path.suffix == ".py" else ""
     if kind == "insert":
-        (where,) = [number for number, line in enumerate(lines) if line.strip() == anchor]
-    path.write_text("".join([*lines[:where], block.code, *lines[where:]]), encoding="utf-8")
+        (where,), gap = [number for number, line in enumerate(lines) if line.strip() == anchor], ""
+    path.write_text("".join([*lines[:where], gap, block.code, *lines[where:]]), encoding="utf-8")
 
 
 @pytest.fixture(scope="module")
