@@ -254,7 +254,7 @@ def test_a_frame_beyond_the_limit_is_answered(idle: Wire) -> None:
 @pytest.fixture
 def core(tmp_path: Path) -> ServerCore:
     world = World(ContentRoot(tmp_path))
-    return ServerCore(world=world, physics=PhysicsConfig(), camera_endpoint="tcp://127.0.0.1:5558")
+    return ServerCore(world=world, physics=PhysicsConfig(), camera_endpoint=lambda *_: "tcp://127.0.0.1:5558")
 
 
 def ask(dispatcher: Dispatcher, transport: Transport = Transport.ZMQ, **request: Any) -> dict[str, Any]:

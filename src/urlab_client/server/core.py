@@ -6,7 +6,7 @@ For the handlers, which get it as their first argument, and for `SimulatedServer
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -70,7 +70,7 @@ class ServerCore:
     Attributes:
         world: The level being edited.
         physics: How play sessions are set up.
-        camera_endpoint: Where camera images will be published.
+        camera_endpoint: Returns where a camera publishes, from articulation key and camera name.
         session: The client's session.
         play: The play session.
         viewport: The viewport's camera.
@@ -79,7 +79,7 @@ class ServerCore:
 
     world: World
     physics: PhysicsConfig
-    camera_endpoint: str
+    camera_endpoint: Callable[[str, str], str]
     session: Session = field(default_factory=Session)
     play: Play = field(default_factory=Play)
     viewport: Viewport = field(default_factory=Viewport)

@@ -18,7 +18,7 @@ import zmq
 
 from urlab_client.protocol.codec import MAX_REQUEST_BYTES
 
-__all__ = ["PortInUse", "ReservedPort", "RpcEndpoint", "bind_tcp", "connect_host", "numeric_host", "tcp"]
+__all__ = ["PortInUse", "RpcEndpoint", "bind_tcp", "connect_host", "numeric_host", "tcp"]
 
 logger = logging.getLogger("urlab_client.server")
 
@@ -85,34 +85,6 @@ def connect_host(host: str) -> str:
 def tcp(host: str) -> str:
     """Return the address of an IP address, without a port."""
     return f"tcp://[{host}]" if ":" in host else f"tcp://{host}"
-
-
-class ReservedPort:
-    """A TCP port that nothing listens on yet and nobody else can take. A client that connects is refused."""
-
-    def __init__(self, host: str, port: int, option: str) -> None:
-        """Bind it.
-
-        Args:
-            host: IP address of the interface.
-            port: TCP port; 0 picks a free one.
-            option: Name of the setting, for the error.
-
-        Raises:
-            PortInUse: Somebody has it.
-            OSError: The address is not one of this machine.
-        """
-        self._socket = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
-        try:
-            self._socket.bind((host, port))
-        except OSError as error:
-            self._socket.close()
-            raise _bind_error(error.errno, host, port, option) from error
-        self.port = int(self._socket.getsockname()[1])
-
-    def release(self) -> None:
-        """Give the port back. Safe to call twice."""
-        self._socket.close()
 
 
 def _bind_error(code: int | None, host: str, port: int, option: str) -> OSError:

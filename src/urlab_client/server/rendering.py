@@ -246,6 +246,11 @@ class CameraStudio:
         self._broken = False
         self._closed = False
 
+    @property
+    def keys(self) -> list[str]:
+        """All cameras as `ARTICULATION/CAMERA`."""
+        return list(self._by_name)
+
     def shots(self, include_cameras: bool | Mapping[str, str | None]) -> list[Shot]:
         """Return what a request's `include_cameras` asks for; unknown names are left out."""
         if isinstance(include_cameras, bool):

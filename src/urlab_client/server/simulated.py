@@ -24,11 +24,12 @@ from urlab_client.protocol.enums import CameraMode, PIEState, StepMode
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.rows import CameraEndpoint
 from urlab_client.server.bundled import bundled_models
+from urlab_client.server.camera_streams import CameraStreams
 from urlab_client.server.content import ContentRoot
 from urlab_client.server.controllers import ControllerConfig
 from urlab_client.server.core import PhysicsConfig, ServerCore
 from urlab_client.server.dispatch import Dispatcher
-from urlab_client.server.endpoint import ReservedPort, RpcEndpoint, connect_host, numeric_host, tcp
+from urlab_client.server.endpoint import RpcEndpoint, connect_host, numeric_host, tcp
 from urlab_client.server.handlers import HANDLERS
 from urlab_client.server.publishing import StreamServer
 from urlab_client.server.refusal import Refusal
@@ -126,7 +127,7 @@ class SimulatedServer:
                 outside play.
             ctrl_port: Port of streamed controls.
             info_port: Port of the info stream.
-            camera_port: Port of camera images. This version reserves it without serving it: a connection is refused.
+            camera_port: Port of the first camera's images; the other cameras get the free ports after it.
             saved_dir: Folder of levels and imported models; None for a temporary one that goes when the server closes.
             model_roots: Folders below which clients may import MJCF files. None for the folders of `models`, or the
                 current folder where those name none.
@@ -268,8 +269,8 @@ class SimulatedServer:
 
     @property
     def camera_port(self) -> int:
-        """Port of camera images; reserved, not served yet."""
-        return self._running.camera.port
+        """Port of the first camera's images; `hello` names those of the others."""
+        return self._running.cameras.port
 
     @property
     def saved_dir(self) -> Path:
@@ -299,7 +300,7 @@ class _Opened:
 
     def __init__(self, config: _Config) -> None:
         self.host = numeric_host(config.host)
-        self._camera: ReservedPort | None = None
+        self._cameras: CameraStreams | None = None
         self._streams: StreamServer | None = None
         self._scratch: Path | None = None
         self._endpoint: RpcEndpoint | None = None
@@ -333,11 +334,11 @@ class _Opened:
         return self._streams
 
     @property
-    def camera(self) -> ReservedPort:
-        """The port of camera images."""
-        if self._camera is None:
+    def cameras(self) -> CameraStreams:
+        """The sockets of camera images."""
+        if self._cameras is None:
             raise RuntimeError("the server is still starting")
-        return self._camera
+        return self._cameras
 
     @property
     def saved_dir(self) -> Path:
@@ -348,11 +349,10 @@ class _Opened:
 
     def _start(self, config: _Config) -> None:
         ports = config.ports
-        self._camera = ReservedPort(self.host, ports.camera, "camera_port")
-        camera_endpoint = f"{tcp(self.host)}:{self._camera.port}"
+        cameras = self._cameras = CameraStreams(host=self.host, port=ports.camera)
         self._streams = StreamServer(
             lambda scene: [
-                CameraEndpoint(camera.name, camera_endpoint)
+                CameraEndpoint(camera.name, cameras.endpoint(index.key, camera.name))
                 for index in scene.articulations
                 for camera in index.cameras
             ],
@@ -364,10 +364,11 @@ class _Opened:
         core = ServerCore(
             world=World(self._content(config), actor_names=config.actor_names),
             physics=config.physics,
-            camera_endpoint=camera_endpoint,
+            camera_endpoint=cameras.endpoint,
         )
         self._core = core
-        core.play.listeners.append(self._streams.show)
+        core.play.listeners += [cameras.show, self._streams.show]  # the second announces the first's ports
+        cameras.start()
         self._streams.start()
         # Bound before the models are read, which takes longer, and answering after: requests wait in the socket.
         self._endpoint = RpcEndpoint(Dispatcher(core, HANDLERS).answer, host=self.host, port=ports.step)
@@ -403,6 +404,8 @@ class _Opened:
             self._endpoint.stop()
         if self._streams is not None:
             self._streams.stop()
+        if self._cameras is not None:
+            self._cameras.stop()
         idle = True
         if self._core is not None:
             idle = self._core.play.close(CLOSE_S / 2)
@@ -410,10 +413,10 @@ class _Opened:
             idle = self._endpoint.join(max(0.0, deadline - time.monotonic())) and idle
         if self._streams is not None:
             idle = self._streams.join(max(0.0, deadline - time.monotonic())) and idle
+        if self._cameras is not None:
+            idle = self._cameras.join(max(0.0, deadline - time.monotonic())) and idle
         if not idle:
             logger.warning("a request was still under way when the server closed; its thread ends after it")
-        if self._camera is not None:
-            self._camera.release()
         if self._scratch is not None:
             shutil.rmtree(self._scratch, ignore_errors=True)
 

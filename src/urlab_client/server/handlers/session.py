@@ -24,6 +24,7 @@ from urlab_client.protocol.messages.session import (
     MetaOk,
     OpInfo,
     OriginalNames,
+    ReplayProgress,
     Reset,
     ResetOk,
     Step,
@@ -106,7 +107,7 @@ def _articulation(server: ServerCore, control: ArticulationControl) -> Articulat
                 mode=server.physics.camera_mode(index, camera.name),
                 resolution=camera.resolution,
                 fovy=float32(camera.fovy),
-                zmq_endpoint=server.camera_endpoint,
+                zmq_endpoint=server.camera_endpoint(index.key, camera.name),
                 zmq_topic=f"{index.key}/camera/{camera.name}",
             )
             for camera in index.cameras
@@ -187,6 +188,9 @@ def _observe_step(running: Running, level: ObservationLevel) -> StepOk:
         wall_time=wall_clock(),
         per_articulation=observer.articulations(level),
         entities=observer.entities(),
+        replay=None
+        if engine.replay is None
+        else ReplayProgress(current_frame=engine.replay.current_frame, total_frames=engine.replay.total_frames),
     )
 
 

@@ -1,0 +1,130 @@
+"""Camera images of live mode, received with a bare SUB socket."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zmq
+from wire import Wire
+
+from urlab_client.server import SimulatedServer
+
+ROBOT = """
+<mujoco model="robot">
+  <worldbody>
+    <camera name="wrist" pos="0 0 3" resolution="16 12"/>
+    <camera name="wrist2" pos="0 0 3" resolution="8 6"/>
+    <camera name="far" pos="0 0 9" resolution="8 6"/>
+    <body name="base"><freejoint name="root"/><geom name="box" type="box" size="4 4 .5" mass="1"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Path:
+    path = tmp_path / "robot.xml"
+    path.write_text(ROBOT)
+    return path
+
+
+@pytest.fixture
+def server(robot: Path) -> Iterator[SimulatedServer]:
+    with SimulatedServer(robot, play=True, camera_modes={"robot/wrist": "depth"}) as server:
+        yield server
+
+
+@pytest.fixture
+def subscribe() -> Iterator[Callable[[str, str], zmq.Socket[bytes]]]:
+    sockets: list[zmq.Socket[bytes]] = []
+    with zmq.Context() as context:
+
+        def make(endpoint: str, topic: str) -> zmq.Socket[bytes]:
+            socket = context.socket(zmq.SUB)
+            sockets.append(socket)
+            socket.linger = 0
+            socket.rcvtimeo = 30_000
+            socket.connect(endpoint)
+            socket.subscribe(topic)
+            return socket
+
+        yield make
+        for socket in sockets:
+            socket.close()
+
+
+def topics(wire: Wire) -> dict[str, Any]:
+    return wire.hello()["articulations"][0]["camera_topics"]
+
+
+def test_each_camera_has_its_port_from_the_first_on(
+    server: SimulatedServer, connect: Callable[[SimulatedServer], Wire]
+) -> None:
+    found = topics(connect(server))
+    ports = [int(found[name]["zmq_endpoint"].rpartition(":")[2]) for name in ("wrist", "wrist2", "far")]
+    assert ports[0] == server.camera_port
+    assert ports == sorted(set(ports))
+    assert all(camera["zmq_endpoint"].startswith("tcp://127.0.0.1:") for camera in found.values())
+
+
+def test_messages_are_topic_and_pixels(
+    server: SimulatedServer, connect: Callable[[SimulatedServer], Wire], subscribe: Any
+) -> None:
+    found = topics(connect(server))
+    wrist, far = found["wrist"], found["far"]
+    for_wrist = subscribe(wrist["zmq_endpoint"], wrist["zmq_topic"] + " ")
+    for_far = subscribe(far["zmq_endpoint"], "")
+    for _ in range(2):
+        topic, data = for_wrist.recv_multipart()
+        assert topic == b"robot/camera/wrist "
+        assert np.frombuffer(data, "<f4").reshape(12, 16) == pytest.approx(np.full((12, 16), 250.0), rel=1e-4)
+    topic, data = for_far.recv_multipart()
+    assert topic == b"robot/camera/far "
+    assert len(data) == 8 * 6 * 4
+
+
+def test_the_stream_shows_live_physics(
+    server: SimulatedServer, connect: Callable[[SimulatedServer], Wire], subscribe: Any
+) -> None:
+    wire = connect(server)
+    wrist = topics(wire)["wrist"]
+    socket = subscribe(wrist["zmq_endpoint"], wrist["zmq_topic"] + " ")
+    socket.recv_multipart()
+    wire.ask("set_paused", paused=False)
+    while np.frombuffer(socket.recv_multipart()[1], "<f4").min() < 300.0:
+        pass
+
+
+def test_stepped_modes_publish_nothing(
+    server: SimulatedServer, connect: Callable[[SimulatedServer], Wire], subscribe: Any
+) -> None:
+    wire = connect(server)
+    wrist = topics(wire)["wrist"]
+    wire.ask("set_mode", mode="direct")
+    socket = subscribe(wrist["zmq_endpoint"], wrist["zmq_topic"] + " ")
+    wire.ask("set_paused", paused=False)
+    for _ in range(3):
+        reply = wire.ask("step", n_steps=50, include_cameras={"wrist": "sync"})
+    last = np.frombuffer(reply["cameras"]["wrist"]["data"], "<f4").min()
+    wire.ask("set_mode", mode="live")
+    topic, data = socket.recv_multipart()
+    assert topic == b"robot/camera/wrist "
+    assert np.frombuffer(data, "<f4").min() >= last
+
+
+def test_streams_survive_a_new_play_session(
+    server: SimulatedServer, connect: Callable[[SimulatedServer], Wire], subscribe: Any
+) -> None:
+    wire = connect(server)
+    before = topics(wire)
+    wire.ask("stop_pie")
+    wire.ask("begin_pie")
+    found = topics(wire)
+    assert found.keys() == before.keys()
+    for camera in found.values():
+        socket = subscribe(camera["zmq_endpoint"], camera["zmq_topic"] + " ")
+        assert socket.recv_multipart()[0] == camera["zmq_topic"].encode() + b" "
