@@ -198,8 +198,6 @@ async def test_what_this_server_cannot_do_yet_says_so(connect: Any) -> None:
     with SimulatedServer("ball", play=True) as server:
         client = connect(server)
         await client.discover()
-        with pytest.raises(Unsupported, match="recording_start"):
-            await client.recording.start()
         with pytest.raises(Unsupported, match="reflections"):
             await client.viewport.set_mode("reflections")
 

@@ -108,7 +108,8 @@ class Dispatcher:
                 name = incoming.name or name
                 return encode_reply(self._serve(incoming, transport), json=self._core.session.json)
             except Refusal as refusal:
-                error = ErrorReply(code=refusal.code, message=refusal.message)
+                path = refusal.absolute_path if refusal.code == "path_not_writable" else None
+                error = ErrorReply(code=refusal.code, message=refusal.message, absolute_path=path)
             except Exception as failure:
                 logger.exception("%s failed", name)
                 error = ErrorReply(

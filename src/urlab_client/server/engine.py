@@ -24,6 +24,7 @@ from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.messages.session import ArticulationCommand, Step
 from urlab_client.server.controllers import ArticulationControl, ControllerConfig, ControlSource, Twist, float32
 from urlab_client.server.refusal import Refusal
+from urlab_client.server.replay import Player
 from urlab_client.server.scene import Scene
 
 __all__ = ["DataLock", "Engine", "parse_control_source", "parse_mode"]
@@ -150,6 +151,7 @@ class Engine:
         self._speed = 100.0
         self._step_count = 0
         self._fault: str | None = None
+        self._player: Player | None = None
         self._step_timeout_s = step_timeout_s
         self._inline_budget_s = INLINE_SHARE * step_timeout_s
         self._substep_s = math.inf
@@ -245,6 +247,33 @@ class Engine:
     def fault(self) -> str | None:
         """What stopped physics, or None. Cleared by a reset, by unpausing and by a change of mode."""
         return self._fault
+
+    @property
+    def replay(self) -> Player | None:
+        """What plays in place of physics in a stepped mode, or None."""
+        return self._player
+
+    def begin_replay(self, make: Callable[[], Player]) -> None:
+        """Reset data and set-points, unpause, and from now on let steps play instead of integrating.
+
+        Args:
+            make: Makes the player once the data are reset.
+
+        Raises:
+            Refusal: `not_ready` with MuJoCo's text.
+        """
+        with self.lock:
+            self.reset()
+            for control in self.controls.values():
+                control.set_points.network[:] = 0.0
+                control.set_points.ui[:] = 0.0
+            self._player = make()
+            self._set_paused(False)
+
+    def end_replay(self) -> None:
+        """Let steps integrate again; the state stays where the replay left it."""
+        with self.lock:
+            self._player = None
 
     def find(self, key: str) -> ArticulationControl | None:
         """Return the articulation with this key, preferring the exact spelling to another case; None if unknown."""
@@ -383,6 +412,7 @@ class Engine:
                 self._tick_if_due()
                 self._drop_queue(Refusal("step_timeout", f"the step was dropped by a switch to step mode '{mode}'"))
                 self._mode = mode
+                self._player = None
                 if mode is not StepMode.LIVE:
                     self._set_paused(False)
                 self._slot = -math.inf
@@ -500,7 +530,20 @@ class Engine:
         for control in self.controls.values():
             control.apply(self._qpos, self._qvel, self._ctrl, raw=control in raw)
 
+    def _play(self, player: Player, n_steps: int) -> None:
+        self._tick_if_due()
+        n_steps = max(1, n_steps)
+        try:
+            player.advance(n_steps)
+        except Exception as error:
+            raise self._fail(error) from error
+        self._step_count += n_steps
+        self._tick_due = bool(self.on_tick)
+
     def _run_direct(self, request: Step) -> None:
+        if self._player is not None:
+            self._play(self._player, request.n_steps)
+            return
         commands = request.per_articulation or {}
         self._stage_positional(request)
         raw = self._stage_named(commands)
@@ -539,6 +582,9 @@ class Engine:
             n_steps -= count
 
     def _push(self, request: Step) -> None:
+        if self._player is not None:
+            self._play(self._player, request.n_steps)
+            return
         self._tick_if_due()
         for values, target in ((request.qpos, self._qpos), (request.qvel, self._qvel), (request.ctrl, self._ctrl)):
             if values is not None and len(values) == len(target):

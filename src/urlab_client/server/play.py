@@ -11,13 +11,16 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 from urlab_client.protocol.enums import PIEState
 from urlab_client.server.engine import Engine
 from urlab_client.server.observe import Observer
+from urlab_client.server.options import OptionOverrides
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rendering import CameraStudio
+from urlab_client.server.replay import ReplaySessions
 from urlab_client.server.scene import CompileFailed, Scene
 
 __all__ = ["Play", "Running"]
@@ -42,6 +45,16 @@ class Running:
     engine: Engine
     observer: Observer
     cameras: CameraStudio
+
+    @cached_property
+    def options(self) -> OptionOverrides:
+        """What `set_sim_options` remembers."""
+        return OptionOverrides(self.scene.model)
+
+    @cached_property
+    def sessions(self) -> ReplaySessions:
+        """The recorded sessions."""
+        return ReplaySessions(self.scene)
 
     def close(self, timeout: float = 1.0) -> bool:
         """End it within about `timeout` seconds; return False when something was still busy then."""

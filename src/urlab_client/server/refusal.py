@@ -11,13 +11,16 @@ class Refusal(Exception):
     Attributes:
         code: Stable wire code, for example `spawn_failed`.
         message: What was wrong, where, and what would be right; one line.
+        absolute_path: The file that could not be written; `recording_save` only.
     """
 
     code: str
     message: str
+    absolute_path: str | None
 
-    def __init__(self, code: str, message: str) -> None:
+    def __init__(self, code: str, message: str, *, absolute_path: str | None = None) -> None:
         super().__init__(code, message)
+        self.absolute_path = absolute_path
         self.code = code
         self.message = message
 

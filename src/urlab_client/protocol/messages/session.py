@@ -29,6 +29,7 @@ __all__ = [
     "OpInfo",
     "OriginalNames",
     "Perturbation",
+    "ReplayProgress",
     "Reset",
     "ResetOk",
     "Step",
@@ -118,12 +119,20 @@ class StateReply(Reply, kw_only=True, omit_defaults=True):
     wall_time: Annotated[Clock | None, doc("UTC when the reply was built.")] = None
 
 
+class ReplayProgress(Struct, kw_only=True):
+    """Where a replay stands."""
+
+    current_frame: Annotated[int, doc("Index, from 0, of the newest frame that has been reached.")]
+    total_frames: Annotated[int, doc("Frames of the session.")]
+
+
 class StepOk(StateReply, tag="step_ok", kw_only=True, omit_defaults=True):
     """State after the step."""
 
     entities: Annotated[dict[str, EntityState] | None, doc("Plain entities by name.")] = None
     cameras: Annotated[dict[str, CameraFrame] | None, doc("Frames, keyed exactly as requested.")] = None
     perturbation: Annotated[Perturbation | None, doc("Only in puppet mode pinned by the project.")] = None
+    replay: Annotated[ReplayProgress | None, doc("While a recording plays; the plugin never sends it.")] = None
 
 
 class ArticulationCommand(Struct, kw_only=True, omit_defaults=True):

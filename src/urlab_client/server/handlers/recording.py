@@ -1,0 +1,192 @@
+"""Handlers of the `recording` and `replay` ops."""
+
+# ruff: noqa: D103 - what an op does stands once, on its request struct
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Final
+
+from urlab_client.protocol.enums import StepMode
+from urlab_client.protocol.messages.recording import (
+    RecordingClear,
+    RecordingClearOk,
+    RecordingSave,
+    RecordingSaveOk,
+    RecordingStart,
+    RecordingStartOk,
+    RecordingStop,
+    RecordingStopOk,
+    ReplayListSessions,
+    ReplayListSessionsOk,
+    ReplayLoad,
+    ReplayLoadOk,
+    ReplaySetActive,
+    ReplaySetActiveOk,
+    ReplayStart,
+    ReplayStartOk,
+    ReplayStop,
+    ReplayStopOk,
+)
+from urlab_client.server.content import write_atomic
+from urlab_client.server.controllers import float32
+from urlab_client.server.core import ServerCore
+from urlab_client.server.dispatch import handles
+from urlab_client.server.play import Running
+from urlab_client.server.recording import LIVE_SESSION, duration, encode_json
+from urlab_client.server.refusal import Refusal
+from urlab_client.server.replay import Player, ReplaySessions
+from urlab_client.server.requests import need
+
+UNLIMITED_S: Final = 3.4028234663852886e38
+"""The largest float32."""
+
+
+def _folder(server: ServerCore) -> Path:
+    return server.world.content.root / "URLab" / "Replays"
+
+
+def _sessions(server: ServerCore) -> tuple[Running, ReplaySessions]:
+    running = server.play.running()
+    running.sessions.scan(_folder(server))
+    return running, running.sessions
+
+
+def _locate(server: ServerCore, path: str, code: str) -> Path:
+    """Return the file meant by a request: relative to the replay directory, and below a folder open to clients.
+
+    Raises:
+        Refusal: `code`, when it lies elsewhere once links are resolved, or is no usable path.
+    """
+    content = server.world.content
+    try:
+        file = Path(os.path.abspath(_folder(server) / path))
+        real = file.resolve()
+    except (OSError, ValueError, RuntimeError) as error:  # too long, a null byte, a loop of links
+        raise Refusal(code, f"{path!r} is no usable path: {error}", absolute_path=path) from None
+    roots = (content.root, *content.model_roots)
+    if not any(real.is_relative_to(root) and real != root for root in roots):
+        text = ", ".join(map(str, roots))
+        raise Refusal(code, f"{file} lies outside the folders of recordings ({text})", absolute_path=str(file))
+    return real
+
+
+@handles(RecordingStart)
+def recording_start(server: ServerCore, request: RecordingStart) -> RecordingStartOk:
+    running, sessions = _sessions(server)
+    engine, live = running.engine, sessions.live
+    limit = request.max_duration_s
+    limit = UNLIMITED_S if limit is None else float32(limit)
+    with engine.lock:
+        if live.capture in engine.on_substep:
+            raise Refusal("recording_already_active", "a recording runs already: stop it first")
+        engine.end_replay()
+        live.start(limit)
+        sessions.active = LIVE_SESSION
+        engine.on_substep.append(live.capture)
+    return RecordingStartOk(name=LIVE_SESSION, max_duration_s=limit)
+
+
+@handles(RecordingStop)
+def recording_stop(server: ServerCore, request: RecordingStop) -> RecordingStopOk:
+    del request
+    running, sessions = _sessions(server)
+    live = sessions.live
+    with running.engine.lock:
+        if live.capture not in running.engine.on_substep:
+            raise Refusal("recording_not_active", "no recording runs")
+        running.engine.on_substep.remove(live.capture)
+        return RecordingStopOk(name=LIVE_SESSION, frame_count=len(live.frames), sim_duration_s=duration(live.frames))
+
+
+@handles(RecordingSave)
+def recording_save(server: ServerCore, request: RecordingSave) -> RecordingSaveOk:
+    running, sessions = _sessions(server)
+    file = _locate(server, request.path or "recording.json", "path_not_writable")
+    with running.engine.lock:
+        frames = sessions.frames
+    # The plugin sends no text with these two.
+    if not frames:
+        raise Refusal("path_not_writable", "", absolute_path=str(file))
+    if file.exists() and not _is_recording(file):
+        raise Refusal("path_not_writable", f"{file} exists and is no recording", absolute_path=str(file))
+    try:
+        write_atomic(file, encode_json(frames))
+    except OSError:
+        raise Refusal("path_not_writable", "", absolute_path=str(file)) from None
+    return RecordingSaveOk(absolute_path=str(file))
+
+
+def _is_recording(file: Path) -> bool:
+    """Whether a file may be replaced: a client must not overwrite models and levels."""
+    try:
+        with file.open("rb") as stream:
+            start = stream.read(64)
+    except OSError:
+        return False
+    text = start.replace(b"\0", b"").lstrip(b"\xff\xfe\xef\xbb\xbf \t\r\n")
+    return text[:1] == b"{" and text[1:].lstrip()[:8].lower() == b'"frames"'
+
+
+@handles(RecordingClear)
+def recording_clear(server: ServerCore, request: RecordingClear) -> RecordingClearOk:
+    del request
+    running, sessions = _sessions(server)
+    with running.engine.lock:
+        sessions.live.clear()
+    return RecordingClearOk()
+
+
+@handles(ReplayLoad)
+def replay_load(server: ServerCore, request: ReplayLoad) -> ReplayLoadOk:
+    _, sessions = _sessions(server)
+    path = need(request, request.path, "path")
+    file = _locate(server, path, "path_not_readable")
+    try:
+        return ReplayLoadOk(name=sessions.load(file))
+    except FileNotFoundError:
+        raise Refusal("path_not_readable", f"{path}: {file} does not exist") from None
+    except (OSError, ValueError) as error:
+        raise Refusal("path_not_readable", f"{path}: {error}") from None
+
+
+@handles(ReplayListSessions)
+def replay_list_sessions(server: ServerCore, request: ReplayListSessions) -> ReplayListSessionsOk:
+    del request
+    return ReplayListSessionsOk(sessions=_sessions(server)[1].names)
+
+
+@handles(ReplaySetActive)
+def replay_set_active(server: ServerCore, request: ReplaySetActive) -> ReplaySetActiveOk:
+    _, sessions = _sessions(server)
+    name = need(request, request.name, "name")
+    if not sessions.activate(name):
+        raise Refusal("replay_session_not_found", name)
+    return ReplaySetActiveOk()
+
+
+@handles(ReplayStart)
+def replay_start(server: ServerCore, request: ReplayStart) -> ReplayStartOk:
+    del request
+    running, sessions = _sessions(server)
+    engine = running.engine
+    with engine.lock:
+        if engine.mode not in (StepMode.DIRECT, StepMode.PUPPET):
+            raise Refusal("replay_requires_stepped", "a replay needs step mode direct or puppet: call set_mode first")
+        if sessions.live.capture in engine.on_substep:
+            engine.on_substep.remove(sessions.live.capture)
+        frames = sessions.frames
+        if frames:
+            relative = sessions.active != LIVE_SESSION
+            engine.begin_replay(lambda: Player(running.scene, frames, relative=relative))
+        return ReplayStartOk(active_session=sessions.active, total_frames=len(frames))
+
+
+@handles(ReplayStop)
+def replay_stop(server: ServerCore, request: ReplayStop) -> ReplayStopOk:
+    del request
+    running, _ = _sessions(server)
+    with running.engine.lock:
+        running.engine.end_replay()
+    return ReplayStopOk()
