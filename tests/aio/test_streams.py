@@ -376,6 +376,9 @@ class TestPolicies:
             publisher.send(STATE, b"nonsense")
             await until(lambda: states.stats.received == 3)
             assert states.latest() is seen, "the newest that can be understood"
+            assert states.receive_nowait() is None
+            stats = states.stats
+            assert (stats.delivered, stats.dropped, stats.malformed, stats.waiting) == (1, 1, 1, 0)
 
     @pytest.mark.parametrize(
         ("options", "problem"),

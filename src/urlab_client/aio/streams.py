@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable
 from types import TracebackType
-from typing import Any, Generic, Protocol, Self, TypeVar
+from typing import Generic, Protocol, Self, TypeVar
 
 from urlab_client.aio.buffers import Buffer, Entry
 from urlab_client.aio.deadline import DEFAULT, Timeout
@@ -51,11 +51,11 @@ class _Source(Protocol[T_co]):
         """Stop feeding `sink`. Idempotent."""
         ...
 
-    def wants(self, topic: bytes, payload: Any) -> bool:
+    def wants(self, topic: bytes, payload: BytesLike) -> bool:
         """Return whether a message is anything to the reader at all."""
         ...
 
-    def decode(self, topic: bytes, payload: Any) -> T_co:
+    def decode(self, topic: bytes, payload: BytesLike) -> T_co:
         """Make an item of a message. Raises `ProtocolError`."""
         ...
 
@@ -84,7 +84,7 @@ class _Channel(Sink, Generic[T]):
         self._lock = threading.Lock()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._attached = False
-        self._reading = self._expired = False
+        self._reading = self._expired = self._warned = False
         self._waiter: asyncio.Future[None] | None = None
         self._end: Callable[[], URLabError] | None = None
         self._last: T | None = None
@@ -95,21 +95,16 @@ class _Channel(Sink, Generic[T]):
 
     def on_message(self, topic: bytes, payload: BytesLike) -> None:
         if self._source.wants(topic, payload):
-            self.push(topic, payload, len(payload))
-
-    def push(self, topic: bytes, payload: Any, size: int) -> None:
-        now, wall_ns = time.monotonic(), time.time_ns()
-        with self._lock:
-            self._arrived = now
-            self._buffer.push(topic, payload, size, wall_ns)
+            now, wall_ns = time.monotonic(), time.time_ns()
+            with self._lock:
+                self._arrived = now
+                self._buffer.push(topic, payload, len(payload), wall_ns)
 
     def on_malformed(self, problem: str) -> None:
         with self._lock:
             self._buffer.reject()
             self._malformed += 1
-            first = self._malformed == 1
-        if first:
-            self._warn(problem)
+        self._warn(problem)
 
     def on_drained(self) -> None:
         if self._waiter is not None and not self._waiter.done():
@@ -240,6 +235,7 @@ class _Channel(Sink, Generic[T]):
             item = self._decoded(entry)
             with self._lock:
                 if item is None:
+                    self._malformed += 1
                     self._buffer.skip(entry)
                     continue
                 self._delivered += 1
@@ -248,7 +244,7 @@ class _Channel(Sink, Generic[T]):
             return item
 
     def _decoded(self, entry: Entry) -> T | None:
-        """Return the item of a message, None if it is malformed. Each failure is counted once."""
+        """Return the item of a message, None if it is malformed."""
         with self._lock:
             if entry.item is not None or entry.malformed:
                 return entry.item
@@ -256,12 +252,8 @@ class _Channel(Sink, Generic[T]):
         try:
             item = self._source.decode(entry.topic, payload)
         except ProtocolError as error:
-            with self._lock:
-                self._malformed += not entry.malformed
-                entry.malformed = True
-                first = self._malformed == 1
-            if first:
-                self._warn(str(error))
+            entry.malformed = True
+            self._warn(str(error))
             return None
         item.seq, item.dropped, item.gap, item.recv_wall_time_ns = entry.seq, entry.dropped, entry.gap, entry.wall_ns
         with self._lock:
@@ -296,7 +288,9 @@ class _Channel(Sink, Generic[T]):
         self.on_drained()
 
     def _warn(self, problem: str) -> None:
-        log.warning("%s: skipped a malformed message: %s More of them are only counted.", self._source.name, problem)
+        if not self._warned:
+            self._warned = True
+            log.warning("%s: skipped a malformed message: %s More are only counted.", self._source.name, problem)
 
 
 class Stream(Generic[T]):
