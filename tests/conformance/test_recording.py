@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from urlab_client import PathNotWritable, ReplayRequiresStepped
+from urlab_client import PathNotWritable, ReplayRequiresStepped, ReplaySessionNotFound
 from urlab_client.server import SimulatedServer
 
 
@@ -47,3 +47,23 @@ async def test_options_reach_the_mirror(connect: Any) -> None:
         assert client.model.opt.timestep == options.timestep == pytest.approx(0.001)
         assert client.model.opt.gravity[2] == pytest.approx(-1.62)
         assert options.solver == "cg"
+
+
+async def test_clearing_and_choosing_a_session(connect: Any, tmp_path: Path) -> None:
+    with SimulatedServer("ball", play=True, saved_dir=tmp_path) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        await client.recording.start()
+        await client.step(5)
+        await client.recording.stop()
+        await client.recording.save("one.json")
+        await client.recording.clear()
+        assert client.recording.frame_count == 0
+        with pytest.raises(PathNotWritable):
+            await client.recording.save("two.json")
+        session = await client.replay.load("one.json")
+        assert (session.name, client.replay.active_session) == ("one", "one")
+        await client.replay.set_active("Live Recording")
+        assert client.replay.active_session == "Live Recording"
+        with pytest.raises(ReplaySessionNotFound):
+            await client.replay.set_active("three")
