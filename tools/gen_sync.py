@@ -83,13 +83,20 @@ PLAN = Plan(
         "articulation.py",
         "controllers.py",
         "cameras.py",
+        "streams.py",
         "namespaces/__init__.py",
         "namespaces/_ops.py",
         "namespaces/[!_]*.py",
     ),
     roots=frozenset({"URLabClient"}),
     exposed=frozenset({"_data_lock"}),
-    renames={"__aenter__": "__enter__", "__aexit__": "__exit__"},
+    renames={
+        "__aiter__": "__iter__",
+        "__anext__": "__next__",
+        "__aenter__": "__enter__",
+        "__aexit__": "__exit__",
+        "aclose": "close",
+    },
 )
 
 
@@ -660,12 +667,16 @@ class Mirror:
         returns_none = self._text(returns) == "None"
         if node.name == "__aiter__":
             return "return self"
+        if node.name == "__anext__" and any(name == "receive_nowait" for name, _ in public_members(cls, self.plan)):
+            return "return self._portal.next_of(self._aio)"
         if isinstance(node, ast.AsyncFunctionDef):
             verb = "next" if node.name == "__anext__" else "call"
             if cls.name in self.plan.roots and node.name in {"close", "aclose", "__aexit__"}:
                 if not returns_none:
                     raise self.module.refuse(node, f"{cls.name}.{node.name} must return None")
                 verb = "close"
+            elif node.name in {"aclose", "__aexit__"}:
+                verb = "release"
             call = f"self._portal.{verb}({call})"
         return call if returns_none else f"return {self._result(cls, node, returns, call, node.name)}"
 

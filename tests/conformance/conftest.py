@@ -36,6 +36,8 @@ class Awaited:
                 return await anyio.to_thread.run_sync(lambda: value(*args, **kwargs))
 
             return call
+        if inspect.ismethod(value):
+            return lambda *args, **kwargs: awaited(value(*args, **kwargs))
         return awaited(value)
 
     def __setattr__(self, name: str, value: Any) -> None:

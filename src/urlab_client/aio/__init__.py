@@ -6,6 +6,7 @@ from urlab_client.aio.client import URLabClient
 from urlab_client.aio.controllers import URLabController, URLabPDController
 from urlab_client.aio.deadline import DEFAULT
 from urlab_client.aio.handles import Actuator, Body, Joint, Sensor
+from urlab_client.aio.streams import Stream
 
 __all__ = [
     "DEFAULT",
@@ -13,6 +14,7 @@ __all__ = [
     "Body",
     "Joint",
     "Sensor",
+    "Stream",
     "URLabArticulation",
     "URLabCameraView",
     "URLabClient",

@@ -10,6 +10,7 @@ from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.controllers import URLabController, make_controller
 from urlab_client.aio.handles import Actuator, Body, Handles, Joint, Sensor, make_handles
 from urlab_client.aio.layout import ArticulationLayout
+from urlab_client.aio.publishers import Publishers
 from urlab_client.aio.records import ArticulationRecord, EntityRecord
 from urlab_client.aio.session import Session
 from urlab_client.protocol.base import Floats
@@ -154,9 +155,10 @@ class URLabArticulation(URLabEntity):
 
     _record: ArticulationRecord
 
-    def __init__(self, record: ArticulationRecord, session: Session) -> None:
+    def __init__(self, record: ArticulationRecord, session: Session, publishers: Publishers) -> None:
         super().__init__(record)
         self._session = session
+        self._publishers = publishers
         self._controller: tuple[ControllerInfo, URLabController] | None = None
         self._handles: tuple[ArticulationLayout, Handles] | None = None
         self._cameras: NameMap[URLabCameraView] = NameMap()
@@ -196,7 +198,10 @@ class URLabArticulation(URLabEntity):
         """Cameras by name."""
         topics = self._record.info.camera_topics
         if any(name not in self._cameras or self._cameras[name].info is not info for name, info in topics.items()):
-            views = {name: self._cameras.get(name) or URLabCameraView(name, info) for name, info in topics.items()}
+            views = {
+                name: self._cameras.get(name) or URLabCameraView(name, info, self._publishers)
+                for name, info in topics.items()
+            }
             for name, info in topics.items():
                 views[name].info = info
             self._cameras = NameMap(views, kind=f"camera of {self.prefix}")

@@ -6,33 +6,45 @@ from typing import Any
 
 import numpy as np
 
+from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.publishers import Publishers
+from urlab_client.aio.reception import Pictures
+from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS, Stream
 from urlab_client.protocol.enums import CameraMode, known
 from urlab_client.protocol.messages.session import CameraInfo
+from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
 from urlab_client.protocol.rows import Pixels
 
 __all__ = ["URLabCameraView"]
 
 
 class URLabCameraView:
-    """One camera. Frames arrive with `client.step(include_cameras=…)`."""
+    """One camera. Frames arrive with `client.step(include_cameras=…)`, and by themselves in live mode."""
 
     name: str
     """Name without the articulation's prefix."""
     info: CameraInfo
     """The handshake's description."""
-    latest_frame: Pixels | None
-    """Newest frame: real (H, W, 4) RGBA, depth (H, W) metres, semantic and instance (H, W, 4) BGRA; yours to keep."""
-    sim_time: float | None
-    """Simulation time of the reply that carried the newest frame, seconds."""
     delivered: bool
     """False when the last step that asked for a frame got none: `latest_frame` is then older than the state."""
 
-    def __init__(self, name: str, info: CameraInfo) -> None:
+    def __init__(self, name: str, info: CameraInfo, publishers: Publishers) -> None:
         self.name = name
         self.info = info
-        self.latest_frame = None
-        self.sim_time = None
         self.delivered = True
+        self._publishers = publishers
+        # Fed by the client. Not declared above, so that the façade has none.
+        self.pictures = Pictures(publishers.camera(self))
+
+    @property
+    def latest_frame(self) -> Pixels | None:
+        """Newest frame: real (H, W, 4) RGBA, depth (H, W) metres, else (H, W, 4) BGRA; yours to keep."""
+        return self.pictures.newest()[0]
+
+    @property
+    def sim_time(self) -> float | None:
+        """Simulation time of the newest frame, seconds; in live mode None unless the server sends it along."""
+        return self.pictures.newest()[1]
 
     @property
     def mode(self) -> CameraMode | str:
@@ -53,6 +65,35 @@ class URLabCameraView:
     def dtype(self) -> np.dtype[Any]:
         """uint8, or float32 for depth."""
         return np.dtype(np.float32 if self.mode == CameraMode.DEPTH else np.uint8)
+
+    def frames(
+        self,
+        policy: str | StreamPolicy = "latest",
+        *,
+        buffer: int = BUFFER_ITEMS,
+        buffer_bytes: int = BUFFER_BYTES,
+        timeout: Timeout = DEFAULT,
+    ) -> Stream[CameraSample]:
+        """Stream its pictures. The server publishes them in live mode only, the plugin without time or number.
+
+        Args:
+            policy: `latest`, or `all` within the buffer.
+            buffer: Pictures that may wait, with `all`.
+            buffer_bytes: Bytes that may wait, with `all`.
+            timeout: Seconds that iterating waits for each picture; by default the client's for the first one and then
+                without limit; None waits.
+
+        Raises:
+            ValueError: Unknown policy, or an empty buffer.
+        """
+        return Stream(
+            self._publishers.camera(self),
+            policy=policy,
+            buffer=buffer,
+            buffer_bytes=buffer_bytes,
+            timeout=timeout,
+            default_timeout=self._publishers.default_timeout,
+        )
 
     def __repr__(self) -> str:
         return f"<URLabCameraView {self.name!r} {self.mode} {self.resolution[0]}x{self.resolution[1]}>"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import warnings
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from threading import RLock
 from types import TracebackType
 from typing import TYPE_CHECKING, NoReturn, Self, TypeVar
@@ -23,8 +23,10 @@ from urlab_client.aio.namespaces.runtime import RuntimeNamespace
 from urlab_client.aio.namespaces.scene import SceneNamespace
 from urlab_client.aio.namespaces.sim import SimNamespace
 from urlab_client.aio.namespaces.viewport import ViewportNamespace
+from urlab_client.aio.publishers import Publishers
 from urlab_client.aio.session import Session
 from urlab_client.aio.state import SimState
+from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS, Stream
 from urlab_client.aio.transport.base import Transport as TransportProtocol
 from urlab_client.aio.transport.base import TransportStats
 from urlab_client.aio.transport.zmq import ZmqTransport
@@ -35,7 +37,9 @@ from urlab_client.protocol.errors import UnknownKeyframe, URLabError
 from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.protocol.messages.session import Meta as MetaRequest
 from urlab_client.protocol.messages.session import MetaOk, OpInfo, Reset, ResetOk, Step, StepOk
+from urlab_client.protocol.messages.streams import ClientEvent, RowSample, StateSnapshot, StreamPolicy
 from urlab_client.protocol.names import NameMap
+from urlab_client.protocol.rows import TopicKind
 from urlab_client.protocol.types import ClientConfig, Diagnosis
 
 if TYPE_CHECKING:
@@ -127,8 +131,15 @@ class URLabClient:
             raise ValueError(f"rcv_timeout_ms must be above 0, got {rcv_timeout_ms}")
         self._transport = _transport(address, step_port)
         self._session = Session(self._transport, default_timeout=rcv_timeout_ms / 1000, json=encoding == "json")
+        self._publishers = Publishers(
+            lambda: self._transport.endpoint,
+            lambda: self._transport.state_port or state_port,
+            default_timeout=rcv_timeout_ms / 1000,
+        )
+        self._transport.on_event = self._publishers.events.publish
         self._state = SimState(
             self._session,
+            self._publishers,
             wanted_mode=StepMode(step_mode),
             local_model=local_model,
             check_version=mujoco_version_check,
@@ -419,6 +430,92 @@ class URLabClient:
         self._state.absorb_reset(reply, request.keyframe_name)
         return reply
 
+    def state_stream(
+        self,
+        policy: str | StreamPolicy = "latest",
+        *,
+        buffer: int = BUFFER_ITEMS,
+        buffer_bytes: int = BUFFER_BYTES,
+        timeout: Timeout = DEFAULT,
+    ) -> Stream[StateSnapshot]:
+        """Stream the snapshots that the server publishes while play runs.
+
+        One per physics tick in live mode, paused or not; one per step, else ten per second, in `direct`; ten per
+        second in `puppet`. Works beside everything else the client does, and costs the server nothing.
+
+        Args:
+            policy: `latest`, or `all` within the buffer.
+            buffer: Snapshots that may wait, with `all`.
+            buffer_bytes: Bytes that may wait, with `all`.
+            timeout: Seconds that iterating waits for each snapshot; by default the client's for the first one and then
+                without limit; None waits.
+
+        Raises:
+            ValueError: Unknown policy, or an empty buffer.
+        """
+        return Stream(
+            self._publishers.state(),
+            policy=policy,
+            buffer=buffer,
+            buffer_bytes=buffer_bytes,
+            timeout=timeout,
+            default_timeout=self._publishers.default_timeout,
+        )
+
+    def row_stream(
+        self,
+        articulation: str | None = None,
+        kinds: Collection[str | TopicKind] = (),
+        components: Collection[str] = (),
+        *,
+        policy: str | StreamPolicy = "latest_per_key",
+        buffer: int = BUFFER_ITEMS,
+        buffer_bytes: int = BUFFER_BYTES,
+        timeout: Timeout = DEFAULT,
+    ) -> Stream[RowSample]:
+        """Stream the small rows that the server publishes in live mode: one joint, sensor or free base each.
+
+        Args:
+            articulation: Key of the articulation; None for all there are, and the plain entities.
+            kinds: `joint`, `base_state`, `sensor`, `twist`, `actions`; of entities `xpos`, `xquat`, `qpos`, `qvel`.
+                Empty for all of them, or with `components` for those that have one.
+            components: Component names; empty for all.
+            policy: `latest_per_key` keeps the newest row of each joint and so on; `latest`; `all` within the buffer.
+            buffer: Rows that may wait.
+            buffer_bytes: Bytes that may wait.
+            timeout: Seconds that iterating waits for each row; by default the client's for the first one and then
+                without limit; None waits.
+
+        Raises:
+            KeyError: Unknown articulation.
+            ValueError: Unknown kind or policy, or an empty buffer.
+            URLabError: `discover()` was not called yet.
+        """
+        if self._state.hello is None:
+            raise URLabError(
+                "row_stream: which articulations there are is not known yet.", hint="Call discover() first."
+            )
+        keys = list(self.articulations) if articulation is None else [self.articulations[articulation].prefix]
+        return Stream(
+            self._publishers.rows(keys, kinds, components, entities=articulation is None),
+            policy=policy,
+            buffer=buffer,
+            buffer_bytes=buffer_bytes,
+            timeout=timeout,
+            default_timeout=self._publishers.default_timeout,
+        )
+
+    def events(self, *, buffer: int = BUFFER_ITEMS) -> Stream[ClientEvent]:
+        """Stream what happens to the connection, the session and play, from this call on.
+
+        Args:
+            buffer: Events that wait for a reader; the oldest give way, which shows in the next one's `dropped`.
+
+        Raises:
+            ClientClosed: The client was closed.
+        """
+        return self._publishers.events.stream(buffer)
+
     async def call(self, request: Request[R], *, timeout: Timeout = DEFAULT) -> R:
         """Send any request of `urlab_client.protocol.messages` and return its reply, without taking anything over.
 
@@ -445,6 +542,7 @@ class URLabClient:
             return
         self._closed = True
         promoted_from = self._state.promoted_from
+        self._publishers.close()
         try:
             if promoted_from is not None and self.connected and self.manager_present:
                 with contextlib.suppress(URLabError):  # a courtesy: the server may have moved on

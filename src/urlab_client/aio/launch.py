@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from urllib.parse import parse_qsl
 
 import msgspec
@@ -19,6 +19,7 @@ from urlab_client.aio.transport.base import TransportStats
 from urlab_client.aio.transport.zmq import ZmqTransport
 from urlab_client.protocol.base import Op
 from urlab_client.protocol.errors import ClientClosed, ServerUnreachable
+from urlab_client.protocol.messages.streams import ClientEvent
 
 __all__ = ["SCHEME", "LaunchedTransport", "serve_arguments"]
 
@@ -34,6 +35,7 @@ class _Ready(Struct):
 
     address: str
     step_port: int
+    state_port: int
 
 
 def serve_arguments(address: str) -> list[str]:
@@ -67,7 +69,14 @@ class LaunchedTransport:
         self._process: asyncio.subprocess.Process | None = None
         self._drain: asyncio.Task[None] | None = None
         self._inner: ZmqTransport | None = None
+        self._state_port: int | None = None
         self._closed = False
+        self.on_event: Callable[[ClientEvent], None] | None = None
+
+    @property
+    def state_port(self) -> int | None:
+        """See `Transport.state_port`; None before the server runs."""
+        return self._state_port
 
     @property
     def endpoint(self) -> str:
@@ -131,6 +140,8 @@ class LaunchedTransport:
             self._drain = asyncio.create_task(_log_lines(process.stderr), name="urlab-server-log")
         transport = ZmqTransport(f"{ready.address}:{ready.step_port}")
         transport.stats = self.stats
+        transport.on_event = self.on_event
+        self._state_port = ready.state_port
         return transport
 
     async def _first_line(self, process: asyncio.subprocess.Process, op: Op) -> bytes:

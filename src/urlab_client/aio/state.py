@@ -20,15 +20,18 @@ from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.layout import FREE, ArticulationLayout, articulation_layouts
 from urlab_client.aio.mirror import Mirror, model_names, write_options
+from urlab_client.aio.publishers import Publishers
+from urlab_client.aio.reception import LiveReception, Pictures
 from urlab_client.aio.records import ArticulationRecord, EntityRecord, Wrenches
 from urlab_client.aio.session import Session
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.errors import NoActiveManager, ProtocolError, URLabRPCError
+from urlab_client.protocol.errors import NoActiveManager, ProtocolError, SessionTakenOver, URLabRPCError
 from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.protocol.messages.session import (
     ArticulationInfo,
     CameraFrame,
+    CameraInfo,
     EntityInfo,
     EntityState,
     Hello,
@@ -36,6 +39,7 @@ from urlab_client.protocol.messages.session import (
     StateReply,
     StepOk,
 )
+from urlab_client.protocol.messages.streams import PlayEnded, PlayStarted, SessionLost, SessionOpened, StateSnapshot
 from urlab_client.protocol.names import NameMap, owner_of
 from urlab_client.protocol.rows import Pixels, decode_camera
 from urlab_client.protocol.types import SimOptions
@@ -47,6 +51,9 @@ __all__ = ["SimState"]
 
 log = logging.getLogger("urlab_client.client")
 
+# By the server's clock. More than this means that the clock was set, not that a message was overtaken.
+_OVERTAKEN_S = 1.0
+
 # Unreal's actor names: class, then a number or a generated id.
 _ENGINE_NAME = re.compile(r"(?P<stem>.+)_C_(?:\d+|UAID_\w+)")
 
@@ -56,8 +63,8 @@ class SimState:
 
     Attributes:
         session: The RPC session.
+        publishers: What the server publishes.
         mirror: Local model and data.
-        mode: Step mode in force, as far as this client knows.
         wanted_mode: Step mode the user asked for.
         promoted_from: Mode to go back to on close, after a promotion of our own.
         level: Observation level of the session.
@@ -71,12 +78,21 @@ class SimState:
     """
 
     def __init__(
-        self, session: Session, *, wanted_mode: StepMode, local_model: bool, check_version: bool, promote: bool
+        self,
+        session: Session,
+        publishers: Publishers,
+        *,
+        wanted_mode: StepMode,
+        local_model: bool,
+        check_version: bool,
+        promote: bool,
     ) -> None:
         self.session = session
+        self.publishers = publishers
         self.mirror = Mirror()
         self.wanted_mode = wanted_mode
-        self.mode = StepMode.LIVE
+        self._mode = StepMode.LIVE
+        self._reception = LiveReception(publishers.state(), self._absorb_live, self.mirror.lock)
         self.promoted_from: StepMode | None = None
         self.level = "standard"
         self.sent_level = "standard"
@@ -98,6 +114,22 @@ class SimState:
         self._entity_records: dict[str, EntityRecord] = {}
 
     @property
+    def mode(self) -> StepMode:
+        """Step mode in force, as far as this client knows. In live mode, and no other, state is received by itself."""
+        return self._mode
+
+    @mode.setter
+    def mode(self, mode: StepMode) -> None:
+        self._mode = mode
+        live = mode is StepMode.LIVE and self.hello is not None and self.hello.manager_present
+        receivers: list[LiveReception | Pictures] = [self._reception, *(view.pictures for view in self._views())]
+        for receiver in receivers:
+            if live:
+                receiver.start()
+            else:
+                receiver.stop()
+
+    @property
     def records(self) -> Mapping[str, ArticulationRecord]:
         """Records of the articulations, by key."""
         return self._records
@@ -115,6 +147,11 @@ class SimState:
     async def open(self, observations: str, *, timeout: Timeout = DEFAULT) -> HelloOk:
         """Open a session and take over what the server says."""
         hello = await self.session.hello(Hello(observations=observations), timeout=timeout)
+        self.publishers.events.publish(
+            SessionOpened(
+                session_id=hello.session_id, urlab_version=hello.urlab_version, mujoco_version=hello.mujoco_version
+            )
+        )
         self.level = self.sent_level = observations
         if self._local_model and hello.mjb is not None:
             mismatch = self.mirror.check_version(hello)
@@ -136,13 +173,20 @@ class SimState:
             await anyio.to_thread.run_sync(self.mirror.load, hello)
         # The model is loaded; its bytes, several times its size, are not needed any more.
         hello.mjb = hello.mjb_base64 = hello.mjcf_compiled = hello.vfs_assets = None
+        played = self.hello is not None and self.hello.manager_present
         with self.mirror.lock:
             self.hello = hello
             self._bind_articulations(hello.articulations)
             self._bind_entities(hello.entities or {})
             cameras = hello.global_cameras or {}
-            self.global_cameras = NameMap({n: URLabCameraView(n, info) for n, info in cameras.items()}, kind="camera")
+            self.global_cameras = NameMap(
+                {n: self._global_camera(n, info) for n, info in cameras.items()}, kind="camera"
+            )
             self.step_count = 0
+        self._views()  # binds the cameras to what the handshake says of them
+        self.publishers.subscriptions.refresh()
+        if hello.manager_present and not played:
+            self.publishers.events.publish(PlayStarted(articulations=list(self.articulations)))
         if not hello.manager_present:
             self.mode = StepMode.LIVE
         elif self._promote and self.wanted_mode in (StepMode.DIRECT, StepMode.PUPPET):
@@ -156,6 +200,17 @@ class SimState:
             "session with %s, MuJoCo %s: %d articulations, mode %s",
             hello.urlab_version, hello.mujoco_version, len(self.articulations), self.mode,
         )  # fmt: skip
+
+    def _global_camera(self, name: str, info: CameraInfo) -> URLabCameraView:
+        view = self.global_cameras.get(name)
+        if view is None:
+            return URLabCameraView(name, info, self.publishers)
+        view.info = info
+        return view
+
+    def _views(self) -> list[URLabCameraView]:
+        own = [view for art in self.articulations.values() for view in art.cameras.values()]
+        return [*own, *self.global_cameras.values()]
 
     def _bind_articulations(self, infos: list[ArticulationInfo]) -> None:
         model = self.mirror.model
@@ -171,7 +226,7 @@ class SimState:
                 record = self._records[key] = ArticulationRecord(self.mirror, info, layout)
             else:
                 record.bind(info, layout)
-            wrappers[key] = self.articulations.get(key) or URLabArticulation(record, self.session)
+            wrappers[key] = self.articulations.get(key) or URLabArticulation(record, self.session, self.publishers)
             found = _ENGINE_NAME.fullmatch(key)
             for alias in {info.actor_id, found["stem"] if found else ""} - {""}:
                 aliases.setdefault(alias, []).append(key)
@@ -205,7 +260,13 @@ class SimState:
                 record.pose = None
             self.absorb(reply, "reset")
 
-    def absorb(self, reply: StateReply, op: str, *, into_mirror: bool = True) -> None:
+    def _absorb_live(self, snapshot: StateSnapshot) -> None:
+        age = self.wall_time_sec - snapshot.wall_time.sec + (self.wall_time_nsec - snapshot.wall_time.nsec) / 1e9
+        if 0 < age < _OVERTAKEN_S:
+            return  # sent before the last reply, arrived after it
+        self.absorb(snapshot, "state/full")
+
+    def absorb(self, reply: StateReply | StateSnapshot, op: str, *, into_mirror: bool = True) -> None:
         """Take over the state in a reply, whole or not at all.
 
         Args:
@@ -222,8 +283,9 @@ class SimState:
             record.check(state, op)
         entities: Mapping[str, EntityState] = {}
         frames: list[tuple[URLabCameraView, Pixels]] = []
-        if isinstance(reply, StepOk):
+        if isinstance(reply, (StepOk, StateSnapshot)):
             entities = reply.entities or {}
+        if isinstance(reply, StepOk):
             frames = [(view, _pixels(view, frame)) for view, frame in self._frames(reply.cameras or {})]
         with self.mirror.lock:
             for record, state in pairs:
@@ -234,13 +296,13 @@ class SimState:
                 if name in self._entity_records:
                     self._entity_records[name].absorb_pose(entity)
             for view, pixels in frames:
-                view.latest_frame, view.sim_time = pixels, reply.time
+                view.pictures.deliver(pixels, reply.time)
             if into_mirror and self.mirror.data is not None:
                 self.mirror.data.time = reply.time
             self.mirror.mark_stale()
             self._absorb_clocks(reply, received)
 
-    def _absorb_clocks(self, reply: StateReply, received: int) -> None:
+    def _absorb_clocks(self, reply: StateReply | StateSnapshot, received: int) -> None:
         self.step_count = reply.step
         self.sim_time = reply.time
         self.recv_wall_time_ns = received
@@ -269,14 +331,19 @@ class SimState:
 
     def _note_refusal(self, refusal: URLabRPCError) -> None:
         if isinstance(refusal, NoActiveManager):
-            self.on_play_ended()  # somebody else stopped play
+            self.on_play_ended("stopped by somebody else")
+        elif isinstance(refusal, SessionTakenOver):
+            self.publishers.events.publish(SessionLost(session_id=self.session.session_id, reason=refusal.message))
 
-    def on_play_ended(self) -> None:
+    def on_play_ended(self, reason: str = "") -> None:
         """Note that the play session is gone: the server is back in live mode, without articulations."""
-        self.mode = StepMode.LIVE
-        self.promoted_from = None
+        played = self.hello is not None and self.hello.manager_present
         if self.hello is not None:
             self.hello.manager_present = False
+        self.mode = StepMode.LIVE
+        self.promoted_from = None
+        if played:
+            self.publishers.events.publish(PlayEnded(reason=reason))
 
     def note_missing_frames(self, asked: bool | Mapping[str, str | None], reply: StepOk) -> None:
         """Mark the cameras whose frame was asked for and did not come: the server just leaves them out."""

@@ -6,6 +6,7 @@ from urlab_client.sync.articulation import URLabArticulation, URLabEntity
 from urlab_client.sync.cameras import URLabCameraView
 from urlab_client.sync.client import URLabClient
 from urlab_client.sync.controllers import URLabController, URLabPDController
+from urlab_client.sync.streams import Stream
 
 __all__ = [
     "DEFAULT",
@@ -13,6 +14,7 @@ __all__ = [
     "Body",
     "Joint",
     "Sensor",
+    "Stream",
     "URLabArticulation",
     "URLabCameraView",
     "URLabClient",

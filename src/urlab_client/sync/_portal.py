@@ -24,6 +24,7 @@ from urlab_client.protocol.names import NameMap
 __all__ = ["GRACE", "Facade", "FacadeRoot", "Portal", "aio_of"]
 
 T = TypeVar("T")
+A = TypeVar("A")
 A_co = TypeVar("A_co", covariant=True)
 F = TypeVar("F", bound="Facade")
 
@@ -63,6 +64,14 @@ class _Job(Generic[T]):
         """Let the caller go on. `value` or `error` is set by now."""
         self._finished = True
         self._waiter.release()
+
+
+class _Stream(Protocol[A_co]):
+    """Something asynchronous whose waiting items can be read from any thread."""
+
+    def receive_nowait(self) -> A_co | None: ...
+
+    def __anext__(self) -> Coroutine[Any, Any, A_co]: ...
 
 
 class _IOThread:
@@ -266,6 +275,16 @@ class Portal:
             return self.call(coro)
         except StopAsyncIteration:
             raise StopIteration from None
+
+    def next_of(self, stream: _Stream[A]) -> A:
+        """`next` for a stream. All of a batch but its first item takes no way through the loop."""
+        item = stream.receive_nowait()
+        return self.next(stream.__anext__()) if item is None else item
+
+    def release(self, coro: Coroutine[Any, Any, object]) -> None:
+        """`call` for what only lets go: after the client was closed, or in a forked child, there is nothing to do."""
+        with contextlib.suppress(ClientClosed, ForkedError):
+            self.call(coro)
 
     def close(self, last: Coroutine[Any, Any, object] | None = None) -> None:
         """Run `last`, then end the loop and its thread. Later calls raise `ClientClosed`; closing again does nothing.

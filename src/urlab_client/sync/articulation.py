@@ -146,7 +146,7 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
     @property
     def cameras(self) -> NameMap[URLabCameraView]:
         """Cameras by name."""
-        return self._aio.cameras
+        return self._map("cameras", URLabCameraView, self._aio.cameras)
 
     @property
     def controller(self) -> URLabController | None:

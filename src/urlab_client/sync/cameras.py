@@ -4,6 +4,94 @@
 
 from __future__ import annotations
 
-from urlab_client.aio.cameras import URLabCameraView
+from typing import Any
+
+import numpy as np
+
+from urlab_client.aio import cameras as aio
+from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS
+from urlab_client.protocol.enums import CameraMode
+from urlab_client.protocol.messages.session import CameraInfo
+from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
+from urlab_client.protocol.rows import Pixels
+from urlab_client.sync._portal import Facade
+from urlab_client.sync.streams import Stream
 
 __all__ = ["URLabCameraView"]
+
+
+class URLabCameraView(Facade, twin=aio.URLabCameraView):
+    """One camera. Frames arrive with `client.step(include_cameras=…)`, and by themselves in live mode."""
+
+    __slots__ = ()
+    _aio: aio.URLabCameraView
+
+    @property
+    def name(self) -> str:
+        """Name without the articulation's prefix."""
+        return self._aio.name
+
+    @property
+    def info(self) -> CameraInfo:
+        """The handshake's description."""
+        return self._aio.info
+
+    @property
+    def delivered(self) -> bool:
+        """False when the last step that asked for a frame got none: `latest_frame` is then older than the state."""
+        return self._aio.delivered
+
+    @property
+    def latest_frame(self) -> Pixels | None:
+        """Newest frame: real (H, W, 4) RGBA, depth (H, W) metres, else (H, W, 4) BGRA; yours to keep."""
+        return self._aio.latest_frame
+
+    @property
+    def sim_time(self) -> float | None:
+        """Simulation time of the newest frame, seconds; in live mode None unless the server sends it along."""
+        return self._aio.sim_time
+
+    @property
+    def mode(self) -> CameraMode | str:
+        """What its pixels mean; a plain string for a mode this client does not know."""
+        return self._aio.mode
+
+    @property
+    def resolution(self) -> tuple[int, int]:
+        """(width, height) in pixels."""
+        return self._aio.resolution
+
+    @property
+    def fovy(self) -> float:
+        """Vertical field of view, degrees."""
+        return self._aio.fovy
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """uint8, or float32 for depth."""
+        return self._aio.dtype
+
+    def frames(
+        self,
+        policy: str | StreamPolicy = "latest",
+        *,
+        buffer: int = BUFFER_ITEMS,
+        buffer_bytes: int = BUFFER_BYTES,
+        timeout: Timeout = DEFAULT,
+    ) -> Stream[CameraSample]:
+        """Stream its pictures. The server publishes them in live mode only, the plugin without time or number.
+
+        Args:
+            policy: `latest`, or `all` within the buffer.
+            buffer: Pictures that may wait, with `all`.
+            buffer_bytes: Bytes that may wait, with `all`.
+            timeout: Seconds that iterating waits for each picture; by default the client's for the first one and then
+                without limit; None waits.
+
+        Raises:
+            ValueError: Unknown policy, or an empty buffer.
+        """
+        return self._portal.wrap(
+            Stream[CameraSample], self._aio.frames(policy, buffer=buffer, buffer_bytes=buffer_bytes, timeout=timeout)
+        )

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from threading import RLock
 from types import TracebackType
 from typing import TYPE_CHECKING, Self, TypeVar
@@ -12,11 +12,14 @@ from typing import TYPE_CHECKING, Self, TypeVar
 from urlab_client.aio import client as aio
 from urlab_client.aio.client import SESSION_LEVEL, SessionLevel
 from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS
 from urlab_client.aio.transport.base import TransportStats
 from urlab_client.protocol.base import Reply, Request
 from urlab_client.protocol.enums import CameraTiming, ObservationLevel, StepMode, Transport
 from urlab_client.protocol.messages.session import OpInfo, ResetOk, StepOk
+from urlab_client.protocol.messages.streams import ClientEvent, RowSample, StateSnapshot, StreamPolicy
 from urlab_client.protocol.names import NameMap
+from urlab_client.protocol.rows import TopicKind
 from urlab_client.protocol.types import ClientConfig, Diagnosis
 from urlab_client.sync._portal import FacadeRoot
 from urlab_client.sync.articulation import URLabArticulation, URLabEntity
@@ -28,6 +31,7 @@ from urlab_client.sync.namespaces.runtime import RuntimeNamespace
 from urlab_client.sync.namespaces.scene import SceneNamespace
 from urlab_client.sync.namespaces.sim import SimNamespace
 from urlab_client.sync.namespaces.viewport import ViewportNamespace
+from urlab_client.sync.streams import Stream
 
 if TYPE_CHECKING:
     import mujoco
@@ -219,7 +223,7 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
     @property
     def global_cameras(self) -> NameMap[URLabCameraView]:
         """Scene-level cameras by name."""
-        return self._aio.global_cameras
+        return self._map("global_cameras", URLabCameraView, self._aio.global_cameras)
 
     @property
     def step_count(self) -> int:
@@ -334,6 +338,87 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
             KeyError: Unknown articulation or joint; nothing was sent.
         """
         return self._portal.call(self._aio.reset(keyframe_name, seed, per_articulation_qpos, timeout=timeout))
+
+    def state_stream(
+        self,
+        policy: str | StreamPolicy = "latest",
+        *,
+        buffer: int = BUFFER_ITEMS,
+        buffer_bytes: int = BUFFER_BYTES,
+        timeout: Timeout = DEFAULT,
+    ) -> Stream[StateSnapshot]:
+        """Stream the snapshots that the server publishes while play runs.
+
+        One per physics tick in live mode, paused or not; one per step, else ten per second, in `direct`; ten per
+        second in `puppet`. Works beside everything else the client does, and costs the server nothing.
+
+        Args:
+            policy: `latest`, or `all` within the buffer.
+            buffer: Snapshots that may wait, with `all`.
+            buffer_bytes: Bytes that may wait, with `all`.
+            timeout: Seconds that iterating waits for each snapshot; by default the client's for the first one and then
+                without limit; None waits.
+
+        Raises:
+            ValueError: Unknown policy, or an empty buffer.
+        """
+        return self._portal.wrap(
+            Stream[StateSnapshot],
+            self._aio.state_stream(policy, buffer=buffer, buffer_bytes=buffer_bytes, timeout=timeout),
+        )
+
+    def row_stream(
+        self,
+        articulation: str | None = None,
+        kinds: Collection[str | TopicKind] = (),
+        components: Collection[str] = (),
+        *,
+        policy: str | StreamPolicy = "latest_per_key",
+        buffer: int = BUFFER_ITEMS,
+        buffer_bytes: int = BUFFER_BYTES,
+        timeout: Timeout = DEFAULT,
+    ) -> Stream[RowSample]:
+        """Stream the small rows that the server publishes in live mode: one joint, sensor or free base each.
+
+        Args:
+            articulation: Key of the articulation; None for all there are, and the plain entities.
+            kinds: `joint`, `base_state`, `sensor`, `twist`, `actions`; of entities `xpos`, `xquat`, `qpos`, `qvel`.
+                Empty for all of them, or with `components` for those that have one.
+            components: Component names; empty for all.
+            policy: `latest_per_key` keeps the newest row of each joint and so on; `latest`; `all` within the buffer.
+            buffer: Rows that may wait.
+            buffer_bytes: Bytes that may wait.
+            timeout: Seconds that iterating waits for each row; by default the client's for the first one and then
+                without limit; None waits.
+
+        Raises:
+            KeyError: Unknown articulation.
+            ValueError: Unknown kind or policy, or an empty buffer.
+            URLabError: `discover()` was not called yet.
+        """
+        return self._portal.wrap(
+            Stream[RowSample],
+            self._aio.row_stream(
+                articulation,
+                kinds,
+                components,
+                policy=policy,
+                buffer=buffer,
+                buffer_bytes=buffer_bytes,
+                timeout=timeout,
+            ),
+        )
+
+    def events(self, *, buffer: int = BUFFER_ITEMS) -> Stream[ClientEvent]:
+        """Stream what happens to the connection, the session and play, from this call on.
+
+        Args:
+            buffer: Events that wait for a reader; the oldest give way, which shows in the next one's `dropped`.
+
+        Raises:
+            ClientClosed: The client was closed.
+        """
+        return self._portal.wrap(Stream[ClientEvent], self._aio.events(buffer=buffer))
 
     def call(self, request: Request[R], *, timeout: Timeout = DEFAULT) -> R:
         """Send any request of `urlab_client.protocol.messages` and return its reply, without taking anything over.

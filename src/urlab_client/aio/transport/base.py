@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 from msgspec import Struct
 
 from urlab_client.protocol.base import Op
+from urlab_client.protocol.messages.streams import ClientEvent
 
 __all__ = ["Transport", "TransportStats"]
 
@@ -31,6 +33,13 @@ class Transport(Protocol):
     """One request at a time goes out, one reply comes back. Used from one event loop."""
 
     stats: TransportStats
+    on_event: Callable[[ClientEvent], None] | None
+    """Told when the connection is made, lost and restored."""
+
+    @property
+    def state_port(self) -> int | None:
+        """Port of the state stream where the transport knows it, None where that is a matter of configuration."""
+        ...
 
     @property
     def endpoint(self) -> str:

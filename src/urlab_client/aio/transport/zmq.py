@@ -26,6 +26,7 @@ from urlab_client.protocol.errors import (
     URLabError,
     URLabTimeoutError,
 )
+from urlab_client.protocol.messages.streams import ClientEvent, ServerConnected, ServerLost, ServerReconnected
 
 __all__ = ["ZmqTransport"]
 
@@ -78,6 +79,13 @@ class ZmqTransport:
         self._connected = False
         self._closed = False
         self._obstacle = "the host does not answer"
+        self._down_since = 0.0
+        self.on_event: Callable[[ClientEvent], None] | None = None
+
+    @property
+    def state_port(self) -> int | None:
+        """See `Transport.state_port`."""
+        return None
 
     @property
     def endpoint(self) -> str:
@@ -249,6 +257,7 @@ class ZmqTransport:
             self._connected = True
             self.stats.connects += 1
             log.info("connected to %s", self._endpoint)
+            self._tell_connected()
             for waiter in self._waiting:
                 if not waiter.done():
                     waiter.set_result(None)
@@ -265,9 +274,22 @@ class ZmqTransport:
         self._on_readable()  # what arrived before the line broke still counts
         if self._connected:
             log.info("lost %s; reconnecting", self._endpoint)
+            if self._loop is not None:
+                self._down_since = self._loop.time()
+            self._tell(ServerLost(endpoint=self._endpoint))
         self._connected = False
         self._obstacle = "the connection was lost and not restored"
         self._fail_sent(self._lost)
+
+    def _tell_connected(self) -> None:
+        if self.stats.connects == 1 or self._loop is None:
+            self._tell(ServerConnected(endpoint=self._endpoint))
+        else:
+            self._tell(ServerReconnected(endpoint=self._endpoint, down_s=self._loop.time() - self._down_since))
+
+    def _tell(self, event: ClientEvent) -> None:
+        if self.on_event is not None:
+            self.on_event(event)
 
     def _lost(self, entry: _Sent) -> URLabError:
         name = entry.op.name
