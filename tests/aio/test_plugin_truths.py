@@ -418,6 +418,24 @@ async def test_puppet_takes_set_points_and_mirrors_a_reset(plugin: Any, connect:
         assert np.array_equal(client.data.qpos, client.model.qpos0)
 
 
+async def test_a_mouse_drag_reaches_the_local_physics(plugin: Any, scripted: Any, connect: Any) -> None:
+    async with connect(step_mode="puppet") as client:
+        await client.discover()
+        body = client.articulations["robot"].body_id
+        drag = {"body_id": float(body), "version": 1.0, "xfrc": [0.0, 0.0, 50.0, 0.0, 0.0, 0.0]}
+        scripted.on("step", lambda request: plugin.step(request) | {"perturbation": drag})
+        await client.step()
+        assert client.data.xfrc_applied[body].tolist() == drag["xfrc"]
+        before = client.data.qvel[2]
+        scripted.on("step", plugin.step)
+        await client.step()
+        assert client.data.qvel[2] > before, "the drag acts in the next local step"
+        assert not client.data.xfrc_applied.any(), "and ends with it"
+        scripted.on("step", lambda request: plugin.step(request) | {"perturbation": drag | {"body_id": 999.0}})
+        with pytest.raises(ProtocolError, match="perturbation of body 999"):
+            await client.step()
+
+
 async def test_a_wrench_in_puppet_mode_warns(plugin: Any, connect: Any) -> None:
     async with connect(step_mode="puppet") as client:
         await client.discover()

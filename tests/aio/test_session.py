@@ -10,6 +10,7 @@ import pytest
 
 from urlab_client.aio import URLabClient
 from urlab_client.protocol.errors import (
+    RPC_ERRORS,
     ClientClosed,
     ConnectionLost,
     OutcomeUnknown,
@@ -201,6 +202,15 @@ async def test_a_nonsensical_answer_is_a_protocol_error(client: Any, scripted: A
         await client.runtime.set_paused(True)
     scripted.on("set_paused", PAUSED)
     assert await client.runtime.set_paused(True) is True
+
+
+@pytest.mark.parametrize("code", sorted(RPC_ERRORS))
+async def test_every_error_code_raises_its_class(client: Any, scripted: Any, code: str) -> None:
+    await client.discover()
+    scripted.on("set_paused", {"op": "error", "code": code, "message": "because"})
+    with pytest.raises(RPC_ERRORS[code], match=f"set_paused: {code}: because") as info:
+        await client.runtime.set_paused(True)
+    assert (info.value.code, info.value.message, info.value.op) == (code, "because", "set_paused")
 
 
 async def test_unknown_error_codes_stay_plain_rpc_errors(client: Any, scripted: Any) -> None:

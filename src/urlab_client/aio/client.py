@@ -390,6 +390,9 @@ class URLabClient:
             for record, wrenches in carried:
                 record.drop_wrenches(wrenches)
         state.absorb(reply, "step", into_mirror=state.mode is not StepMode.PUPPET)
+        if state.mode is StepMode.PUPPET:
+            with state.mirror.lock:
+                state.mirror.perturb(reply.perturbation)
         if cameras:
             state.note_missing_frames(cameras, reply)
         return reply

@@ -14,7 +14,7 @@ import numpy as np
 
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.errors import ProtocolError, URLabVersionMismatch
-from urlab_client.protocol.messages.session import HelloOk
+from urlab_client.protocol.messages.session import HelloOk, Perturbation
 from urlab_client.protocol.types import SimOptions
 
 if TYPE_CHECKING:
@@ -99,6 +99,7 @@ class Mirror:
         self.data: mujoco.MjData | None = None
         self.approximate = False
         self._stale = False
+        self._dragged: int | None = None
 
     @staticmethod
     def check_version(hello: HelloOk) -> URLabVersionMismatch | None:
@@ -139,6 +140,7 @@ class Mirror:
             self.model, self.data = model, data
             self.approximate = mismatch is not None
             self._stale = False
+            self._dragged = None
 
     def clear(self) -> None:
         """Forget the model."""
@@ -161,6 +163,17 @@ class Mirror:
             mujoco.mj_resetDataKeyframe(self.model, self.data, key)
         else:
             mujoco.mj_resetData(self.model, self.data)
+
+    def perturb(self, perturbation: Perturbation | None) -> None:
+        """Take over a mouse drag for the next local step, and let go of the one before. Call under the lock."""
+        if self.data is None:
+            return
+        if self._dragged is not None:
+            self.data.xfrc_applied[self._dragged] = 0.0
+        self._dragged = None
+        if perturbation is not None:
+            self._dragged = perturbation.body_id
+            self.data.xfrc_applied[self._dragged] = perturbation.xfrc
 
     def mark_stale(self) -> None:
         """Note that positions or velocities changed, so that derived quantities must be computed before use."""

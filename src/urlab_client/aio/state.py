@@ -281,6 +281,7 @@ class SimState:
         pairs = [(self._records[key], s) for key, s in reply.per_articulation.items() if key in self._records]
         for record, state in pairs:
             record.check(state, op)
+        self._check_perturbation(reply, op)
         entities: Mapping[str, EntityState] = {}
         frames: list[tuple[URLabCameraView, Pixels]] = []
         if isinstance(reply, (StepOk, StateSnapshot)):
@@ -301,6 +302,12 @@ class SimState:
                 self.mirror.data.time = reply.time
             self.mirror.mark_stale()
             self._absorb_clocks(reply, received)
+
+    def _check_perturbation(self, reply: StateReply | StateSnapshot, op: str) -> None:
+        drag = reply.perturbation if isinstance(reply, StepOk) else None
+        model = self.mirror.model
+        if drag is not None and model is not None and not (0 < drag.body_id < model.nbody and len(drag.xfrc) == 6):
+            raise ProtocolError(f"{op}: a perturbation of body {drag.body_id} with {len(drag.xfrc)} values.", op=op)
 
     def _absorb_clocks(self, reply: StateReply | StateSnapshot, received: int) -> None:
         self.step_count = reply.step
