@@ -76,6 +76,7 @@ class Plugin:
         scripted.on("hello", lambda _: self.hello)
         scripted.on("set_mode", self.set_mode)
         scripted.on("stop_pie", {"op": "stop_pie_ok"})
+        scripted.on("pie_status", {"op": "pie_status_ok", "state": "off", "compile_error": ""})
         scripted.on("step", lambda _: self.state("step_ok", 0.5, 0.5, wall=100.0) | {"entities": {}})
 
     def set_mode(self, request: dict[str, Any]) -> dict[str, Any]:

@@ -515,6 +515,25 @@ async def test_start_waits_through_compiling(plugin: Any, scripted: Any, connect
         assert len(client.articulations) == 3
 
 
+async def test_stop_waits_until_play_has_ended(plugin: Any, scripted: Any, connect: Any) -> None:
+    states = iter(["ready", "ready", "off"])
+    scripted.on("stop_pie", {"op": "stop_pie_ok"})
+    scripted.on("pie_status", lambda _: {"op": "pie_status_ok", "state": next(states), "compile_error": ""})
+    async with connect() as client:
+        await client.discover()
+        await client.sim.stop()
+        assert next(states, None) is None
+        assert not client.manager_present
+
+
+async def test_a_step_count_that_is_none(plugin: Any, connect: Any) -> None:
+    async with connect() as client:
+        await client.discover()
+        with pytest.raises(TypeError, match="integer"):
+            await client.step("3")
+        assert plugin.requests == []
+
+
 async def test_a_model_that_does_not_compile(plugin: Any, scripted: Any, connect: Any) -> None:
     log = "Error: mass and inertia of moving bodies must be larger than mjMINVAL"
     scripted.on("begin_pie", {"op": "begin_pie_ok", "state": "compile_failed", "compile_error": log})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import operator
 import warnings
 from collections.abc import Collection, Mapping
 from threading import RLock
@@ -368,6 +369,7 @@ class URLabClient:
             KeyError: Unknown camera; nothing was sent.
         """
         state = self._state
+        n_steps = operator.index(n_steps)  # a hot op: its request is not checked again before it is sent
         level = state.level if isinstance(observations, SessionLevel) else ObservationLevel(observations)
         cameras = self._cameras(include_cameras)
         if timeout is DEFAULT and isinstance(cameras, dict):

@@ -12,7 +12,7 @@ from urlab_client.aio.namespaces._base import Namespace
 from urlab_client.aio.session import Session
 from urlab_client.aio.state import SimState
 from urlab_client.protocol.enums import PIEState
-from urlab_client.protocol.errors import URLabPIEError
+from urlab_client.protocol.errors import URLabPIEError, URLabTimeoutError
 from urlab_client.protocol.messages.sim import BeginPie, BeginPieOk, PieStatus, StopPie
 from urlab_client.protocol.types import PIEStartResult, PIEStatus
 
@@ -20,6 +20,8 @@ __all__ = ["SimNamespace"]
 
 _POLL_S = 0.25
 _SLICE_S = 2.0
+_STOP_POLL_S = 0.05
+_WIND_DOWN_S = 10.0
 _SLACK_S = 15.0  # the server may take 10 s to reach its game thread before its own timeout starts
 
 
@@ -86,13 +88,24 @@ class SimNamespace(Namespace):
         return await self._call(BeginPie(level_path=level_path, timeout_s=timeout_s), seconds)
 
     async def stop(self, *, timeout: Timeout = DEFAULT) -> None:
-        """End play; a success without one. The session goes on, authoring works.
+        """End play and wait until it has ended; a success without one. The session goes on, authoring works.
+
+        Args:
+            timeout: Seconds to wait for each answer of the server; None waits without limit.
 
         Raises:
             GameThreadTimeout: The editor did not react; often a modal dialog is open.
+            URLabTimeoutError: The editor agreed, but play has not ended after ten seconds.
         """
+        loop = asyncio.get_running_loop()
         await self._call(StopPie(), timeout)
-        self._state.on_play_ended()
+        # The plugin answers when the end has been requested.
+        deadline = loop.time() + _WIND_DOWN_S
+        while (await self.status(timeout=timeout)).state is not PIEState.OFF:
+            if loop.time() > deadline:
+                raise URLabTimeoutError(f"stop_pie: play has not ended within {_WIND_DOWN_S:g} s.", op="stop_pie")
+            await asyncio.sleep(_STOP_POLL_S)
+        self._state.on_play_ended("stopped by this client")
 
     async def status(self, *, timeout: Timeout = DEFAULT) -> PIEStatus:
         """Read the state of play."""

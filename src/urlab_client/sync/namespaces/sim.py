@@ -55,10 +55,14 @@ class SimNamespace(Facade, twin=aio.SimNamespace):
         )
 
     def stop(self, *, timeout: Timeout = DEFAULT) -> None:
-        """End play; a success without one. The session goes on, authoring works.
+        """End play and wait until it has ended; a success without one. The session goes on, authoring works.
+
+        Args:
+            timeout: Seconds to wait for each answer of the server; None waits without limit.
 
         Raises:
             GameThreadTimeout: The editor did not react; often a modal dialog is open.
+            URLabTimeoutError: The editor agreed, but play has not ended after ten seconds.
         """
         self._portal.call(self._aio.stop(timeout=timeout))
 
