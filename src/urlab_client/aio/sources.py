@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection
 from typing import Protocol
 
@@ -52,7 +53,7 @@ _EVENTS = msgspec.msgpack.Decoder(
 )
 
 
-class _SocketSource:
+class _SocketSource(ABC):
     """What a subscription brings.
 
     Attributes:
@@ -68,9 +69,9 @@ class _SocketSource:
     def __init__(self, subscriptions: Subscriptions) -> None:
         self._subscriptions = subscriptions
 
+    @abstractmethod
     def subscription(self) -> Subscription:
         """Say what to receive, from where, as things stand."""
-        raise NotImplementedError
 
     def attach(self, sink: Sink) -> None:
         """Begin to feed `sink`, from the event loop."""

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -62,25 +63,25 @@ _OBSTACLES = {
 _REMEMBERED_TOPICS = 4096
 
 
-class Sink:
+class Sink(ABC):
     """Takes what a subscription brings. Called on the event loop; must not block and must not raise."""
 
+    @abstractmethod
     def on_message(self, topic: bytes, payload: BytesLike) -> None:
         """Take one message."""
-        raise NotImplementedError
 
+    @abstractmethod
     def on_malformed(self, problem: str) -> None:
         """Take note of a message that is none."""
-        raise NotImplementedError
 
+    @abstractmethod
     def on_end(self, error: Callable[[], URLabError]) -> None:
         """Take note that nothing will come any more, and why."""
-        raise NotImplementedError
 
-    def on_drained(self) -> None:
+    def on_drained(self) -> None:  # noqa: B027 - a sink that acts on each message needs nothing here
         """Act on the messages that just came, after the last of a batch."""
 
-    def on_gap(self, why: str) -> None:
+    def on_gap(self, why: str) -> None:  # noqa: B027 - a sink that keeps only the newest misses nothing
         """Take note that messages are missing before the next one."""
 
 
