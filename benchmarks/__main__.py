@@ -1,0 +1,88 @@
+"""`python -m benchmarks`: print the table and write the JSON file."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+import msgspec
+
+from benchmarks.harness import Result, measure
+from benchmarks.machine import describe
+from benchmarks.rows import all_rows
+
+
+def main() -> int:
+    """Run the command line; return the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="under a minute; noisier")
+    parser.add_argument("--only", action="append", metavar="NAME", help="rows whose name contains NAME; repeatable")
+    parser.add_argument("--json", type=Path, default=Path("benchmarks.json"), help="file to write (%(default)s)")
+    parser.add_argument("--seconds", type=float, help="seconds to measure each row, instead of 10, or 1 with --quick")
+    parser.add_argument("--list", action="store_true", help="list the rows and stop")
+    options = parser.parse_args()
+    rows = [row for row in all_rows() if not options.only or any(part in row.name for part in options.only)]
+    if not rows:
+        parser.error(f"no row is named like {' or '.join(options.only)}")
+    if options.list:
+        for row in rows:
+            print(f"{row.name:<22}{row.what} / {row.floor}")
+        return 0
+    seconds = options.seconds or (1.0 if options.quick else 10.0)
+    before = describe()
+    print(f"{before['cpu']}, {before['cores']} cores, load {before['load']}, Python {before['python']}\n")
+    print(f"{'row':<22}{'ratio':>7}  {'(10-90 % of rounds)':<21}{'to reach':>9}{'p99':>8}{'to keep':>9}  rounds")
+    results: list[Result] = []
+    for row in rows:
+        started = time.perf_counter()
+        result = measure(row, seconds)
+        results.append(result)
+        _print(result, time.perf_counter() - started)
+    document = {"before": before, "after": describe(), "seconds": seconds, "rows": [_plain(r) for r in results]}
+    options.json.write_bytes(msgspec.json.format(msgspec.json.encode(document), indent=1) + b"\n")
+    print(f"\nwritten: {options.json}")
+    return 0
+
+
+def _print(result: Result, seconds: float) -> None:
+    row = result.row
+    sign = "≥" if row.kind == "rate" else "≤"
+    spread = f"({result.low:.2f} - {result.high:.2f})"
+    p99 = "" if result.p99 is None else f"{result.p99:.2f}"
+    keep = "" if row.p99 is None else f"≤ {row.p99:.2f}"
+    missed = f"  missed: {', '.join(result.misses)}" if result.misses else ""
+    print(
+        f"{row.name:<22}{result.ratio:>7.2f}  {spread:<21}{f'{sign} {row.reach:.2f}':>9}{p99:>8}{keep:>9}"
+        f"  {result.rounds} in {seconds:.0f} s{missed}"
+    )
+    for figure in result.figures:
+        limit = "" if figure.at_most is None else f"  (to keep: ≤ {figure.at_most:g})"
+        print(f"  {figure.name}: {figure.value:.3g}{limit}")
+    sys.stdout.flush()
+
+
+def _plain(result: Result) -> dict[str, object]:
+    row = result.row
+    return {
+        "name": row.name,
+        "what": row.what,
+        "floor": row.floor,
+        "kind": row.kind,
+        "ratio": result.ratio,
+        "low": result.low,
+        "high": result.high,
+        "reach": row.reach,
+        "p99": result.p99,
+        "p99_to_keep": row.p99,
+        "rounds": result.rounds,
+        "samples": result.samples,
+        "median_s": {"ours": result.median_s[0], "floor": result.median_s[1]},
+        "figures": [{"name": f.name, "value": f.value, "at_most": f.at_most} for f in result.figures],
+        "missed": result.misses,
+    }
+
+
+if __name__ == "__main__":
+    sys.exit(main())

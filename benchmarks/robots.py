@@ -1,0 +1,75 @@
+"""Robots to measure with, and what a real server answers about them."""
+
+from __future__ import annotations
+
+import functools
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from benchmarks.canned import Requester
+from urlab_client.protocol.base import Request
+from urlab_client.protocol.codec import decode_reply, encode_request, op_of
+from urlab_client.protocol.messages.runtime import SetMode
+from urlab_client.protocol.messages.session import Hello, HelloOk, Meta, Step
+from urlab_client.server import SimulatedServer
+
+__all__ = ["recorded", "robot_mjcf"]
+
+_SENSORS = """
+    <gyro name="imu_gyro" site="imu"/>
+    <accelerometer name="imu_acc" site="imu"/>
+    <framequat name="imu_quat" objtype="site" objname="imu"/>
+"""
+
+
+def robot_mjcf(joints: int, *, terrain: int = 0) -> str:
+    """Return a robot with a free base, so many hinges in limbs of six, a motor each, and an inertial unit.
+
+    Args:
+        joints: Hinges.
+        terrain: Side of a height field that only makes the model large, samples.
+    """
+    limbs: list[str] = []
+    for start in range(0, joints, 6):
+        chain = ""
+        for i in reversed(range(start, min(start + 6, joints))):
+            chain = (
+                f'<body name="link{i}" pos="0 0 -0.08"><joint name="joint{i}" axis="{i % 2} {(i + 1) % 2} 0"'
+                f' range="-60 60"/><geom type="capsule" size="0.02 0.03" contype="0" conaffinity="0"/>{chain}</body>'
+            )
+        limbs.append(chain)
+    motors = "".join(f'<motor name="motor{i}" joint="joint{i}" gear="5"/>' for i in range(joints))
+    asset = f'<hfield name="terrain" nrow="{terrain}" ncol="{terrain}" size="5 5 1 1"/>' if terrain else ""
+    return f"""<mujoco model="robot">
+    <default><joint damping="0.5" armature="0.01"/></default>
+    <asset>{asset}</asset>
+    <worldbody><body name="torso" pos="0 0 1"><freejoint name="root"/><site name="imu"/>
+    <geom type="box" size="0.1 0.1 0.2"/>{"".join(limbs)}</body></worldbody>
+    <actuator>{motors}</actuator>
+    <sensor>{_SENSORS}</sensor>
+    </mujoco>"""
+
+
+@functools.cache
+def recorded(joints: int, count: int = 1, *, mode: str = "direct", terrain: int = 0) -> Mapping[str, bytes]:
+    """Return what the simulated server answers to `hello`, `meta`, `set_mode` and `step`, by op.
+
+    Args:
+        joints: Hinges of each robot.
+        count: Robots.
+        mode: Step mode that the server is left in.
+        terrain: See `robot_mjcf`.
+    """
+    answers: dict[str, bytes] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "robot.xml"
+        path.write_text(robot_mjcf(joints, terrain=terrain))
+        with SimulatedServer(*[path] * count, play=True) as server, Requester(server.step_port) as floor:
+            answers["hello"] = floor.ask(encode_request(Hello(), ""))
+            hello = decode_reply(op_of(Hello), HelloOk, answers["hello"])
+            others: list[Request[Any]] = [Meta(), SetMode(mode=mode), Step()]
+            for request in others:
+                answers[op_of(request).name] = floor.ask(encode_request(request, hello.session_id))
+    return answers
