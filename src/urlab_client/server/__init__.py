@@ -7,6 +7,21 @@ package imports MuJoCo.
 from urlab_client.server.bundled import bundled_models
 from urlab_client.server.controllers import ControllerConfig
 from urlab_client.server.endpoint import PortInUse
+from urlab_client.server.faults import ActiveFault, Corrupt, Cut, Delay, Drop, Fault, Faults, Refuse
 from urlab_client.server.simulated import ModelError, SimulatedServer
 
-__all__ = ["ControllerConfig", "ModelError", "PortInUse", "SimulatedServer", "bundled_models"]
+__all__ = [
+    "ActiveFault",
+    "ControllerConfig",
+    "Corrupt",
+    "Cut",
+    "Delay",
+    "Drop",
+    "Fault",
+    "Faults",
+    "ModelError",
+    "PortInUse",
+    "Refuse",
+    "SimulatedServer",
+    "bundled_models",
+]

@@ -10,6 +10,7 @@ import contextlib
 import logging
 import threading
 import time
+from collections.abc import Callable
 from typing import Final
 
 import zmq
@@ -66,7 +67,12 @@ class _Stream:
 
 
 class CameraStreams:
-    """Publishes the cameras of the play session. The first port is held for as long as the server is open."""
+    """Publishes the cameras of the play session. The first port is held for as long as the server is open.
+
+    Attributes:
+        filter: What becomes of an image, from its topic and pixels: its pixels, or None for nothing. Set it before
+            `start`; called on the thread that sends.
+    """
 
     def __init__(self, *, host: str, port: int) -> None:
         """Bind the first port.
@@ -79,6 +85,7 @@ class CameraStreams:
             PortInUse: Somebody has the port.
             OSError: The address is none of this machine.
         """
+        self.filter: Callable[[bytes, bytes], bytes | None] | None = None
         self._host = host
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._lock = threading.Lock()
@@ -160,20 +167,23 @@ class CameraStreams:
     def _publish(self) -> None:
         with self._lock:
             running = self._running
-            keys = {stream.key: "sync" for stream in self._streams if stream.wanted()}
-        if running is None or not keys or running.engine.mode in (StepMode.DIRECT, StepMode.PUPPET):
+            topics = {stream.key: stream.topic for stream in self._streams if stream.wanted()}
+        if running is None or not topics or running.engine.mode in (StepMode.DIRECT, StepMode.PUPPET):
             return
-        shots = running.cameras.shots(keys)
+        shots = running.cameras.shots(dict.fromkeys(topics, "sync"))
         try:
             with running.engine.lock:
                 exposure = running.cameras.capture(shots)
         except Refusal:  # physics is busy; the next time, then
             return
-        frames = running.cameras.frames(shots, exposure) or {}
+        images: dict[str, bytes] = {}
+        for key, frame in (running.cameras.frames(shots, exposure) or {}).items():
+            image = frame.data if self.filter is None else self.filter(topics[key], frame.data)
+            if image is not None:
+                images[key] = image
         with self._lock:
             if self._running is not running:
                 return
             for stream in self._streams:
-                frame = frames.get(stream.key)
-                if frame is not None:
-                    stream.socket.send_multipart([stream.topic, frame.data], zmq.DONTWAIT)
+                if stream.key in images:
+                    stream.socket.send_multipart([stream.topic, images[stream.key]], zmq.DONTWAIT)

@@ -10,7 +10,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from urlab_client.protocol.codec import encode_reply
 from urlab_client.protocol.enums import CameraMode, StepMode
+from urlab_client.protocol.messages.session import ErrorReply
 from urlab_client.server.actors import Actor
 from urlab_client.server.controllers import ControllerConfig
 from urlab_client.server.engine import Engine
@@ -84,6 +86,10 @@ class ServerCore:
     play: Play = field(default_factory=Play)
     viewport: Viewport = field(default_factory=Viewport)
     drawings: Drawings = field(default_factory=Drawings)
+
+    def refuse(self, code: str, message: str) -> bytes:
+        """Return the frame of an error reply."""
+        return encode_reply(ErrorReply(code=code, message=message), json=self.session.json)
 
     def begin_play(self) -> None:
         """Start play with the level as it is now; `play.wait` says how it ends."""

@@ -12,7 +12,7 @@ import os
 import socket
 import threading
 from collections.abc import Callable
-from typing import Final
+from typing import ClassVar, Final
 
 import zmq
 
@@ -118,9 +118,11 @@ class RpcEndpoint:
     """Receives requests one at a time and sends what `answer` returns.
 
     Attributes:
+        kind: Type of the ZeroMQ socket.
         port: TCP port that is bound.
     """
 
+    kind: ClassVar[int] = zmq.REP
     port: int
 
     def __init__(self, answer: Callable[[bytes], bytes], *, host: str = "127.0.0.1", port: int = 0) -> None:
@@ -138,7 +140,7 @@ class RpcEndpoint:
         self._answer = answer
         self._context = zmq.Context()
         self._context.linger = LINGER_MS
-        self._socket = self._context.socket(zmq.REP)
+        self._socket = self._context.socket(self.kind)
         # A frame between the two limits is answered with the reason, one beyond both costs the sender its connection.
         self._socket.maxmsgsize = 2 * MAX_REQUEST_BYTES
         try:
@@ -179,21 +181,26 @@ class RpcEndpoint:
         return not self._thread.is_alive()
 
     def _run(self) -> None:
-        receive, send, answer, option = self._socket.recv, self._socket.send, self._answer, self._socket.getsockopt
         try:
-            while True:
-                frame = receive()
-                # A request of several frames is none: to execute the first one would be a guess.
-                while option(zmq.RCVMORE):
-                    receive()
-                    frame = b""
-                if self._stopping:
-                    break
-                send(answer(frame))
+            while self._exchange():
+                pass
         except zmq.ZMQError:
             logger.exception("the request socket failed; the server answers no longer")
         finally:
             self._close()
+
+    def _exchange(self) -> bool:
+        """Answer one request; return False when it is time to end."""
+        socket = self._socket
+        frame = socket.recv()
+        # A request of several frames is none: to execute the first one would be a guess.
+        while socket.getsockopt(zmq.RCVMORE):
+            socket.recv()
+            frame = b""
+        if self._stopping:
+            return False
+        socket.send(self._answer(frame))
+        return True
 
     def _close(self) -> None:
         self._socket.close()

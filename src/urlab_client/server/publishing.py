@@ -423,6 +423,8 @@ class StreamServer:
         state_port: Port of the state stream.
         ctrl_port: Port of streamed controls and gains.
         info_port: Port of the info stream.
+        filter: What becomes of a message, from its topic and payload: its payload, or None for nothing. Set it before
+            `start`; called on the thread that sends.
     """
 
     state_port: int
@@ -451,6 +453,7 @@ class StreamServer:
             PortInUse: Somebody has a port.
             OSError: The address is not one of this machine.
         """
+        self.filter: Callable[[bytes, bytes], bytes | None] | None = None
         self._cameras = cameras
         self._context = zmq.Context()
         self._context.linger = 0
@@ -602,10 +605,14 @@ class StreamServer:
             if broadcast is not self._broadcast:
                 continue
             for topic, payload in broadcast.state_messages(tick):
-                self._state.send(topic, zmq.SNDMORE | zmq.NOBLOCK)
-                self._state.send(payload, zmq.NOBLOCK)
+                sent = payload if self.filter is None else self.filter(topic, payload)
+                if sent is not None:
+                    self._state.send(topic, zmq.SNDMORE | zmq.NOBLOCK)
+                    self._state.send(sent, zmq.NOBLOCK)
             for frame in broadcast.info_messages(tick, self._cameras):
-                self._info.send(frame, zmq.NOBLOCK)
+                sent = frame if self.filter is None else self.filter(frame, frame)
+                if sent is not None:
+                    self._info.send(sent, zmq.NOBLOCK)
 
     def _read_commands(self) -> None:
         for frames in _waiting(self._control):

@@ -30,6 +30,7 @@ from urlab_client.server.controllers import ControllerConfig
 from urlab_client.server.core import PhysicsConfig, ServerCore
 from urlab_client.server.dispatch import Dispatcher
 from urlab_client.server.endpoint import RpcEndpoint, connect_host, numeric_host, tcp
+from urlab_client.server.faults import Faults, FaultyEndpoint, Injector
 from urlab_client.server.handlers import HANDLERS
 from urlab_client.server.publishing import StreamServer
 from urlab_client.server.refusal import Refusal
@@ -73,6 +74,7 @@ class _Config:
     model_roots: tuple[Path, ...] | None
     actor_names: Literal["model", "plugin"]
     physics: PhysicsConfig
+    faults: Faults | None
 
 
 class SimulatedServer:
@@ -112,6 +114,7 @@ class SimulatedServer:
         camera_size: tuple[int, int] | None = None,
         mjcf_options: bool = False,
         actor_names: Literal["model", "plugin"] = "model",
+        faults: Faults | None = None,
     ) -> None:
         """Describe a server; `start`, or entering it, opens it.
 
@@ -137,6 +140,8 @@ class SimulatedServer:
             mjcf_options: Honour the `<option>` of the first model; the plugin ignores it.
             actor_names: Name articulations after their MJCF's model name (`robot`, `robot_1`) or as the plugin does
                 (`robot_C_0`, `robot_C_1`).
+            faults: What is to go wrong with replies and published messages, for tests; may change while the server
+                runs.
 
         Raises:
             ValueError: A port, mode or size that is none, or two levels.
@@ -168,6 +173,7 @@ class SimulatedServer:
                 camera_size=camera_size,
                 mjcf_options=mjcf_options,
             ),
+            faults=faults,
         )
         self._lock = threading.Lock()
         self._opened: _Opened | None = None
@@ -303,6 +309,7 @@ class _Opened:
         self._cameras: CameraStreams | None = None
         self._streams: StreamServer | None = None
         self._scratch: Path | None = None
+        self._injector: Injector | None = None
         self._endpoint: RpcEndpoint | None = None
         self._core: ServerCore | None = None
         self._closed = False
@@ -367,11 +374,19 @@ class _Opened:
             camera_endpoint=cameras.endpoint,
         )
         self._core = core
+        if config.faults is not None:
+            self._injector = injector = Injector(config.faults, core.refuse)
+            self._streams.filter = cameras.filter = injector.publish
         core.play.listeners += [cameras.show, self._streams.show]  # the second announces the first's ports
         cameras.start()
         self._streams.start()
         # Bound before the models are read, which takes longer, and answering after: requests wait in the socket.
-        self._endpoint = RpcEndpoint(Dispatcher(core, HANDLERS).answer, host=self.host, port=ports.step)
+        answer = Dispatcher(core, HANDLERS).answer
+        self._endpoint = (
+            RpcEndpoint(answer, host=self.host, port=ports.step)
+            if self._injector is None
+            else FaultyEndpoint(self._injector, answer, host=self.host, port=ports.step)
+        )
         try:
             _populate(core.world, config.models)
         except Refusal as refusal:
@@ -400,6 +415,8 @@ class _Opened:
             return
         self._closed = True
         deadline = time.monotonic() + CLOSE_S
+        if self._injector is not None:
+            self._injector.close()
         if self._endpoint is not None:
             self._endpoint.stop()
         if self._streams is not None:

@@ -1,0 +1,185 @@
+"""Faults on purpose, as a user's test meets them: through the client, and for the rest over a bare socket."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zmq
+from hypothesis import given
+from hypothesis import strategies as st
+
+from urlab_client import (
+    ConnectionLost,
+    OutcomeUnknown,
+    ProtocolError,
+    StepTimeout,
+    URLabClient,
+    URLabTimeoutError,
+)
+from urlab_client.server import Corrupt, Cut, Delay, Drop, Fault, Faults, Refuse, SimulatedServer
+
+
+@pytest.fixture(scope="module")
+def server(models: Path) -> Iterator[SimulatedServer]:
+    with SimulatedServer(models / "bot.xml", play=True, faults=FAULTS) as server:
+        yield server
+
+
+FAULTS = Faults(seed=7)
+
+
+@pytest.fixture
+def faults(server: SimulatedServer) -> Iterator[Faults]:
+    yield FAULTS
+    FAULTS.clear()
+
+
+@pytest.fixture
+def client(server: SimulatedServer, faults: Faults) -> Iterator[URLabClient]:
+    with URLabClient(**server.client_options(), step_mode="direct", rcv_timeout_ms=2000) as client:
+        client.discover()
+        client.reset()
+        yield client
+
+
+def test_a_late_reply_runs_into_the_timeout_and_the_next_step_works(client: URLabClient, faults: Faults) -> None:
+    late = faults.add(Delay("step", seconds=60.0, after=1, times=1))
+    client.step()
+    with pytest.raises(URLabTimeoutError):
+        client.step(timeout=0.05)
+    late.remove()
+    assert client.step().step == 3, "the late step was executed"
+    assert (late.seen, late.applied) == (2, 1)
+
+
+@pytest.mark.parametrize("executed", [True, False])
+def test_a_lost_step(client: URLabClient, faults: Faults, executed: bool) -> None:
+    with faults.add(Drop("step", times=1, executed=executed)) as lost, pytest.raises(URLabTimeoutError):
+        client.step(timeout=0.05)
+    assert lost.applied == 1
+    assert faults.active == ()
+    assert client.connected
+    assert client.step().step == (2 if executed else 1)
+
+
+@pytest.mark.parametrize("executed", [True, False])
+def test_a_cut_connection(client: URLabClient, faults: Faults, executed: bool) -> None:
+    with faults.add(Cut("step", executed=executed, times=1)), pytest.raises(OutcomeUnknown):
+        client.step()
+    with faults.add(Cut("list_keyframes", times=1)), pytest.raises(ConnectionLost):
+        client.runtime.list_keyframes()
+    assert client.step().step == (2 if executed else 1)
+    assert client.transport_stats.connects == 3
+
+
+def test_others_keep_their_connection(server: SimulatedServer, client: URLabClient, faults: Faults) -> None:
+    with URLabClient(**server.client_options(), step_mode="direct") as other:
+        other.discover()
+        with faults.add(Cut(times=1)), pytest.raises(ConnectionLost):
+            client.runtime.list_keyframes()
+        other.step()
+        assert other.transport_stats.connects == 1
+
+
+def test_a_corrupt_reply(client: URLabClient, faults: Faults) -> None:
+    with faults.add(Corrupt("step", times=1)), pytest.raises(ProtocolError):
+        client.step()
+    assert client.step().step == 2
+
+
+@pytest.mark.parametrize("executed", [True, False])
+def test_a_refusal(client: URLabClient, faults: Faults, executed: bool) -> None:
+    faults.add(Refuse("step", code="step_timeout", message="too slow", executed=executed, times=1))
+    with pytest.raises(StepTimeout, match="too slow"):
+        client.step()
+    assert client.step().step == (2 if executed else 1)
+
+
+def test_a_delay_and_a_loss_add_up(client: URLabClient, faults: Faults) -> None:
+    slow, lost, never = (faults.add(fault) for fault in (Delay(seconds=0.01), Drop("step"), Cut("step")))
+    with pytest.raises(URLabTimeoutError):
+        client.step(timeout=0.2)
+    assert (slow.applied, lost.applied, never.seen) == (1, 1, 0)
+
+
+def test_waiting_for_a_fault(client: URLabClient, faults: Faults) -> None:
+    lost = faults.add(Drop("step", times=1))
+    assert not lost.wait(timeout=0.0)
+    with pytest.raises(URLabTimeoutError):
+        client.step(timeout=0.01)
+    assert lost.wait()
+
+
+def test_closing_ends_a_delay(models: Path) -> None:
+    faults = Faults(Delay(seconds=3600.0))
+    with SimulatedServer(models / "bot.xml", faults=faults) as server, zmq.Context() as context:
+        asking = context.socket(zmq.REQ)
+        asking.linger = 0
+        asking.connect(f"{server.address}:{server.step_port}")
+        asking.send(b"\x80")
+        (delay,) = faults.active
+        assert delay.wait()
+        server.close()  # or this test runs into its time limit
+        asking.close()
+
+
+def test_published_messages_get_lost_late_or_corrupt(server: SimulatedServer, faults: Faults) -> None:
+    topic = "state/full"
+    with zmq.Context() as context, context.socket(zmq.SUB) as stream:
+        stream.linger = 0
+        stream.subscribe(topic)
+        stream.connect(f"{server.address}:{server.state_port}")
+        assert stream.poll(5000)
+        lost = faults.add(Drop(topic=topic, times=3))
+        assert lost.wait(3)
+        late = faults.add(Delay(topic=topic, seconds=0.001, times=1))
+        assert late.wait()
+        broken = faults.add(Corrupt(topic=topic, times=1))
+        assert broken.wait()
+        while stream.recv_multipart()[1][0] != 0xC1:
+            assert stream.poll(5000)
+
+
+def run(seed: int) -> list[bool]:
+    faults = Faults(seed=seed)
+    fault = faults.add(Drop("step", probability=0.5, after=2, times=5))
+    return [faults.take(lambda each: each.concerns_request("step"))[1] is fault for _ in range(40)]
+
+
+@given(st.integers())
+def test_a_seed_decides(seed: int) -> None:
+    assert run(seed) == run(seed)
+    assert not any(run(seed)[:2])
+    assert sum(run(seed)) <= 5
+
+
+def test_seeds_differ() -> None:
+    assert len({tuple(run(seed)) for seed in range(5)}) > 1
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "complaint"),
+    [
+        (Drop, {"op": "fly"}, "no op 'fly'"),
+        (Drop, {"op": "step", "topic": "state/full"}, "not both"),
+        (Cut, {"topic": "state/full"}, "Cut concerns requests"),
+        (Refuse, {"code": ""}, "needs a code"),
+        (Delay, {"seconds": -1.0}, "seconds"),
+        (Delay, {"seconds": float("nan")}, "seconds"),
+        (Drop, {"probability": 2.0}, "probability"),
+        (Drop, {"times": 0}, "times"),
+        (Corrupt, {"executed": False}, "executed"),
+        (Corrupt, {"flips": -1}, "flips"),
+    ],
+)
+def test_faults_that_are_none(kind: type[Fault], options: dict[str, Any], complaint: str) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        kind(**options)
+
+
+def test_a_fault_is_of_some_kind() -> None:
+    with pytest.raises(TypeError, match="Delay, Drop"):
+        Fault()
