@@ -13,12 +13,13 @@ PACKAGE = Path(__file__).resolve().parents[1] / "src" / "urlab_client"
 # Layer -> the layers it may import besides itself. The empty name is the public package, `urlab_client` itself.
 ALLOWED: dict[str, frozenset[str]] = {
     "protocol": frozenset(),
-    "aio": frozenset({"protocol"}),
+    "keys": frozenset({"protocol"}),
+    "aio": frozenset({"keys", "protocol"}),
     "sync": frozenset({"aio", "protocol"}),
-    "server": frozenset({"protocol"}),
+    "server": frozenset({"keys", "protocol"}),
     "enums": frozenset({"protocol"}),
     "": frozenset({"sync", "enums", "protocol"}),
-    "cli": frozenset({"", "aio", "enums", "protocol", "server", "sync"}),
+    "cli": frozenset({"", "aio", "enums", "keys", "protocol", "server", "sync"}),
     "__main__": frozenset({"cli"}),
 }
 

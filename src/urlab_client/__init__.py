@@ -19,6 +19,7 @@ from urlab_client.protocol.enums import (
 from urlab_client.protocol.errors import (
     ActorHierarchyFailed,
     AddQuickConvertFailed,
+    AuthenticationFailed,
     BadMode,
     BadRequest,
     BadValue,
@@ -171,6 +172,7 @@ __all__ = [
     "Actuator",
     "ActuatorType",
     "AddQuickConvertFailed",
+    "AuthenticationFailed",
     "BadMode",
     "BadRequest",
     "BadValue",

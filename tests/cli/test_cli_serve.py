@@ -15,7 +15,7 @@ from urlab_client.protocol.enums import CameraMode, StepMode
 
 READY_KEYS = [
     "event", "address", "step_port", "state_port", "ctrl_port", "info_port", "camera_port", "shm_dir", "saved_dir",
-    "pid",
+    "pid", "open_to", "server_key",
 ]  # fmt: skip
 
 
@@ -53,6 +53,7 @@ def test_ends_while_a_client_is_connected_and_physics_runs(tmp_path: Path) -> No
 def test_says_readably_where_it_serves(tmp_path: Path) -> None:
     with served("arm", cwd=tmp_path, json=False) as server:
         assert server.first_line.startswith("Serving arm at tcp://127.0.0.1:")
+        assert "open to any program on this machine" in server.first_line
         assert "Ctrl-C" in server.first_line
         assert server.end(signal.SIGINT) == (0, "", "")
 
@@ -182,6 +183,10 @@ def test_a_port_in_use(name: str, capsys: pytest.CaptureFixture[str]) -> None:
         (["arm", "--shm-dir", "/dev/shm"], ["--shm-dir", "not in this version"]),
         (["arm", "--step-port", "1", "--info-port", "1"], ["--step-port", "--info-port", "1"]),
         (["arm", "--host", "host.invalid"], ["host.invalid"]),
+        (["arm", "--host", "0.0.0.0"], ["0.0.0.0", "--server-key", "--insecure-no-auth"]),
+        (["arm", "--server-key", "s.key_secret"], ["--allow-client", "--allow-any-client"]),
+        (["arm", "--allow-any-client"], ["--server-key"]),
+        (["arm", "--server-key", "none.key_secret", "--allow-any-client"], ["none.key_secret"]),
         (["arm", "--model-root", "nowhere"], ["--model-root", "nowhere"]),
         (["lab.json"], ["lab.json"]),
     ],

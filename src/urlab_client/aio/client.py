@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import operator
+import os
 import warnings
 from collections.abc import Collection, Mapping
 from threading import RLock
@@ -30,6 +31,7 @@ from urlab_client.aio.state import SimState
 from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS, Stream
 from urlab_client.aio.transport.base import Transport as TransportProtocol
 from urlab_client.aio.transport.base import TransportStats
+from urlab_client.aio.transport.curve import ClientKeys, client_keys, is_local
 from urlab_client.aio.transport.zmq import ZmqTransport
 from urlab_client.protocol.base import Reply, Request
 from urlab_client.protocol.codec import op_of
@@ -87,8 +89,15 @@ class URLabClient:
         transport: `zmq`, or `shm` on the same host.
         shm_dir: Directory of the shared-memory regions, when it is not the one the server names.
         encoding: `msgpack`, or `json` to make traffic readable while debugging.
+        server_key: Public key of a server that uses CURVE: a file, or its 40 characters. On other machines than this
+            one the environment variable `URLAB_SERVER_KEY` may name the file instead.
+        client_key: File with the client's own secret key, for servers that know their clients; likewise
+            `URLAB_CLIENT_KEY`. None makes up a key.
+        trust_server: Load the binary model of a server that is neither on this machine nor known by its key. Without,
+            the model is compiled here from XML.
 
     Raises:
+        KeyFileError: A key file cannot be used.
         ValueError: The address or an option is malformed.
     """
 
@@ -108,6 +117,9 @@ class URLabClient:
         transport: str | Transport = "zmq",
         shm_dir: str | None = None,
         encoding: str = "msgpack",
+        server_key: str | os.PathLike[str] | None = None,
+        client_key: str | os.PathLike[str] | None = None,
+        trust_server: bool = False,
     ) -> None:
         self._config = ClientConfig(
             address=address,
@@ -123,6 +135,9 @@ class URLabClient:
             transport=Transport(transport),
             shm_dir=shm_dir,
             encoding=encoding,
+            server_key=None if server_key is None else os.fspath(server_key),
+            client_key=None if client_key is None else os.fspath(client_key),
+            trust_server=trust_server,
         )
         if encoding not in {"msgpack", "json"}:
             raise ValueError(f"encoding is msgpack or json, not {encoding!r}")
@@ -130,12 +145,14 @@ class URLabClient:
             raise URLabError("Shared memory is not available in this version.", hint="Use transport='zmq'.")
         if rcv_timeout_ms <= 0:
             raise ValueError(f"rcv_timeout_ms must be above 0, got {rcv_timeout_ms}")
-        self._transport = _transport(address, step_port)
+        keys = client_keys(address, self._config.server_key, self._config.client_key)
+        self._transport = _transport(address, step_port, keys)
         self._session = Session(self._transport, default_timeout=rcv_timeout_ms / 1000, json=encoding == "json")
         self._publishers = Publishers(
             lambda: self._transport.endpoint,
             lambda: self._transport.state_port or state_port,
             default_timeout=rcv_timeout_ms / 1000,
+            keys=keys,
         )
         self._transport.on_event = self._publishers.events.publish
         self._state = SimState(
@@ -145,6 +162,7 @@ class URLabClient:
             local_model=local_model,
             check_version=mujoco_version_check,
             promote=auto_promote_step_mode,
+            trusted=trust_server or keys is not None or is_local(address),
         )
         self._closed = False
         self._scene = SceneNamespace(self._session)
@@ -335,6 +353,7 @@ class URLabClient:
         Raises:
             URLabVersionMismatch: Client and server MuJoCo builds differ.
             ServerUnreachable: Nothing answers at the address.
+            AuthenticationFailed: Server and client do not accept each other's keys.
         """
         level = ObservationLevel(observations)
         await self._state.open(level, timeout=timeout)
@@ -633,11 +652,11 @@ class URLabClient:
         raise UnknownKeyframe("unknown_keyframe", f"{problem}. Nothing was sent.", op="reset")
 
 
-def _transport(address: str, step_port: int) -> TransportProtocol:
+def _transport(address: str, step_port: int, keys: ClientKeys | None) -> TransportProtocol:
     if address.startswith(SCHEME):
         return LaunchedTransport(address)
     scheme, separator, rest = address.partition("://")
     if not separator or scheme not in {"tcp", "ipc"} or not rest:
         raise ValueError(f"{address!r} is no address; write tcp://HOST, ipc://PATH or sim://MODEL")
     own_port = scheme == "tcp" and rest.rpartition(":")[2].isdigit()
-    return ZmqTransport(address if own_port else f"{address}:{step_port}")
+    return ZmqTransport(address if own_port else f"{address}:{step_port}", keys)

@@ -90,7 +90,8 @@ class Mirror:
         lock: Held while data change; hold it to read several values that belong together from another thread.
         model: The compiled model, or None without one.
         data: State that mirrors the server's, or None without a model.
-        approximate: True when the model was compiled here from XML because the server runs another MuJoCo build.
+        approximate: True when the model was compiled here from XML because the server runs another MuJoCo build
+            or is not trusted with binary models.
     """
 
     def __init__(self) -> None:
@@ -125,7 +126,8 @@ class Mirror:
 
         mismatch = self.check_version(hello)
         try:
-            if mismatch is None and hello.mjb is not None:
+            binary = mismatch is None and hello.mjb is not None
+            if binary and hello.mjb is not None:
                 model = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": hello.mjb})
             elif hello.mjcf_compiled is not None:
                 model = mujoco.MjModel.from_xml_string(hello.mjcf_compiled, hello.vfs_assets or {})
@@ -138,7 +140,7 @@ class Mirror:
         mujoco.mj_forward(model, data)
         with self.lock:
             self.model, self.data = model, data
-            self.approximate = mismatch is not None
+            self.approximate = not binary
             self._stale = False
             self._dragged = None
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 
 from urlab_client.aio.sources import CameraSource, EventBus, HasCamera, RowSource, StateSource
+from urlab_client.aio.transport.curve import ClientKeys
 from urlab_client.aio.transport.subscriber import Subscriptions
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.rows import TopicKind
@@ -19,6 +20,7 @@ class Publishers:
         rpc_endpoint: Tells where requests go: the other ports are on the same host.
         state_port: Tells the port of the state stream.
         default_timeout: Seconds that a stream waits for its first item unless told otherwise; None waits.
+        keys: What the publishers demand; None for nothing.
 
     Attributes:
         default_timeout: As given.
@@ -27,10 +29,15 @@ class Publishers:
     """
 
     def __init__(
-        self, rpc_endpoint: Callable[[], str], state_port: Callable[[], int], *, default_timeout: float | None
+        self,
+        rpc_endpoint: Callable[[], str],
+        state_port: Callable[[], int],
+        *,
+        default_timeout: float | None,
+        keys: ClientKeys | None = None,
     ) -> None:
         self.default_timeout = default_timeout
-        self.subscriptions = Subscriptions()
+        self.subscriptions = Subscriptions(keys)
         self.events = EventBus()
         self._rpc_endpoint = rpc_endpoint
         self._state_port = state_port

@@ -26,7 +26,13 @@ from urlab_client.aio.records import ArticulationRecord, EntityRecord, Wrenches
 from urlab_client.aio.session import Session
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.errors import NoActiveManager, ProtocolError, SessionTakenOver, URLabRPCError
+from urlab_client.protocol.errors import (
+    NoActiveManager,
+    ProtocolError,
+    SessionTakenOver,
+    URLabError,
+    URLabRPCError,
+)
 from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.protocol.messages.session import (
     ArticulationInfo,
@@ -86,6 +92,7 @@ class SimState:
         local_model: bool,
         check_version: bool,
         promote: bool,
+        trusted: bool,
     ) -> None:
         self.session = session
         self.publishers = publishers
@@ -110,6 +117,7 @@ class SimState:
         self._check_version = check_version
         session.on_refusal = self._note_refusal
         self._promote = promote
+        self._trusted = trusted
         self._records: dict[str, ArticulationRecord] = {}
         self._entity_records: dict[str, EntityRecord] = {}
 
@@ -167,9 +175,31 @@ class SimState:
         await self.adopt(hello, timeout=timeout)
         return hello
 
+    async def _without_binary(self, hello: HelloOk, timeout: Timeout) -> HelloOk:
+        """Return the handshake with a model in XML alone: MuJoCo's binary loader is no match for a hostile model.
+
+        Raises:
+            URLabError: The server has none.
+        """
+        if hello.mjcf_compiled is None:
+            log.info("the server is not trusted with binary models: the local model is compiled here from XML")
+            hello = await self.session.hello(Hello(observations=self.level, include_assets=True), timeout=timeout)
+        if hello.manager_present and hello.mjcf_compiled is None:
+            raise URLabError(
+                "The server offers its model only in MuJoCo's binary format, which is loaded from servers on this "
+                "machine and from servers known by their key.",
+                op="hello",
+                hint="Pass server_key=…, or trust_server=True if you trust all between here and there, or "
+                "local_model=False.",
+            )
+        hello.mjb = None
+        return hello
+
     async def adopt(self, hello: HelloOk, *, timeout: Timeout = DEFAULT) -> None:
         """Take over a handshake: load its model, bind the wrappers, bring the server into the wanted step mode."""
         if self._local_model:
+            if hello.mjb is not None and not self._trusted:
+                hello = await self._without_binary(hello, timeout)
             await anyio.to_thread.run_sync(self.mirror.load, hello)
         # The model is loaded; its bytes, several times its size, are not needed any more.
         hello.mjb = hello.mjb_base64 = hello.mjcf_compiled = hello.vfs_assets = None

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Callable
 from typing import Any, NoReturn, Protocol
 
-__all__ = ["Commands", "Parser", "count", "port", "seconds"]
+__all__ = ["Commands", "Parser", "add_keys", "count", "port", "seconds"]
 
 
 class Parser(argparse.ArgumentParser):
@@ -25,6 +25,16 @@ class Commands(Protocol):
     """What a command adds its parser to."""
 
     def add_parser(self, name: str, *, help: str, description: str) -> Parser: ...  # noqa: A002 - argparse's word
+
+
+def add_keys(parser: argparse.ArgumentParser) -> None:
+    """Add the options of a client that talks to a server with CURVE keys."""
+    parser.add_argument(
+        "--server-key", metavar="FILE", help="public key of a server that uses keys (default: $URLAB_SERVER_KEY)"
+    )
+    parser.add_argument(
+        "--client-key", metavar="FILE", help="own secret key, if the server knows its clients ($URLAB_CLIENT_KEY)"
+    )
 
 
 def port(text: str) -> int:

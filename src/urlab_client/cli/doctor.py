@@ -9,7 +9,7 @@ import sys
 
 import msgspec
 
-from urlab_client.cli._arguments import Commands, port, seconds
+from urlab_client.cli._arguments import Commands, add_keys, port, seconds
 from urlab_client.cli._mujoco import import_mujoco
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import URLabError
@@ -29,6 +29,8 @@ class DoctorArguments(argparse.Namespace):
     step_mode: StepMode
     timeout: float
     json: bool
+    server_key: str | None
+    client_key: str | None
 
 
 def add_parser(commands: Commands) -> None:
@@ -59,6 +61,7 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument("--timeout", type=seconds, default=2.0, metavar="S", help="deadline (default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="print JSON")
+    add_keys(parser)
     parser.set_defaults(run=run)
 
 
@@ -82,6 +85,8 @@ async def _diagnose(arguments: DoctorArguments) -> Diagnosis:
         auto_promote_step_mode=False,
         mujoco_version_check=False,
         rcv_timeout_ms=round(arguments.timeout * 1000),
+        server_key=arguments.server_key,
+        client_key=arguments.client_key,
     )
     async with client:
         with contextlib.suppress(URLabError):  # the diagnosis says it

@@ -14,7 +14,7 @@ import msgspec
 from msgspec import Struct
 
 from urlab_client.aio.launch import SCHEME
-from urlab_client.cli._arguments import Commands, count, port, seconds
+from urlab_client.cli._arguments import Commands, add_keys, count, port, seconds
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._mujoco import import_mujoco
 from urlab_client.protocol.errors import ModeLocked, URLabRPCError, URLabVersionMismatch
@@ -36,6 +36,8 @@ class PingArguments(argparse.Namespace):
     timeout: float
     count: int
     no_session: bool
+    server_key: str | None
+    client_key: str | None
     json: bool
 
 
@@ -120,6 +122,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("--count", type=count, default=5, metavar="N", help="round trips to time (default: 5)")
     parser.add_argument("--no-session", action="store_true", help="disturb nobody: do not open a session")
     parser.add_argument("--json", action="store_true", help="print one line of JSON")
+    add_keys(parser)
     parser.set_defaults(run=run)
 
 
@@ -162,6 +165,8 @@ def _client(arguments: PingArguments, *, local_model: bool) -> URLabClient:
             step_port=arguments.step_port,
             rcv_timeout_ms=max(1, round(arguments.timeout * 1000)),
             local_model=local_model,
+            server_key=arguments.server_key,
+            client_key=arguments.client_key,
         )
     except ValueError as error:
         raise CommandError(str(error)) from None

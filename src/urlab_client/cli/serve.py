@@ -22,6 +22,7 @@ from urlab_client.cli._mujoco import import_mujoco
 from urlab_client.protocol.enums import CameraMode, ControllerKind, StepMode
 
 if TYPE_CHECKING:
+    from urlab_client.server.guard import CurveServer
     from urlab_client.server.simulated import SimulatedServer
 
 __all__ = ["add_parser", "run"]
@@ -56,6 +57,10 @@ class ServeArguments(argparse.Namespace):
 
     models: list[str]
     host: str
+    server_key: Path | None
+    allow_client: list[Path]
+    allow_any_client: bool
+    insecure_no_auth: bool
     step_port: int
     state_port: int
     ctrl_port: int
@@ -92,7 +97,34 @@ def add_parser(commands: Commands) -> None:
         "becomes a blueprint and one actor whose id is the file stem",
     )
     network = parser.add_argument_group("network")
-    network.add_argument("--host", default="127.0.0.1", help="interface to bind (default: %(default)s)")
+    network.add_argument(
+        "--host",
+        default="127.0.0.1",
+        help="interface to bind (default: %(default)s); any but loopback needs --server-key or --insecure-no-auth",
+    )
+    network.add_argument(
+        "--server-key",
+        type=Path,
+        metavar="FILE",
+        help="encrypt everything and prove who this server is, with the secret key file that `urlab keys new` made",
+    )
+    who = network.add_mutually_exclusive_group()
+    who.add_argument(
+        "--allow-client",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="PATH",
+        help="with --server-key: let in the client with this public key file, or those of a folder; repeatable",
+    )
+    who.add_argument(
+        "--allow-any-client", action="store_true", help="with --server-key: let in whoever has the server's public key"
+    )
+    network.add_argument(
+        "--insecure-no-auth",
+        action="store_true",
+        help="serve anyone who reaches the interface: they can read and write files as clients can",
+    )
     for name, default in _PORTS.items():
         network.add_argument(
             f"--{name}-port", type=port, default=default, metavar="PORT", help="default %(default)s; 0: any free one"
@@ -269,6 +301,8 @@ def _server(arguments: ServeArguments, saved_dir: Path) -> SimulatedServer:
             unpaused=arguments.unpaused,
             step_mode=arguments.step_mode,
             host=arguments.host,
+            curve=_curve(arguments),
+            insecure_no_auth=arguments.insecure_no_auth,
             step_port=arguments.step_port,
             state_port=arguments.state_port,
             ctrl_port=arguments.ctrl_port,
@@ -286,18 +320,36 @@ def _server(arguments: ServeArguments, saved_dir: Path) -> SimulatedServer:
         raise CommandError(str(error)) from None
 
 
+def _curve(arguments: ServeArguments) -> CurveServer | None:
+    from urlab_client.server.guard import CurveServer  # noqa: PLC0415
+
+    if arguments.server_key is None:
+        if arguments.allow_client or arguments.allow_any_client:
+            raise CommandError("--allow-client and --allow-any-client go with --server-key FILE")
+        return None
+    if not (arguments.allow_client or arguments.allow_any_client):
+        raise CommandError("--server-key: say whom to let in, with --allow-client PATH or --allow-any-client")
+    return CurveServer(
+        server_key=arguments.server_key, allow=arguments.allow_client, allow_any=arguments.allow_any_client
+    )
+
+
 def _announce(server: SimulatedServer, arguments: ServeArguments) -> None:
     ports = {name: int(getattr(server, f"{name}_port")) for name in _PORTS}
     if arguments.json:
         ready: dict[str, Any] = {"event": "ready", "address": server.address}
         ready |= {f"{name}_port": number for name, number in ports.items()}
         ready |= {"shm_dir": None, "saved_dir": str(server.saved_dir), "pid": os.getpid()}
+        ready |= {"open_to": server.open_to, "server_key": server.client_options().get("server_key")}
         print(json.dumps(ready), flush=True)
         return
     others = ", ".join(f"{name} {number}" for name, number in ports.items() if name != "step")
     models = ", ".join(Path(model).name for model in arguments.models)
     end = "Ctrl-C or the end of standard input" if arguments.until_eof else "Ctrl-C"
-    print(f"Serving {models} at {server.address}:{ports['step']} ({others}); {end} ends it.", flush=True)
+    print(
+        f"Serving {models} at {server.address}:{ports['step']} ({others}), open to {server.open_to}; {end} ends it.",
+        flush=True,
+    )
 
 
 def _check_ports(arguments: ServeArguments) -> None:

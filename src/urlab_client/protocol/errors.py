@@ -14,6 +14,7 @@ __all__ = [
     "RPC_ERRORS",
     "ActorHierarchyFailed",
     "AddQuickConvertFailed",
+    "AuthenticationFailed",
     "BadMode",
     "BadRequest",
     "BadValue",
@@ -129,6 +130,10 @@ class URLabConnectionError(URLabError, ConnectionError):
 
 class ServerUnreachable(URLabConnectionError):
     """No connection could be made within the deadline; nothing was sent."""
+
+
+class AuthenticationFailed(ServerUnreachable):
+    """Server and client do not accept each other's CURVE keys, or only one of them uses such keys; nothing was sent."""
 
 
 class ConnectionLost(URLabConnectionError):

@@ -109,6 +109,9 @@ class ClientConfig(Struct, frozen=True, kw_only=True):
     transport: Transport = Transport.ZMQ
     shm_dir: str | None = None
     encoding: str = "msgpack"
+    server_key: str | None = None
+    client_key: str | None = None
+    trust_server: bool = False
 
     def options(self) -> dict[str, Any]:
         """Return the constructor's arguments: `URLabClient(**config.options())`."""

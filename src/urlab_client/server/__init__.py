@@ -8,12 +8,14 @@ from urlab_client.server.bundled import bundled_models
 from urlab_client.server.controllers import ControllerConfig
 from urlab_client.server.endpoint import PortInUse
 from urlab_client.server.faults import ActiveFault, Corrupt, Cut, Delay, Drop, Fault, Faults, Refuse
+from urlab_client.server.guard import CurveServer, UnprotectedServer
 from urlab_client.server.simulated import ModelError, SimulatedServer
 
 __all__ = [
     "ActiveFault",
     "ControllerConfig",
     "Corrupt",
+    "CurveServer",
     "Cut",
     "Delay",
     "Drop",
@@ -23,5 +25,6 @@ __all__ = [
     "PortInUse",
     "Refuse",
     "SimulatedServer",
+    "UnprotectedServer",
     "bundled_models",
 ]

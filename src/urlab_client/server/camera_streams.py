@@ -17,7 +17,8 @@ import zmq
 
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.rows import camera_filter
-from urlab_client.server.endpoint import PortInUse, bind_tcp, tcp
+from urlab_client.server.endpoint import PortInUse, bind_tcp, bound_peers, tcp
+from urlab_client.server.guard import Door, Guard
 from urlab_client.server.play import Running
 from urlab_client.server.refusal import Refusal
 
@@ -28,6 +29,9 @@ logger = logging.getLogger("urlab_client.server")
 PERIOD_S: Final = 1.0 / 30.0
 QUEUED_FRAMES: Final = 10
 
+MAX_FILTER_BYTES: Final = 4096
+"""A larger subscription costs its sender the connection."""
+
 PORTS: Final = 100
 """How many ports above the first are tried for a camera."""
 
@@ -35,8 +39,11 @@ PORTS: Final = 100
 class _Stream:
     """The socket of one camera. An XPUB socket is a PUB socket that tells who listens."""
 
-    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], host: str, port: int) -> None:
+    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], guard: Guard, host: str, port: int) -> None:
         self.socket = context.socket(zmq.XPUB)
+        self.socket.maxmsgsize = MAX_FILTER_BYTES
+        guard.protect(self.socket)
+        bound_peers(self.socket)
         self.socket.sndhwm = QUEUED_FRAMES
         self.socket.linger = 0
         self.key = ""
@@ -74,12 +81,13 @@ class CameraStreams:
             `start`; called on the thread that sends.
     """
 
-    def __init__(self, *, host: str, port: int) -> None:
+    def __init__(self, *, host: str, port: int, door: Door | None = None) -> None:
         """Bind the first port.
 
         Args:
             host: Address of the interface.
             port: Port of the first camera; the others get the free ones after it. 0 picks any.
+            door: Who may connect; None for anybody who reaches the interface.
 
         Raises:
             PortInUse: Somebody has the port.
@@ -88,14 +96,16 @@ class CameraStreams:
         self.filter: Callable[[bytes, bytes], bytes | None] | None = None
         self._host = host
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._guard = Guard(self._context, door)
         self._lock = threading.Lock()
         self._stopping = threading.Event()
         self._running: Running | None = None
         self._streams: list[_Stream] = []
         self._thread = threading.Thread(target=self._run, name="urlab-cameras", daemon=True)
         try:
-            self._streams.append(_Stream(self._context, host, port))
+            self._streams.append(_Stream(self._context, self._guard, host, port))
         except BaseException:
+            self._guard.close()
             self._context.term()
             raise
         self.port = self._streams[0].port
@@ -143,6 +153,7 @@ class CameraStreams:
             for stream in self._streams:
                 stream.socket.close()
             self._streams.clear()
+        self._guard.close()
         self._context.term()
         return not self._thread.is_alive()
 
@@ -150,7 +161,7 @@ class CameraStreams:
         last = self._streams[-1].port
         for port in range(last + 1, min(self.port + PORTS, 65535) + 1):
             with contextlib.suppress(PortInUse):
-                return _Stream(self._context, self._host, port)
+                return _Stream(self._context, self._guard, self._host, port)
         return None
 
     def _run(self) -> None:

@@ -17,13 +17,27 @@ from typing import ClassVar, Final
 import zmq
 
 from urlab_client.protocol.codec import MAX_REQUEST_BYTES
+from urlab_client.server.guard import Door, Guard
 
-__all__ = ["PortInUse", "RpcEndpoint", "bind_tcp", "connect_host", "numeric_host", "tcp"]
+__all__ = ["PortInUse", "RpcEndpoint", "bind_tcp", "bound_peers", "connect_host", "numeric_host", "tcp"]
 
 logger = logging.getLogger("urlab_client.server")
 
 LINGER_MS: Final = 500
 """How long a reply under way may keep the socket open after the end."""
+
+HEARTBEAT_MS: Final = 2000
+SILENCE_MS: Final = 10_000
+"""A peer that answers no heartbeat for so long is dropped. Its I/O thread answers, however busy its program is."""
+
+HANDSHAKE_MS: Final = 5000
+"""A connection that has not become a ZeroMQ peer by then is closed."""
+
+BACKLOG: Final = 128
+"""Connections that may wait to be accepted."""
+
+QUEUED_REQUESTS: Final = 4
+"""Requests of one peer that may wait; a peer that sends more is not read. Clients send one at a time."""
 
 _WAKE = "inproc://urlab-wake"
 
@@ -114,6 +128,15 @@ def bind_tcp(socket: zmq.Socket[bytes], host: str, port: int, option: str) -> in
     return int(socket.get_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
 
 
+def bound_peers(socket: zmq.Socket[bytes]) -> None:
+    """Drop peers that are gone, half-open or only pretend to speak ZeroMQ; before the socket is bound."""
+    socket.heartbeat_ivl = HEARTBEAT_MS
+    socket.heartbeat_timeout = SILENCE_MS
+    socket.heartbeat_ttl = SILENCE_MS
+    socket.handshake_ivl = HANDSHAKE_MS
+    socket.backlog = BACKLOG
+
+
 class RpcEndpoint:
     """Receives requests one at a time and sends what `answer` returns.
 
@@ -125,13 +148,16 @@ class RpcEndpoint:
     kind: ClassVar[int] = zmq.REP
     port: int
 
-    def __init__(self, answer: Callable[[bytes], bytes], *, host: str = "127.0.0.1", port: int = 0) -> None:
+    def __init__(
+        self, answer: Callable[[bytes], bytes], *, host: str = "127.0.0.1", port: int = 0, door: Door | None = None
+    ) -> None:
         """Bind the socket; `start` begins to serve.
 
         Args:
             answer: Turns the frame of a request into the frame of its reply; must not raise.
             host: IP address of the interface.
             port: TCP port; 0 picks a free one.
+            door: Who may connect; None for anybody who reaches the interface.
 
         Raises:
             PortInUse: Somebody has the port.
@@ -140,12 +166,17 @@ class RpcEndpoint:
         self._answer = answer
         self._context = zmq.Context()
         self._context.linger = LINGER_MS
+        self._guard = Guard(self._context, door)
         self._socket = self._context.socket(self.kind)
+        self._guard.protect(self._socket)
+        bound_peers(self._socket)
         # A frame between the two limits is answered with the reason, one beyond both costs the sender its connection.
         self._socket.maxmsgsize = 2 * MAX_REQUEST_BYTES
+        self._socket.rcvhwm = QUEUED_REQUESTS
         try:
             self.port = bind_tcp(self._socket, host, port, "step_port")
         except BaseException:
+            self._guard.close()
             self._context.destroy(linger=0)
             raise
         self._socket.bind(_WAKE)
@@ -204,4 +235,5 @@ class RpcEndpoint:
 
     def _close(self) -> None:
         self._socket.close()
+        self._guard.close()
         self._context.term()

@@ -44,7 +44,8 @@ from urlab_client.protocol.rows import (
     gains_by_parameter,
 )
 from urlab_client.server.controllers import ArticulationControl, Twist
-from urlab_client.server.endpoint import bind_tcp
+from urlab_client.server.endpoint import bind_tcp, bound_peers
+from urlab_client.server.guard import Door, Guard
 from urlab_client.server.observe import Observer, sim_clock, wall_clock
 from urlab_client.server.play import Running
 from urlab_client.server.refusal import Refusal
@@ -71,6 +72,9 @@ LOCK_S: Final = 0.02
 
 MAX_COMMAND_BYTES: Final = 1 << 20
 """A larger control message costs its sender the connection."""
+
+MAX_FILTER_BYTES: Final = 4096
+"""Likewise a larger subscription."""
 
 INFO_EVERY: Final = 50
 INFO_START_TICKS: Final = 2500
@@ -439,6 +443,7 @@ class StreamServer:
         state_port: int = 0,
         ctrl_port: int = 0,
         info_port: int = 0,
+        door: Door | None = None,
     ) -> None:
         """Bind the sockets; `start` begins to serve.
 
@@ -448,6 +453,7 @@ class StreamServer:
             state_port: TCP port; 0 picks a free one, here and below.
             ctrl_port: TCP port.
             info_port: TCP port.
+            door: Who may connect; None for anybody who reaches the interface.
 
         Raises:
             PortInUse: Somebody has a port.
@@ -457,16 +463,23 @@ class StreamServer:
         self._cameras = cameras
         self._context = zmq.Context()
         self._context.linger = 0
+        self._guard = Guard(self._context, door)
         # XPUB is PUB that tells what is subscribed to.
         self._state = self._context.socket(zmq.XPUB)
         self._info = self._context.socket(zmq.XPUB)
         self._control = self._context.socket(zmq.SUB)
         self._control.maxmsgsize = MAX_COMMAND_BYTES
+        for socket in (self._state, self._info):
+            socket.maxmsgsize = MAX_FILTER_BYTES
+        for socket in (self._state, self._info, self._control):
+            self._guard.protect(socket)
+            bound_peers(socket)
         try:
             self.state_port = bind_tcp(self._state, host, state_port, "state_port")
             self.ctrl_port = bind_tcp(self._control, host, ctrl_port, "ctrl_port")
             self.info_port = bind_tcp(self._info, host, info_port, "info_port")
         except BaseException:
+            self._guard.close()
             self._context.destroy(linger=0)
             raise
         self._wake = self._context.socket(zmq.PAIR)
@@ -626,6 +639,7 @@ class StreamServer:
     def _close(self) -> None:
         with self._waking:
             self._waker.close()
+        self._guard.close()
         self._context.destroy(linger=0)
 
 

@@ -31,6 +31,7 @@ from urlab_client.server.core import PhysicsConfig, ServerCore
 from urlab_client.server.dispatch import Dispatcher
 from urlab_client.server.endpoint import RpcEndpoint, connect_host, numeric_host, tcp
 from urlab_client.server.faults import Faults, FaultyEndpoint, Injector
+from urlab_client.server.guard import CurveServer, Door, UnprotectedServer, is_loopback
 from urlab_client.server.handlers import HANDLERS
 from urlab_client.server.publishing import StreamServer
 from urlab_client.server.refusal import Refusal
@@ -47,6 +48,7 @@ GAP_M: Final = 1.0
 """Free space between the models placed side by side, metres."""
 
 _NO_LIMIT: Final = float("inf")
+_INTERFACES: Final = {"0.0.0.0": "every network of this machine", "::": "every network of this machine"}  # noqa: S104
 
 
 class ModelError(URLabError, ValueError):
@@ -69,6 +71,8 @@ class _Config:
     models: tuple[str, ...]
     play: bool
     host: str
+    curve: CurveServer | None
+    insecure_no_auth: bool
     ports: _Ports
     saved_dir: Path | None
     model_roots: tuple[Path, ...] | None
@@ -102,6 +106,8 @@ class SimulatedServer:
         unpaused: bool = False,
         step_mode: StepMode | str = StepMode.AUTO,
         host: str = "127.0.0.1",
+        curve: CurveServer | None = None,
+        insecure_no_auth: bool = False,
         step_port: int = 0,
         state_port: int = 0,
         ctrl_port: int = 0,
@@ -124,7 +130,9 @@ class SimulatedServer:
             play: Start a play session at once.
             unpaused: Let physics run from the start of each play session; the plugin starts paused.
             step_mode: `live`, `direct` or `puppet` pins the mode; `auto` starts live and lets clients choose.
-            host: Interface to bind, an address or a name.
+            host: Interface to bind, an address or a name. Other than loopback needs `curve` or `insecure_no_auth`.
+            curve: Encrypt all traffic and let in only clients with the right keys.
+            insecure_no_auth: Serve whoever reaches the interface: they can do all that a client can.
             step_port: Port of requests; 0 picks a free one, here and below.
             state_port: Port of the state stream. Like the next two it is bound while the server is open, and silent
                 outside play.
@@ -144,7 +152,7 @@ class SimulatedServer:
                 runs.
 
         Raises:
-            ValueError: A port, mode or size that is none, or two levels.
+            ValueError: A port, mode or size that is none, two levels, or both `curve` and `insecure_no_auth`.
         """
         names = tuple(os.fspath(model) for model in models)
         if sum(map(_is_level, names)) > 1:
@@ -153,6 +161,8 @@ class SimulatedServer:
             raise ValueError(f"actor_names is 'model' or 'plugin', not {actor_names!r}")
         if camera_size is not None and (len(camera_size) != 2 or min(camera_size) < 1):
             raise ValueError(f"camera_size is a width and a height of at least 1 pixel, not {camera_size!r}")
+        if curve is not None and insecure_no_auth:
+            raise ValueError("curve and insecure_no_auth exclude each other: with keys a server is not open to all")
         ports = _Ports(step=step_port, state=state_port, ctrl=ctrl_port, info=info_port, camera=camera_port)
         for name, port in vars(ports).items():
             if not 0 <= port <= 65535:
@@ -161,6 +171,8 @@ class SimulatedServer:
             models=names,
             play=play,
             host=host,
+            curve=curve,
+            insecure_no_auth=insecure_no_auth,
             ports=ports,
             saved_dir=None if saved_dir is None else Path(saved_dir),
             model_roots=None if model_roots is None else tuple(map(Path, model_roots)),
@@ -195,6 +207,8 @@ class SimulatedServer:
         Raises:
             PortInUse: Somebody has a port.
             OSError: The host is none of this machine, or `saved_dir` cannot be used.
+            UnprotectedServer: The host is not loopback, and neither `curve` nor `insecure_no_auth` was given.
+            KeyFileError: A key file cannot be used.
             ModelError: A model is missing or broken, or play was asked for and MuJoCo rejects the scene.
         """
         with self._lock:
@@ -283,9 +297,23 @@ class SimulatedServer:
         """Folder of levels and imported models."""
         return self._running.saved_dir
 
+    @property
+    def open_to(self) -> str:
+        """Who can use the server, in words: this machine alone, holders of keys, or anyone on an interface."""
+        host, door = self._running.host, self._running.door
+        where = "this machine" if is_loopback(host) else _INTERFACES.get(host, f"the network at {host}")
+        if door is None:
+            return f"any program on {where}" if is_loopback(host) else f"anyone on {where}, without authentication"
+        who = "whoever has the server's key" if door.clients is None else f"{door.clients} client key(s)"
+        return f"{who} on {where}, encrypted"
+
     def client_options(self) -> dict[str, Any]:
-        """Return what a client needs to reach this server: `URLabClient(**server.client_options())`."""
-        return {
+        """Return what a client needs to reach this server: `URLabClient(**server.client_options())`.
+
+        With `curve` that includes the server's public key. A client that must show who it is adds its `client_key`.
+        """
+        door = self._running.door
+        return ({} if door is None else {"server_key": door.public_key}) | {
             "address": self.address,
             "step_port": self.step_port,
             "state_port": self.state_port,
@@ -306,6 +334,14 @@ class _Opened:
 
     def __init__(self, config: _Config) -> None:
         self.host = numeric_host(config.host)
+        self.door = None if config.curve is None else Door(config.curve)
+        if self.door is None and not config.insecure_no_auth and not is_loopback(self.host):
+            raise UnprotectedServer(
+                f"{config.host} ({self.host}) can be reached from other machines, and a client can read and write "
+                "files of this one.",
+                hint="Protect the server with CURVE keys (--server-key and --allow-client, or curve=…), "
+                "or say --insecure-no-auth (insecure_no_auth=True).",
+            )
         self._cameras: CameraStreams | None = None
         self._streams: StreamServer | None = None
         self._scratch: Path | None = None
@@ -356,7 +392,7 @@ class _Opened:
 
     def _start(self, config: _Config) -> None:
         ports = config.ports
-        cameras = self._cameras = CameraStreams(host=self.host, port=ports.camera)
+        cameras = self._cameras = CameraStreams(host=self.host, port=ports.camera, door=self.door)
         self._streams = StreamServer(
             lambda scene: [
                 CameraEndpoint(camera.name, cameras.endpoint(index.key, camera.name))
@@ -367,6 +403,7 @@ class _Opened:
             state_port=ports.state,
             ctrl_port=ports.ctrl,
             info_port=ports.info,
+            door=self.door,
         )
         core = ServerCore(
             world=World(self._content(config), actor_names=config.actor_names),
@@ -383,9 +420,9 @@ class _Opened:
         # Bound before the models are read, which takes longer, and answering after: requests wait in the socket.
         answer = Dispatcher(core, HANDLERS).answer
         self._endpoint = (
-            RpcEndpoint(answer, host=self.host, port=ports.step)
+            RpcEndpoint(answer, host=self.host, port=ports.step, door=self.door)
             if self._injector is None
-            else FaultyEndpoint(self._injector, answer, host=self.host, port=ports.step)
+            else FaultyEndpoint(self._injector, answer, host=self.host, port=ports.step, door=self.door)
         )
         try:
             _populate(core.world, config.models)
@@ -396,6 +433,8 @@ class _Opened:
             if core.play.wait(_NO_LIMIT) is not PIEState.READY:
                 raise ModelError(f"play cannot start: {core.play.compile_error}")
         self._endpoint.start()
+        if self.door is None and not is_loopback(self.host):
+            logger.warning("open to anyone who reaches %s, without authentication or encryption", self.host)
         logger.info("serving at %s:%d", tcp(self.host), self._endpoint.port)
 
     def _content(self, config: _Config) -> ContentRoot:

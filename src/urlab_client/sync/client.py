@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Mapping
 from threading import RLock
 from types import TracebackType
@@ -62,8 +63,15 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
         transport: `zmq`, or `shm` on the same host.
         shm_dir: Directory of the shared-memory regions, when it is not the one the server names.
         encoding: `msgpack`, or `json` to make traffic readable while debugging.
+        server_key: Public key of a server that uses CURVE: a file, or its 40 characters. On other machines than this
+            one the environment variable `URLAB_SERVER_KEY` may name the file instead.
+        client_key: File with the client's own secret key, for servers that know their clients; likewise
+            `URLAB_CLIENT_KEY`. None makes up a key.
+        trust_server: Load the binary model of a server that is neither on this machine nor known by its key. Without,
+            the model is compiled here from XML.
 
     Raises:
+        KeyFileError: A key file cannot be used.
         ValueError: The address or an option is malformed.
     """
 
@@ -86,6 +94,9 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
         transport: str | Transport = "zmq",
         shm_dir: str | None = None,
         encoding: str = "msgpack",
+        server_key: str | os.PathLike[str] | None = None,
+        client_key: str | os.PathLike[str] | None = None,
+        trust_server: bool = False,
     ) -> None:
         super().__init__(
             aio.URLabClient(
@@ -102,6 +113,9 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
                 transport=transport,
                 shm_dir=shm_dir,
                 encoding=encoding,
+                server_key=server_key,
+                client_key=client_key,
+                trust_server=trust_server,
             )
         )
 
@@ -278,6 +292,7 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
         Raises:
             URLabVersionMismatch: Client and server MuJoCo builds differ.
             ServerUnreachable: Nothing answers at the address.
+            AuthenticationFailed: Server and client do not accept each other's keys.
         """
         self._portal.call(self._aio.discover(observations, timeout=timeout))
 

@@ -12,6 +12,7 @@ fast they are read, and a subscriber that is not read cannot fill the server's q
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -21,6 +22,7 @@ import zmq
 from msgspec import Struct
 from zmq.utils.monitor import recv_monitor_message
 
+from urlab_client.aio.transport.curve import SERVER_KEY_HINT, ClientKeys
 from urlab_client.protocol.errors import ClientClosed, ProtocolError, URLabError
 from urlab_client.protocol.rows import BytesLike
 
@@ -55,9 +57,9 @@ _WATCHED = (
 _OBSTACLES = {
     zmq.Event.CONNECT_RETRIED: "connection refused",
     zmq.Event.CONNECTED: "something accepts the connection but does not speak ZeroMQ",
-    zmq.Event.HANDSHAKE_FAILED_AUTH: "the ZeroMQ handshake failed",
-    zmq.Event.HANDSHAKE_FAILED_NO_DETAIL: "the ZeroMQ handshake failed",
-    zmq.Event.HANDSHAKE_FAILED_PROTOCOL: "the ZeroMQ handshake failed",
+    zmq.Event.HANDSHAKE_FAILED_AUTH: f"the ZeroMQ handshake failed. {SERVER_KEY_HINT}",
+    zmq.Event.HANDSHAKE_FAILED_NO_DETAIL: f"the ZeroMQ handshake failed. {SERVER_KEY_HINT}",
+    zmq.Event.HANDSHAKE_FAILED_PROTOCOL: f"the ZeroMQ handshake failed. {SERVER_KEY_HINT}",
 }
 # Topics differ for ever only where a server is out of its mind; then forget them.
 _REMEMBERED_TOPICS = 4096
@@ -121,7 +123,13 @@ class _Subscriber:
     """One SUB socket."""
 
     def __init__(
-        self, context: zmq.Context[zmq.Socket[bytes]], loop: asyncio.AbstractEventLoop, endpoint: str, *, pictures: bool
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        loop: asyncio.AbstractEventLoop,
+        endpoint: str,
+        *,
+        pictures: bool,
+        keys: ClientKeys | None,
     ) -> None:
         self.endpoint = endpoint
         self.connected = False
@@ -142,6 +150,8 @@ class _Subscriber:
         socket.heartbeat_ttl = _SILENCE_MS
         socket.reconnect_ivl = _RECONNECT_MS
         socket.reconnect_ivl_max = _RECONNECT_MAX_MS
+        if keys is not None:
+            keys.protect(socket)
         self._monitor = socket.get_monitor_socket(_WATCHED)
         try:
             socket.connect(endpoint)
@@ -265,12 +275,22 @@ class _Subscriber:
                 self._down_since = self._loop.time()
         elif event in _OBSTACLES and self.connects == 0:
             self.obstacle = _OBSTACLES[event]
+        if event in (zmq.Event.HANDSHAKE_FAILED_AUTH, zmq.Event.HANDSHAKE_FAILED_PROTOCOL):
+            # ZeroMQ does not try again by itself, but the server may learn the key.
+            self._loop.call_later(_RECONNECT_MAX_MS / 1000, self._reconnect)
+
+    def _reconnect(self) -> None:
+        if not self._closed:
+            with contextlib.suppress(zmq.ZMQError):
+                self._socket.disconnect(self.endpoint)
+            self._socket.connect(self.endpoint)
 
 
 class Subscriptions:
     """All that one client receives. Sockets are made when first needed and closed when nobody listens any more."""
 
-    def __init__(self) -> None:
+    def __init__(self, keys: ClientKeys | None = None) -> None:
+        self._keys = keys
         self._context: zmq.Context[zmq.Socket[bytes]] | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._subscribers: dict[tuple[str, bool], _Subscriber] = {}
@@ -348,7 +368,9 @@ class Subscriptions:
         if subscriber is None:
             if self._context is None:
                 self._context = zmq.Context()
-            subscriber = _Subscriber(self._context, self._loop, subscription.endpoint, pictures=subscription.pictures)
+            subscriber = _Subscriber(
+                self._context, self._loop, subscription.endpoint, pictures=subscription.pictures, keys=self._keys
+            )
             self._subscribers[key] = subscriber
         subscriber.attach(sink, subscription)
 

@@ -8,6 +8,7 @@ ever cancels a receive, which could lose a frame.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,8 +18,10 @@ import zmq
 from zmq.utils.monitor import recv_monitor_message
 
 from urlab_client.aio.transport.base import TransportStats
+from urlab_client.aio.transport.curve import ClientKeys
 from urlab_client.protocol.base import Op, Timing
 from urlab_client.protocol.errors import (
+    AuthenticationFailed,
     ClientClosed,
     ConnectionLost,
     OutcomeUnknown,
@@ -46,6 +49,8 @@ _WATCHED = (
     | zmq.Event.HANDSHAKE_FAILED_NO_DETAIL
     | zmq.Event.HANDSHAKE_FAILED_PROTOCOL
 )
+_MECHANISM_MISMATCH = 0x11000002  # ZMQ_PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH
+_CERTAIN = 3  # a server that is just ending breaks a handshake off once; one with another key always does
 _HANDSHAKE_FAILURES = (
     zmq.Event.HANDSHAKE_FAILED_AUTH,
     zmq.Event.HANDSHAKE_FAILED_NO_DETAIL,
@@ -66,9 +71,12 @@ class ZmqTransport:
 
     stats: TransportStats
 
-    def __init__(self, endpoint: str) -> None:
+    def __init__(self, endpoint: str, keys: ClientKeys | None = None) -> None:
         self.stats = TransportStats()
         self._endpoint = endpoint
+        self._keys = keys
+        self._rejections = 0
+        self._given_up = False
         self._loop: asyncio.AbstractEventLoop | None = None
         self._context: zmq.Context[zmq.Socket[bytes]] | None = None
         self._socket: zmq.Socket[bytes] | None = None
@@ -167,6 +175,8 @@ class ZmqTransport:
         socket.heartbeat_ttl = _SILENCE_MS
         socket.reconnect_ivl = _RECONNECT_MS
         socket.reconnect_ivl_max = _RECONNECT_MAX_MS
+        if self._keys is not None:
+            self._keys.protect(socket)
         monitor = socket.get_monitor_socket(_WATCHED)
         try:
             loop.add_reader(monitor, self._on_event)
@@ -191,6 +201,12 @@ class ZmqTransport:
         waiter: asyncio.Future[None] = loop.create_future()
         started = loop.time()
         self._waiting.add(waiter)
+        if self._given_up and self._socket is not None:
+            # Told why, ZeroMQ does not try again by itself; by now the server may have learnt the key.
+            self._given_up = False
+            with contextlib.suppress(zmq.ZMQError):
+                self._socket.disconnect(self._endpoint)
+            self._socket.connect(self._endpoint)
 
         def give_up() -> None:
             if not waiter.done():
@@ -250,11 +266,12 @@ class ZmqTransport:
                 message = cast("dict[str, Any]", recv_monitor_message(self._monitor, zmq.NOBLOCK))
             except zmq.Again:
                 return
-            self._note(zmq.Event(message["event"]))
+            self._note(zmq.Event(message["event"]), message["value"])
 
-    def _note(self, event: zmq.Event) -> None:
+    def _note(self, event: zmq.Event, value: int) -> None:
         if event is zmq.Event.HANDSHAKE_SUCCEEDED:
             self._connected = True
+            self._rejections = 0
             self.stats.connects += 1
             log.info("connected to %s", self._endpoint)
             self._tell_connected()
@@ -269,6 +286,27 @@ class ZmqTransport:
             self._obstacle = "something accepts the connection but does not speak ZeroMQ"
         elif event in _HANDSHAKE_FAILURES:
             self._obstacle = "the ZeroMQ handshake failed"
+            self._rejections += 1
+            self._note_rejection(event, value)
+
+    def _note_rejection(self, event: zmq.Event, value: int) -> None:
+        """Tell those who wait, once it is certain that trying again would not help."""
+        if event is zmq.Event.HANDSHAKE_FAILED_AUTH:
+            why, hint = "the server does not know this client's key", "Give it the public key (--allow-client)."
+        elif value == _MECHANISM_MISMATCH and self._keys is None:
+            why, hint = "the server demands CURVE keys", "Pass server_key=…, and client_key=… if it knows its clients."
+        elif value == _MECHANISM_MISMATCH:
+            why, hint = "the server uses no CURVE keys", "Leave out server_key, or start the server with --server-key."
+        elif self._keys is not None and self._rejections >= _CERTAIN:
+            why, hint = "the server does not have the key it should have", "Compare with: urlab keys show FILE."
+        else:
+            return
+        self._given_up = event is not zmq.Event.HANDSHAKE_FAILED_NO_DETAIL
+        for waiter in self._waiting:
+            if not waiter.done():
+                waiter.set_exception(
+                    AuthenticationFailed(f"No session with {self._endpoint}: {why}. Nothing was sent.", hint=hint)
+                )
 
     def _lose(self) -> None:
         self._on_readable()  # what arrived before the line broke still counts

@@ -1,0 +1,60 @@
+"""`urlab keys`: CURVE keys for servers that are open to a network, and for their clients."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from urlab_client.cli._arguments import Commands
+from urlab_client.keys import SECRET_SUFFIX, KeyPair, public_key
+
+__all__ = ["add_parser", "run"]
+
+
+class KeysArguments(argparse.Namespace):
+    """What the command line says."""
+
+    action: str
+    names: list[str]
+    dir: Path
+    files: list[Path]
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command to the parser."""
+    parser = commands.add_parser(
+        "keys",
+        help="make and show CURVE keys",
+        description="Make and show CURVE keys. A server that is open to a network needs a key, so that clients know "
+        "it, and one of each client, so that it knows them.",
+    )
+    actions = parser.add_subparsers(title="actions", dest="action", metavar="ACTION", required=True)
+    new = actions.add_parser(
+        "new",
+        help="make key pairs",
+        description="Make key pairs: NAME.key, which may be given to anybody, and NAME.key_secret, which only its "
+        "owner can read (mode 0600) and which stays on this machine. Files that exist are never overwritten.",
+    )
+    new.add_argument("names", nargs="+", metavar="NAME", help="for example server, or the name of a client")
+    new.add_argument("--dir", type=Path, default=Path(), metavar="DIR", help="where to write (default: here)")
+    show = actions.add_parser("show", help="print public keys", description="Print the public key of each file.")
+    show.add_argument("files", nargs="+", type=Path, metavar="FILE", help="a .key or .key_secret file")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: KeysArguments) -> int:
+    """Make or show keys.
+
+    Raises:
+        KeyFileError: A file exists already, or is no key file.
+        OSError: A file cannot be written.
+    """
+    if arguments.action == "new":
+        for name in arguments.names:
+            public, secret = KeyPair.new().write(arguments.dir, name)
+            print(f"{public}: to give away\n{secret}: to keep")
+    else:
+        for file in arguments.files:
+            kind = "secret" if file.suffix == SECRET_SUFFIX else "public"
+            print(f"{public_key(file).decode()}  {file} ({kind} key file)")
+    return 0

@@ -1,0 +1,145 @@
+"""CURVE key files: who a server is, and who may talk to it.
+
+For client, server and command line alike. A key pair is two files in the format of ZeroMQ's certificates: `NAME.key`
+holds the public key and may be given to anybody, `NAME.key_secret` holds both and stays where it was made. Objects
+here show public keys alone.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from urlab_client.protocol.errors import URLabError
+
+__all__ = ["PUBLIC_SUFFIX", "SECRET_SUFFIX", "KeyFileError", "KeyPair", "public_key", "public_keys", "read_pair"]
+
+PUBLIC_SUFFIX: Final = ".key"
+SECRET_SUFFIX: Final = ".key_secret"  # noqa: S105 - of a file name
+
+_Z85: Final = frozenset("0123456789abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ.-:+=^!/*?&<>()[]{}@%$#")
+_LENGTH: Final = 40
+_MAX_BYTES: Final = 64 * 1024
+_HEADER: Final = "#   CURVE {kind} key of '{name}'. {advice}\n\nmetadata\n    name = \"{name}\"\ncurve\n"
+
+
+class KeyFileError(URLabError, ValueError):
+    """A key file is missing, none, or open to others."""
+
+
+@dataclass(frozen=True)
+class KeyPair:
+    """A CURVE key pair.
+
+    Attributes:
+        public: Public key, Z85 text of 40 characters.
+        secret: Secret key, likewise; not part of the representation.
+    """
+
+    public: bytes
+    secret: bytes = field(repr=False)
+
+    @staticmethod
+    def new() -> KeyPair:
+        """Make a key pair that nobody has."""
+        import zmq  # noqa: PLC0415 - importing the package opens nothing
+
+        return KeyPair(*zmq.curve_keypair())
+
+    def write(self, folder: Path, name: str) -> tuple[Path, Path]:
+        """Write `NAME.key` and `NAME.key_secret`, the latter readable by its owner alone.
+
+        Returns:
+            The public file and the secret one.
+
+        Raises:
+            KeyFileError: The name is no file name, or one of the files exists: keys are never overwritten.
+            OSError: They cannot be written.
+        """
+        if not name or name.startswith(".") or not all(char.isalnum() or char in "-_." for char in name):
+            raise KeyFileError(f"{name!r} is no name for a key: use letters, digits, '-', '_' and '.'")
+        files = folder / f"{name}{PUBLIC_SUFFIX}", folder / f"{name}{SECRET_SUFFIX}"
+        for file in files:
+            if file.exists():
+                raise KeyFileError(f"{file} exists, and keys are not overwritten.", hint="Choose another name.")
+        folder.mkdir(parents=True, exist_ok=True)
+        public = f'    public-key = "{self.public.decode()}"\n'
+        secret = f'{public}    secret-key = "{self.secret.decode()}"\n'
+        header = {"kind": "secret", "name": name, "advice": "Keep it to yourself."}
+        _create(files[1], _HEADER.format(**header) + secret, 0o600)
+        header |= {"kind": "public", "advice": "May be given to anybody."}
+        _create(files[0], _HEADER.format(**header) + public, 0o644)
+        return files
+
+
+def read_pair(file: str | os.PathLike[str]) -> KeyPair:
+    """Read a secret key file.
+
+    Raises:
+        KeyFileError: It cannot be read, holds no secret key, or others may read it, too.
+    """
+    path = Path(file)
+    public, secret = _read(path)
+    if secret is None:
+        raise KeyFileError(f"{path} holds no secret key.", hint=f"Name the file that ends in {SECRET_SUFFIX}.")
+    if os.name == "posix" and path.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO):
+        raise KeyFileError(f"{path} holds a secret and is open to other users.", hint=f"chmod 600 {path}")
+    return KeyPair(public, secret)
+
+
+def public_key(source: str | os.PathLike[str]) -> bytes:
+    """Return a public key, given as its 40 characters or as a key file.
+
+    Raises:
+        KeyFileError: It is neither.
+    """
+    text = os.fspath(source)
+    if len(text) == _LENGTH and _Z85.issuperset(text) and not Path(text).exists():
+        return text.encode()
+    return _read(Path(text))[0]
+
+
+def public_keys(sources: Iterable[str | os.PathLike[str]]) -> frozenset[bytes]:
+    """Return the public keys of files, and of all `*.key` files of folders.
+
+    Raises:
+        KeyFileError: One is no key file, or a folder has none.
+    """
+    found: set[bytes] = set()
+    for source in map(Path, sources):
+        if not source.is_dir():
+            found.add(public_key(source))
+            continue
+        files = sorted(source.glob(f"*{PUBLIC_SUFFIX}"))
+        if not files:
+            raise KeyFileError(f"{source} holds no file that ends in {PUBLIC_SUFFIX}.")
+        found.update(map(public_key, files))
+    return frozenset(found)
+
+
+def _create(file: Path, text: str, mode: int) -> None:
+    handle = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+    with os.fdopen(handle, "w", encoding="ascii", errors="replace") as stream:
+        stream.write(text)
+
+
+def _read(path: Path) -> tuple[bytes, bytes | None]:
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise KeyFileError(f"{path} is no key file: it is too long.")
+        lines = path.read_text("utf-8").splitlines()
+    except OSError as error:
+        raise KeyFileError(f"{path}: the key cannot be read: {error.strerror or error}.") from None
+    except UnicodeDecodeError:
+        raise KeyFileError(f"{path} is no key file.", hint="urlab keys new makes key files.") from None
+    entries = {name.strip(): value.strip().strip('"') for name, _, value in (line.partition("=") for line in lines)}
+    public, secret = entries.get("public-key"), entries.get("secret-key")
+    for key in (public, secret) if secret is not None else (public,):
+        if key is None or len(key) != _LENGTH or not _Z85.issuperset(key):
+            # The text is not shown: it may be most of a secret.
+            raise KeyFileError(f"{path} is no key file.", hint="urlab keys new makes key files.")
+    return str(public).encode(), None if secret is None else secret.encode()
