@@ -3,6 +3,7 @@
 A block may carry a directive, an HTML comment on the line above it, which readers do not see:
 
     <!-- run -->                         console block: execute it
+    <!-- test -->                        python block: a test file, run by pytest
 
 and on `docs/adding-an-op.md`, for `test_docs_adding_an_op.py`:
 
@@ -21,7 +22,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 
 _FENCE = re.compile(r"^```(?P<language>\S*)\s*$")
-_DIRECTIVE = re.compile(r"^<!-- (?P<directive>(?:run|use|append:|insert:|shows:).*?) -->$")
+_DIRECTIVE = re.compile(r"^<!-- (?P<directive>(?:run|test|use|append:|insert:|shows:).*?) -->$")
 
 
 @dataclass(frozen=True)

@@ -58,11 +58,11 @@ def test_python_blocks_run(page: Path, tmp_path: Path) -> None:
         assert_output(block, got)
 
 
-def marked() -> list[Block]:
-    return [block for page in pages() for block in blocks(page) if block.directive == "run"]
+def marked(directive: str) -> list[Block]:
+    return [block for page in pages() for block in blocks(page) if block.directive == directive]
 
 
-@pytest.mark.parametrize("block", marked(), ids=str)
+@pytest.mark.parametrize("block", marked("run"), ids=str)
 def test_marked_console_blocks_run(block: Block, tmp_path: Path) -> None:
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
     script = "\n".join(["set -e", *commands(block)])
@@ -80,9 +80,27 @@ def test_marked_console_blocks_run(block: Block, tmp_path: Path) -> None:
     assert_output(Block(block.page, block.line, "console", block.code, output=expected), done.stdout)
 
 
+@pytest.mark.parametrize("page", sorted({block.page for block in marked("test")}), ids=shown)
+def test_marked_tests_pass(page: Path, tmp_path: Path) -> None:
+    for block in marked("test"):
+        if block.page == page:
+            # So that a failure names the page's line.
+            (tmp_path / f"test_line_{block.line}.py").write_text("\n" * (block.line - 1) + block.code, encoding="utf-8")
+    (tmp_path / "pytest.ini").write_text("[pytest]\nasyncio_default_fixture_loop_scope = function\n", encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", "pytest_urlab", "--strict-markers", "-W", "error", str(tmp_path)],
+        capture_output=True,
+        text=True,
+        timeout=DEADLINE_S,
+        check=False,
+        cwd=tmp_path,
+    )
+    assert done.returncode == 0, f"{shown(page)}\n{done.stdout}\n{done.stderr}"
+
+
 def test_something_runs() -> None:
     assert {shown(page) for page in pages() if python_blocks(page)} >= {"README.md", "docs/quickstart.md"}
-    assert marked()
+    assert marked("run")
 
 
 @pytest.mark.parametrize("page", pages(), ids=shown)

@@ -110,6 +110,11 @@ class CameraStreams:
             raise
         self.port = self._streams[0].port
 
+    @property
+    def alive(self) -> bool:
+        """Whether images are published."""
+        return self._thread.is_alive()
+
     def start(self) -> None:
         """Start publishing."""
         self._thread.start()

@@ -5,13 +5,16 @@ For the handlers, which get it as their first argument, and for `SimulatedServer
 
 from __future__ import annotations
 
+import copy
 import logging
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import mujoco
+
 from urlab_client.protocol.codec import encode_reply
-from urlab_client.protocol.enums import CameraMode, StepMode
+from urlab_client.protocol.enums import CameraMode, PIEState, StepMode
 from urlab_client.protocol.messages.session import ErrorReply
 from urlab_client.server.actors import Actor
 from urlab_client.server.controllers import ControllerConfig
@@ -77,6 +80,7 @@ class ServerCore:
         play: The play session.
         viewport: The viewport's camera.
         drawings: Debug drawing.
+        compiled: What the last play session was started with.
     """
 
     world: World
@@ -86,6 +90,7 @@ class ServerCore:
     play: Play = field(default_factory=Play)
     viewport: Viewport = field(default_factory=Viewport)
     drawings: Drawings = field(default_factory=Drawings)
+    compiled: _Compiled | None = None
 
     def refuse(self, code: str, message: str) -> bytes:
         """Return the frame of an error reply."""
@@ -98,16 +103,57 @@ class ServerCore:
 
         def build() -> Running:
             scene = compile_scene(actors, honour_mjcf_options=physics.mjcf_options, camera_size=physics.camera_size)
-            return _run(scene, physics, {actor.name: _kind(actor) for actor in actors})
+            self.compiled = _Compiled(actors, scene, copy.copy(scene.model.opt))
+            return _run(scene, physics, _classes(actors))
 
         self.play.begin(build)
         self.world.pie_running = True
+
+    def begin_play_again(self, timeout: float) -> bool:
+        """Start play afresh with the scene that was compiled last, in place of what runs, and return when it is ready.
+
+        Args:
+            timeout: Seconds that the end of what runs may take.
+
+        Returns:
+            False when that took longer, or the level is not the one that was compiled.
+        """
+        compiled, actors = self.compiled, self.world.freeze()
+        if compiled is None or compiled.actors != actors:
+            return False
+        running = self.play.current
+        if running is not None and not running.close(timeout):
+            return False
+        model = compiled.scene.model
+        model.opt = compiled.options
+
+        def build() -> Running:
+            data = mujoco.MjData(model)
+            mujoco.mj_forward(model, data)
+            return _run(replace(compiled.scene, data=data), self.physics, _classes(actors))
+
+        self.play.begin(build)
+        self.world.pie_running = True
+        return self.play.wait(timeout) is PIEState.READY
 
     def stop_play(self) -> None:
         """End play, if it runs."""
         self.play.stop()
         self.world.pie_running = False
         self.drawings.clear(in_play=True)
+
+
+@dataclass(frozen=True)
+class _Compiled:
+    """A level that was compiled, and the options its model had before anybody changed them."""
+
+    actors: tuple[Actor, ...]
+    scene: Scene
+    options: mujoco.MjOption
+
+
+def _classes(actors: Iterable[Actor]) -> dict[str, str]:
+    return {actor.name: _kind(actor) for actor in actors}
 
 
 def _kind(actor: Actor) -> str:

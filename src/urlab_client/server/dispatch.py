@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
+from contextlib import contextmanager
 from typing import Any, Final, TypeVar, get_type_hints
 
 from urlab_client.protocol.base import Needs, Reply, Request
@@ -117,6 +118,16 @@ class Dispatcher:
                     message=f"{name}: the server failed with {type(failure).__name__}; its log has the details",
                 )
             return encode_reply(error, json=self._core.session.json)
+
+    @contextmanager
+    def standstill(self, timeout: float) -> Generator[bool]:
+        """Answer no request meanwhile; yields False if the one under way did not end within `timeout` seconds."""
+        idle = self._lock.acquire(timeout=timeout)
+        try:
+            yield idle
+        finally:
+            if idle:
+                self._lock.release()
 
     def _serve(self, incoming: Incoming, transport: Transport) -> Reply:
         op, name = incoming.op, incoming.name

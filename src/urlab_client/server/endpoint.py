@@ -185,6 +185,11 @@ class RpcEndpoint:
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="urlab-rpc", daemon=True)
 
+    @property
+    def alive(self) -> bool:
+        """Whether requests are served."""
+        return self._thread.is_alive()
+
     def start(self) -> None:
         """Start the thread that serves."""
         self._thread.start()

@@ -244,8 +244,8 @@ class Faults:
         self._made = 0
         self._changed = threading.Condition()
         self._active: tuple[ActiveFault, ...] = ()
-        for fault in faults:
-            self.add(fault)
+        self._first = faults
+        self.reset()
 
     @property
     def active(self) -> tuple[ActiveFault, ...]:
@@ -270,11 +270,18 @@ class Faults:
             self._changed.notify_all()
 
     def clear(self) -> None:
-        """Apply no fault any more; delays under way end. Those added later are decided as if they were the first."""
+        """Apply no fault any more; delays under way end."""
         with self._changed:
             self._active = ()
-            self._made = 0
             self._changed.notify_all()
+
+    def reset(self) -> None:
+        """Apply the faults it was made with and no others, with counters and chance as at the start."""
+        with self._changed:
+            self.clear()
+            self._made = 0
+            for fault in self._first:
+                self.add(fault)
 
     def take(self, concerned: Callable[[Fault], bool]) -> tuple[list[ActiveFault], ActiveFault | None]:
         """Count a message and return the delays and the other fault that are due."""

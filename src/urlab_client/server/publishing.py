@@ -499,6 +499,11 @@ class StreamServer:
         self._broadcast: _Broadcast | None = None
         self._thread = threading.Thread(target=self._run, name="urlab-streams", daemon=True)
 
+    @property
+    def alive(self) -> bool:
+        """Whether the sockets are served."""
+        return self._thread.is_alive()
+
     def start(self) -> None:
         """Start the thread that serves."""
         self._thread.start()

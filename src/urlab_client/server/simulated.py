@@ -33,8 +33,11 @@ from urlab_client.server.endpoint import RpcEndpoint, connect_host, numeric_host
 from urlab_client.server.faults import Faults, FaultyEndpoint, Injector
 from urlab_client.server.guard import CurveServer, Door, UnprotectedServer, is_loopback
 from urlab_client.server.handlers import HANDLERS
+from urlab_client.server.markers import Drawings
 from urlab_client.server.publishing import StreamServer
 from urlab_client.server.refusal import Refusal
+from urlab_client.server.session import Session
+from urlab_client.server.viewport import Viewport
 from urlab_client.server.world import World
 
 __all__ = ["ModelError", "SimulatedServer"]
@@ -229,6 +232,23 @@ class SimulatedServer:
                     self._finalizer.detach()
                 opened.close()
 
+    def restore(self) -> None:
+        """Bring the server back to how it was after `start`, for the next test; without effect while it is closed.
+
+        The session is ended, play starts afresh from the level's initial state or is stopped, and nothing is left of
+        modes, options, controllers, recordings, drawings and faults. That takes milliseconds. Where a level was
+        edited or a file written, or where the server hangs, it is closed and started again instead, after which free
+        ports have other numbers. Files in a `saved_dir` of the caller's own stay.
+
+        Raises:
+            OSError, ModelError: It could not be started again; see `start`.
+        """
+        with self._lock:
+            opened = self._opened
+        if opened is not None and not opened.restore():
+            self.close()
+            self.start()
+
     def __enter__(self) -> Self:
         return self.start()
 
@@ -307,6 +327,11 @@ class SimulatedServer:
         who = "whoever has the server's key" if door.clients is None else f"{door.clients} client key(s)"
         return f"{who} on {where}, encrypted"
 
+    @property
+    def faults(self) -> Faults | None:
+        """What goes wrong, as given at the start."""
+        return self._config.faults
+
     def client_options(self) -> dict[str, Any]:
         """Return what a client needs to reach this server: `URLabClient(**server.client_options())`.
 
@@ -346,6 +371,10 @@ class _Opened:
         self._streams: StreamServer | None = None
         self._scratch: Path | None = None
         self._injector: Injector | None = None
+        self._dispatcher: Dispatcher | None = None
+        self._plays = config.play
+        self._faults = config.faults
+        self._authored: object = None
         self._endpoint: RpcEndpoint | None = None
         self._core: ServerCore | None = None
         self._closed = False
@@ -418,7 +447,8 @@ class _Opened:
         cameras.start()
         self._streams.start()
         # Bound before the models are read, which takes longer, and answering after: requests wait in the socket.
-        answer = Dispatcher(core, HANDLERS).answer
+        self._dispatcher = Dispatcher(core, HANDLERS)
+        answer = self._dispatcher.answer
         self._endpoint = (
             RpcEndpoint(answer, host=self.host, port=ports.step, door=self.door)
             if self._injector is None
@@ -432,6 +462,7 @@ class _Opened:
             core.begin_play()
             if core.play.wait(_NO_LIMIT) is not PIEState.READY:
                 raise ModelError(f"play cannot start: {core.play.compile_error}")
+        self._authored = self._mark(core)
         self._endpoint.start()
         if self.door is None and not is_loopback(self.host):
             logger.warning("open to anyone who reaches %s, without authentication or encryption", self.host)
@@ -447,6 +478,34 @@ class _Opened:
             files = [Path(model).resolve() for model in config.models if Path(model).is_file()]
             roots = tuple(dict.fromkeys(file.parent for file in files)) or (Path.cwd(),)
         return ContentRoot(folder, model_roots=roots)
+
+    def restore(self) -> bool:
+        """Return to the state after the start, or return False if that takes another start."""
+        core, dispatcher = self._core, self._dispatcher
+        if core is None or dispatcher is None:
+            return False
+        if self._faults is not None:
+            self._faults.reset()
+        if not (self.endpoint.alive and self.streams.alive and self.cameras.alive):
+            return False
+        with dispatcher.standstill(CLOSE_S) as idle:
+            if not idle or self._mark(core) != self._authored:
+                return False
+            core.session, core.viewport, core.drawings = Session(), Viewport(), Drawings()
+            core.world.selected = ""
+            if self._plays:
+                return core.begin_play_again(CLOSE_S)
+            core.stop_play()
+            return True
+
+    def _mark(self, core: ServerCore) -> object:
+        """Return something that compares equal for as long as nothing was authored or written."""
+        files: set[tuple[Path, int, int]] = set()
+        if self._scratch is not None:
+            for file in self._scratch.rglob("*"):
+                status = file.lstat()
+                files.add((file, status.st_mtime_ns, status.st_size))
+        return core.world.authored(), files
 
     def close(self) -> None:
         """Release everything. Safe to call twice; a forked child, which has none of it, leaves it alone."""

@@ -363,6 +363,10 @@ class World:
         folder, _, name = self._package.rpartition("/")
         return f"{folder}/UEDPIE_0_{name}"
 
+    def authored(self) -> object:
+        """Return something that compares equal for as long as no level, actor or blueprint was changed."""
+        return self._package, tuple(self._actors.values()), dict(self._external), dict(self.content.blueprints)
+
     # Actors
 
     def ensure_manager(self) -> tuple[Actor, bool]:

@@ -1,0 +1,131 @@
+"""Fixtures for tests of programs that drive URLab: a simulated server and both clients, reset between tests.
+
+pytest loads this module in every run, so it imports nothing of the package before a test asks for a server.
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Iterator
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+if TYPE_CHECKING:
+    from pytest_urlab.pool import ServerPool
+    from urlab_client import URLabClient
+    from urlab_client.aio import URLabClient as AsyncURLabClient
+    from urlab_client.server import Faults, SimulatedServer
+
+__all__ = [
+    "pytest_configure",
+    "urlab_aio_client",
+    "urlab_client",
+    "urlab_default",
+    "urlab_faults",
+    "urlab_server",
+]
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Announce the marker, and the fixture that needs pytest-asyncio where that is installed."""
+    config.addinivalue_line(
+        "markers",
+        "urlab(*models, step_mode='auto', **options): the simulated server of a test, in play, with models and options "
+        "of SimulatedServer, and the step mode of the clients. Files may be given relative to the test's folder.",
+    )
+    if config.pluginmanager.hasplugin("asyncio"):
+        from pytest_urlab import asyncio_fixtures  # noqa: PLC0415
+
+        config.pluginmanager.register(asyncio_fixtures, "urlab_asyncio_fixtures")
+
+
+@pytest.fixture(scope="session")
+def urlab_default() -> pytest.MarkDecorator:
+    """The `urlab` mark of tests that have none; override this fixture to choose another."""
+    return pytest.mark.urlab("arm")
+
+
+@pytest.fixture(scope="session")
+def _urlab_pool() -> Iterator[ServerPool]:
+    from pytest_urlab.pool import ServerPool  # noqa: PLC0415
+
+    with ServerPool() as pool:
+        yield pool
+
+
+@pytest.fixture
+def _urlab_mark(request: pytest.FixtureRequest, urlab_default: pytest.MarkDecorator) -> pytest.Mark:
+    return request.node.get_closest_marker("urlab") or urlab_default.mark
+
+
+@pytest.fixture
+def urlab_server(
+    request: pytest.FixtureRequest, _urlab_pool: ServerPool, _urlab_mark: pytest.Mark
+) -> Iterator[SimulatedServer]:
+    """A simulated server in play, as the test's `urlab` mark describes it, in its initial state."""
+    options = {name: value for name, value in _urlab_mark.kwargs.items() if name != "step_mode"}
+    try:
+        server = _urlab_pool.acquire(_urlab_mark.args, options, request.path.parent)
+    except (TypeError, ValueError, OSError) as error:
+        message = f"the server of @pytest.mark.urlab does not start: {error}"
+        raise pytest.fail.Exception(message, pytrace=False) from None
+    yield server
+    _urlab_pool.release(server)
+
+
+@pytest.fixture
+def urlab_faults(urlab_server: SimulatedServer) -> Faults:
+    """What goes wrong with the server's replies: nothing, until the test adds something."""
+    faults = urlab_server.faults
+    if faults is None:
+        pytest.fail("the test's mark says faults=None", pytrace=False)
+    return faults
+
+
+@pytest.fixture
+def _urlab_client_options(urlab_server: SimulatedServer, _urlab_mark: pytest.Mark) -> dict[str, Any]:
+    return {"step_mode": _urlab_mark.kwargs.get("step_mode", "auto"), **urlab_server.client_options()}
+
+
+@pytest.fixture
+def urlab_client(_urlab_client_options: dict[str, Any]) -> Iterator[URLabClient]:
+    """A blocking client of the server, after `discover()`."""
+    from urlab_client import URLabClient  # noqa: PLC0415
+
+    with URLabClient(**_urlab_client_options) as client:
+        client.discover()
+        yield client
+
+
+@pytest.fixture
+def urlab_aio_client(request: pytest.FixtureRequest) -> AsyncURLabClient:
+    """An async client of the server, after `discover()`, on the test's event loop.
+
+    For tests that pytest-asyncio or anyio's plugin runs.
+    """
+    config = request.config
+    if "anyio_backend" in request.fixturenames:
+        runner = "anyio"
+    elif config.pluginmanager.hasplugin("urlab_asyncio_fixtures"):
+        mark = request.node.get_closest_marker("asyncio")
+        chosen = None if mark is None else mark.kwargs.get("loop_scope")
+        runner = chosen or config.getini("asyncio_default_test_loop_scope") or "function"
+    else:
+        pytest.fail(
+            "urlab_aio_client needs somebody who runs async tests: install pytest-asyncio, or mark the test with anyio",
+            pytrace=False,
+        )
+    return request.getfixturevalue(f"_urlab_aio_client_{runner}")
+
+
+@pytest.fixture
+async def _urlab_aio_client_anyio(
+    anyio_backend_name: str, _urlab_client_options: dict[str, Any]
+) -> AsyncIterator[AsyncURLabClient]:
+    from urlab_client.aio import URLabClient  # noqa: PLC0415
+
+    if anyio_backend_name != "asyncio":
+        pytest.fail(f"the async client runs on asyncio, not on {anyio_backend_name}: say so in anyio_backend")
+    async with URLabClient(**_urlab_client_options) as client:
+        await client.discover()
+        yield client
