@@ -26,6 +26,7 @@ from urlab_client.aio.namespaces.scene import SceneNamespace
 from urlab_client.aio.namespaces.sim import SimNamespace
 from urlab_client.aio.namespaces.viewport import ViewportNamespace
 from urlab_client.aio.publishers import Publishers
+from urlab_client.aio.recovery import resync
 from urlab_client.aio.session import Session
 from urlab_client.aio.state import SimState
 from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS, Stream
@@ -33,6 +34,7 @@ from urlab_client.aio.transport.base import Transport as TransportProtocol
 from urlab_client.aio.transport.base import TransportStats
 from urlab_client.aio.transport.curve import ClientKeys, client_keys, is_local
 from urlab_client.aio.transport.zmq import ZmqTransport
+from urlab_client.aio.watch import Watch
 from urlab_client.protocol.base import Reply, Request
 from urlab_client.protocol.codec import op_of
 from urlab_client.protocol.enums import CameraTiming, ObservationLevel, StepMode, Transport
@@ -43,7 +45,7 @@ from urlab_client.protocol.messages.session import MetaOk, OpInfo, Reset, ResetO
 from urlab_client.protocol.messages.streams import ClientEvent, RowSample, StateSnapshot, StreamPolicy
 from urlab_client.protocol.names import NameMap
 from urlab_client.protocol.rows import TopicKind
-from urlab_client.protocol.types import ClientConfig, Diagnosis
+from urlab_client.protocol.types import ClientConfig, Diagnosis, Resync
 
 if TYPE_CHECKING:
     import mujoco
@@ -154,7 +156,6 @@ class URLabClient:
             default_timeout=rcv_timeout_ms / 1000,
             keys=keys,
         )
-        self._transport.on_event = self._publishers.events.publish
         self._state = SimState(
             self._session,
             self._publishers,
@@ -164,6 +165,8 @@ class URLabClient:
             promote=auto_promote_step_mode,
             trusted=trust_server or keys is not None or is_local(address),
         )
+        self._watch = Watch(self._session, self._state)
+        self._transport.on_event = self._watch.on_line
         self._closed = False
         self._scene = SceneNamespace(self._session)
         self._sim = SimNamespace(self._session, self._state)
@@ -384,7 +387,7 @@ class URLabClient:
 
         Raises:
             StepTimeout: The server did not finish within its 5 s; the steps are still queued there.
-            OutcomeUnknown: The connection broke: the steps may or may not have been taken.
+            OutcomeUnknown: The connection broke: the steps may or may not have been taken. `resync()` finds out.
             KeyError: Unknown camera; nothing was sent.
         """
         state = self._state
@@ -405,12 +408,18 @@ class URLabClient:
         if level != state.sent_level:
             request.observations = level
         state.sent_level = ""  # unknown to us until the server has answered
-        reply = await self._session.call(request, timeout=timeout)
-        state.sent_level = level
-        if state.mode is StepMode.DIRECT:
-            for record, wrenches in carried:
-                record.drop_wrenches(wrenches)
-        state.absorb(reply, "step", into_mirror=state.mode is not StepMode.PUPPET)
+        try:
+            reply = await self._session.call(request, timeout=timeout)
+            state.sent_level = level
+            if state.mode is StepMode.DIRECT:
+                for record, wrenches in carried:
+                    record.drop_wrenches(wrenches)
+            state.absorb(reply, "step", into_mirror=state.mode is not StepMode.PUPPET)
+        except BaseException as error:
+            state.doubts.add_steps(state, error, 1 if state.mode is StepMode.PUPPET else max(n_steps, 1), carried)
+            raise
+        if state.doubts:
+            state.doubts.clear()
         if state.mode is StepMode.PUPPET:
             with state.mirror.lock:
                 state.mirror.perturb(reply.perturbation)
@@ -450,9 +459,33 @@ class URLabClient:
             seed=seed,
             per_articulation_qpos=overrides or None,
         )
-        reply = await self._session.call(request, timeout=timeout)
-        self._state.absorb_reset(reply, request.keyframe_name)
+        try:
+            reply = await self._session.call(request, timeout=timeout)
+            self._state.absorb_reset(reply, request.keyframe_name)
+        except BaseException as error:
+            self._state.doubts.add_reset(self._state, error, request.keyframe_name)
+            raise
+        self._state.doubts.clear()
         return reply
+
+    async def resync(self, *, timeout: Timeout = DEFAULT) -> Resync:
+        """Find out what became of steps, resets and mode changes whose replies were lost, and go on from there.
+
+        To be called after `OutcomeUnknown`, after `URLabTimeoutError` of a step, or after a step was cancelled. Asks
+        the server for its step counter and time without stepping it, takes over the state, and opens a new session
+        when the old one is gone, or when a lost request may still be on its way: it is then refused when it arrives.
+        No step and no reset is sent a second time; whether to repeat them is the caller's decision.
+
+        Args:
+            timeout: Seconds to wait; None waits without limit.
+
+        Returns:
+            What was found; with nothing in doubt, just where the simulation stands.
+
+        Raises:
+            URLabConnectionError: The server is not back yet. What is in doubt stays so for the next attempt.
+        """
+        return await resync(self._state, timeout=timeout)
 
     def state_stream(
         self,
@@ -568,6 +601,7 @@ class URLabClient:
         promoted_from = self._state.promoted_from
         self._publishers.close()
         try:
+            await self._watch.aclose()
             if promoted_from is not None and self.connected and self.manager_present:
                 with contextlib.suppress(URLabError):  # a courtesy: the server may have moved on
                     await self._session.call(SetMode(mode=promoted_from), timeout=_REVERT_S)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import enum
+from collections.abc import Callable
 from typing import Final, Literal, TypeAlias
 
-__all__ = ["DEFAULT", "Default", "Timeout"]
+__all__ = ["DEFAULT", "Default", "Timeout", "shared"]
 
 
 class Default(enum.Enum):
@@ -19,3 +21,15 @@ DEFAULT: Final = Default.DEFAULT
 
 Timeout: TypeAlias = float | Literal[Default.DEFAULT] | None
 """Seconds for queueing, sending and the reply together; None waits without limit."""
+
+
+def shared(timeout: Timeout) -> Callable[[], Timeout]:
+    """Return what tells how much of `timeout` is left from now on: one limit for several requests in a row.
+
+    The default and None stand for each request by itself.
+    """
+    if timeout is DEFAULT or timeout is None:
+        return lambda: timeout
+    loop = asyncio.get_running_loop()
+    end = loop.time() + timeout
+    return lambda: max(0.0, end - loop.time())

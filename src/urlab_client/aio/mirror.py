@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import threading
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from urlab_client.protocol.types import SimOptions
 if TYPE_CHECKING:
     import mujoco
 
-__all__ = ["Mirror", "model_names", "write_options"]
+__all__ = ["Loaded", "Mirror", "model_names", "write_options"]
 
 log = logging.getLogger("urlab_client.mirror")
 
@@ -83,6 +83,14 @@ def _switched(mask: int, bit: int, on: bool) -> int:
     return mask | bit if on else mask & ~bit
 
 
+class Loaded(NamedTuple):
+    """A model that was loaded, and whether it was compiled here from XML."""
+
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    approximate: bool
+
+
 class Mirror:
     """Local model and data, guarded by a reentrant lock.
 
@@ -116,15 +124,16 @@ class Mirror:
             same = hello.mjb[:_HEADER_BYTES] == _mjb_header()
         return None if same else URLabVersionMismatch(hello.mujoco_version, client)
 
-    def load(self, hello: HelloOk) -> None:
-        """Load the handshake's model. Blocking: run it off the event loop.
+    @classmethod
+    def load(cls, hello: HelloOk) -> Loaded | None:
+        """Load the handshake's model, None if there is none. Blocking, and without effect here: run it in a thread.
 
         Raises:
             ProtocolError: The bytes are not a model this MuJoCo can load.
         """
         import mujoco  # noqa: PLC0415
 
-        mismatch = self.check_version(hello)
+        mismatch = cls.check_version(hello)
         try:
             binary = mismatch is None and hello.mjb is not None
             if binary and hello.mjb is not None:
@@ -132,23 +141,22 @@ class Mirror:
             elif hello.mjcf_compiled is not None:
                 model = mujoco.MjModel.from_xml_string(hello.mjcf_compiled, hello.vfs_assets or {})
             else:
-                self.clear()
-                return
+                return None
         except (ValueError, mujoco.FatalError) as error:
             raise ProtocolError(f"hello: the server's model cannot be loaded: {error}", op="hello") from error
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
-        with self.lock:
-            self.model, self.data = model, data
-            self.approximate = not binary
-            self._stale = False
-            self._dragged = None
+        return Loaded(model, data, not binary)
 
-    def clear(self) -> None:
-        """Forget the model."""
-        with self.lock:
+    def use(self, loaded: Loaded | None) -> None:
+        """Mirror into a model from now on, or into none. Call under the lock."""
+        if loaded is None:
             self.model = self.data = None
             self.approximate = False
+        else:
+            self.model, self.data, self.approximate = loaded.model, loaded.data, loaded.approximate
+        self._stale = False
+        self._dragged = None
 
     def reset(self, keyframe: str | None) -> None:
         """Reset the data as the server does: replies carry the articulations' state, but not all of it. Under the lock.

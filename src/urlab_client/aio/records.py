@@ -65,8 +65,20 @@ class EntityRecord:
         self.qvel_offset = info.qvel_offset
         self.pose = None
 
+    def check_pose(self, state: EntityState, op: str) -> None:
+        """Refuse a state whose arrays have other lengths than a pose and a velocity.
+
+        Raises:
+            ProtocolError: An array has the wrong length.
+        """
+        for what, array, expected in (("qpos", state.qpos, 7), ("qvel", state.qvel, 6)):
+            if array is not None and len(array) != expected:
+                raise ProtocolError(
+                    f"{op}: {what} of entity {self.name!r} has {len(array)} values, not {expected}.", op=op
+                )
+
     def absorb_pose(self, state: EntityState) -> None:
-        """Take over a state, here and in the mirror. Call under the mirror's lock."""
+        """Take over a checked state, here and in the mirror. Call under the mirror's lock."""
         self.pose = state
         data = self.mirror.data
         if data is None or self.qpos_offset is None or self.qvel_offset is None:

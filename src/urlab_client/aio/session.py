@@ -7,11 +7,11 @@ import logging
 from collections.abc import Callable
 from typing import TypeVar
 
-from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.deadline import DEFAULT, Timeout, shared
 from urlab_client.aio.transport.base import Transport
 from urlab_client.protocol.base import Needs, Op, Reply, Request
 from urlab_client.protocol.codec import check_request, decode_reply, encode_request, op_of
-from urlab_client.protocol.errors import UnknownOp, URLabRPCError, URLabTimeoutError
+from urlab_client.protocol.errors import ConnectionLost, ServerUnreachable, UnknownOp, URLabRPCError, URLabTimeoutError
 from urlab_client.protocol.messages.session import Hello, HelloOk, Meta
 
 __all__ = ["Session"]
@@ -31,17 +31,21 @@ class Session:
         session_id: Id of the open session; empty without one.
         offered: Ops the server lists, or None before it was asked.
         on_refusal: Told of each refusal before it is raised.
+        confirmed: Whether the server has answered within this session since the connection was made. It may be another
+            server after that was lost, which only a refused or accepted session id shows.
     """
 
     def __init__(self, transport: Transport, *, default_timeout: float | None, json: bool = False) -> None:
         self.session_id = ""
         self.offered: frozenset[str] | None = None
         self.on_refusal: Callable[[URLabRPCError], None] | None = None
+        self.confirmed = False
         self._transport = transport
         self._default_timeout = default_timeout
         self._json = json
         self._turn = asyncio.Lock()
         self._queued = 0
+        self._aside: asyncio.Task[Reply] | None = None
 
     @property
     def transport(self) -> Transport:
@@ -73,12 +77,15 @@ class Session:
         else:
             await self._turn.acquire()
         try:
-            frame = encode_request(request, self.session_id, json=self._json)
+            stamped = self.session_id
+            frame = encode_request(request, stamped, json=self._json)
             if not op.hot and not self._json:
                 check_request(request, frame)
-            answer = await self._transport.request(
-                frame, op, deadline=deadline, connect_by=self._connect_by(now, deadline, timeout)
-            )
+            connect_by = self._connect_by(now, deadline, timeout)
+            try:
+                answer = await self._transport.request(frame, op, deadline=deadline, connect_by=connect_by)
+            except ConnectionLost as lost:
+                answer = await self._ask_again(frame, op, lost, deadline=deadline, connect_by=connect_by)
         finally:
             self._turn.release()
         if log.isEnabledFor(logging.DEBUG):
@@ -86,21 +93,43 @@ class Session:
                 "%s: %d bytes out, %d back in %.3f ms", op.name, len(frame), len(answer), 1e3 * (loop.time() - now)
             )
         try:
-            return decode_reply(op, op_reply(request, op), answer)
+            reply = decode_reply(op, op_reply(request, op), answer)
         except URLabRPCError as refusal:
-            if self.on_refusal is not None:
+            # A refusal of what was sent before the latest hello says nothing about the session of now.
+            if self.on_refusal is not None and stamped == self.session_id:
                 self.on_refusal(refusal)
             raise
+        if not self.confirmed:
+            self.confirmed = op.needs is not Needs.NOTHING and stamped == self.session_id
+        return reply
+
+    async def probe(self, request: Request[R], *, timeout: float) -> R | None:
+        """Send a request that nobody waits for, unless somebody else's is under way, and give way to the next one.
+
+        Returns:
+            The reply, or None if it gave way.
+        """
+        if self._turn.locked() or self._queued:
+            return None
+        task = asyncio.create_task(self.call(request, timeout=timeout), name="urlab-probe")
+        self._aside = task
+        try:
+            await asyncio.wait((task,))
+            return None if task.cancelled() else task.result()
+        finally:
+            task.cancel()
+            self._aside = None
 
     async def hello(self, request: Hello, *, timeout: Timeout = DEFAULT) -> HelloOk:
         """Open a session; the one before it becomes invalid, here and for any other client."""
         if self._json:
             request.encoding = "json"
-        self.session_id = ""
-        reply = await self.call(request, timeout=timeout)
+        left = shared(timeout)
+        reply = await self.call(request, timeout=left())
         self.session_id = reply.session_id
+        self.confirmed = True
         # A packaged build lacks the editor's ops, an older server lacks newer ones.
-        self.offered = frozenset(op.name for op in (await self.call(Meta(), timeout=timeout)).ops)
+        self.offered = frozenset(op.name for op in (await self.call(Meta(), timeout=left())).ops)
         return reply
 
     async def aclose(self) -> None:
@@ -119,7 +148,22 @@ class Session:
         by = now + self._default_timeout
         return by if deadline is None else min(by, deadline)
 
+    async def _ask_again(
+        self, frame: bytes, op: Op, lost: ConnectionLost, *, deadline: float | None, connect_by: float | None
+    ) -> bytes:
+        """Repeat a request that changes nothing, whose connection broke, until there is an answer or time is up."""
+        while True:
+            log.debug("%s: asking again, because the connection was lost", op.name)
+            try:
+                return await self._transport.request(frame, op, deadline=deadline, connect_by=connect_by)
+            except ConnectionLost as again:
+                lost = again
+            except ServerUnreachable as unreachable:
+                raise lost from unreachable
+
     async def _wait_turn(self, op: Op, deadline: float | None) -> None:
+        if self._aside is not None:
+            self._aside.cancel()
         self._queued += 1
         try:
             async with asyncio.timeout_at(deadline):

@@ -20,9 +20,11 @@ from urlab_client.protocol.messages.streams import (
     PlayEnded,
     PlayStarted,
     RowSample,
+    ServerAnswers,
     ServerConnected,
     ServerLost,
     ServerReconnected,
+    ServerSilent,
     SessionLost,
     SessionOpened,
     StateSnapshot,
@@ -49,7 +51,15 @@ _OF_SCENE = frozenset({TopicKind.XPOS, TopicKind.XQUAT, TopicKind.QPOS, TopicKin
 _WITH_ID = frozenset({TopicKind.JOINT, TopicKind.SENSOR})
 
 _EVENTS = msgspec.msgpack.Decoder(
-    ServerConnected | ServerLost | ServerReconnected | SessionOpened | SessionLost | PlayStarted | PlayEnded
+    ServerConnected
+    | ServerLost
+    | ServerReconnected
+    | ServerSilent
+    | ServerAnswers
+    | SessionOpened
+    | SessionLost
+    | PlayStarted
+    | PlayEnded
 )
 
 
@@ -278,11 +288,16 @@ class CameraSource(_SocketSource):
 
 
 class EventBus:
-    """Tells whoever listens what happens to a client. Publishing without listeners costs nothing and keeps nothing."""
+    """Tells whoever listens what happens to a client. Publishing without listeners costs nothing and keeps nothing.
+
+    Attributes:
+        on_listener: Told, on any thread, that somebody began to listen.
+    """
 
     name = "events"
 
     def __init__(self) -> None:
+        self.on_listener: Callable[[], None] | None = None
         self._lock = threading.Lock()
         self._sinks: dict[Sink, None] = {}
         self._closed = False
@@ -321,6 +336,13 @@ class EventBus:
             if self._closed:
                 raise client_closed()
             self._sinks[sink] = None
+        if self.on_listener is not None:
+            self.on_listener()
+
+    @property
+    def heard(self) -> bool:
+        """Whether anybody listens."""
+        return bool(self._sinks)
 
     def detach(self, sink: Sink) -> None:
         """Stop feeding `sink`, from any thread. Idempotent."""

@@ -9,7 +9,7 @@ import logging
 import re
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING
 
 import anyio.to_thread
@@ -17,12 +17,13 @@ import numpy as np
 
 from urlab_client.aio.articulation import URLabArticulation, URLabEntity
 from urlab_client.aio.cameras import URLabCameraView
-from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.deadline import DEFAULT, Timeout, shared
 from urlab_client.aio.layout import FREE, ArticulationLayout, articulation_layouts
 from urlab_client.aio.mirror import Mirror, model_names, write_options
 from urlab_client.aio.publishers import Publishers
 from urlab_client.aio.reception import LiveReception, Pictures
 from urlab_client.aio.records import ArticulationRecord, EntityRecord, Wrenches
+from urlab_client.aio.recovery import Doubts
 from urlab_client.aio.session import Session
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.enums import StepMode
@@ -81,6 +82,9 @@ class SimState:
         global_cameras: Scene-level cameras.
         step_count: Steps since the last handshake or reset.
         sim_time: Simulation time of the last reply, seconds.
+        on_adopted: Told of each handshake taken over, and of the end of play.
+        doubts: Requests whose replies were lost.
+        stopping: Whether this client is ending play, so that its end is no news.
     """
 
     def __init__(
@@ -118,6 +122,9 @@ class SimState:
         session.on_refusal = self._note_refusal
         self._promote = promote
         self._trusted = trusted
+        self.doubts = Doubts()
+        self.on_adopted: Callable[[], None] | None = None
+        self.stopping = False
         self._records: dict[str, ArticulationRecord] = {}
         self._entity_records: dict[str, EntityRecord] = {}
 
@@ -138,6 +145,16 @@ class SimState:
                 receiver.stop()
 
     @property
+    def live(self) -> bool:
+        """Whether state is received by itself."""
+        return self._reception.running
+
+    @property
+    def live_received(self) -> int:
+        """Snapshots that arrived by themselves."""
+        return self._reception.stats.received
+
+    @property
     def records(self) -> Mapping[str, ArticulationRecord]:
         """Records of the articulations, by key."""
         return self._records
@@ -154,7 +171,9 @@ class SimState:
 
     async def open(self, observations: str, *, timeout: Timeout = DEFAULT) -> HelloOk:
         """Open a session and take over what the server says."""
-        hello = await self.session.hello(Hello(observations=observations), timeout=timeout)
+        left = shared(timeout)
+        hello = await self.session.hello(Hello(observations=observations), timeout=left())
+        self.doubts.clear()  # what belonged to the session before is refused now
         self.publishers.events.publish(
             SessionOpened(
                 session_id=hello.session_id, urlab_version=hello.urlab_version, mujoco_version=hello.mujoco_version
@@ -171,8 +190,8 @@ class SimState:
                     stacklevel=2,
                 )
                 request = Hello(observations=observations, include_assets=True)
-                hello = await self.session.hello(request, timeout=timeout)
-        await self.adopt(hello, timeout=timeout)
+                hello = await self.session.hello(request, timeout=left())
+        await self.adopt(hello, timeout=left())
         return hello
 
     async def _without_binary(self, hello: HelloOk, timeout: Timeout) -> HelloOk:
@@ -197,14 +216,18 @@ class SimState:
 
     async def adopt(self, hello: HelloOk, *, timeout: Timeout = DEFAULT) -> None:
         """Take over a handshake: load its model, bind the wrappers, bring the server into the wanted step mode."""
+        loaded = None
         if self._local_model:
             if hello.mjb is not None and not self._trusted:
                 hello = await self._without_binary(hello, timeout)
-            await anyio.to_thread.run_sync(self.mirror.load, hello)
-        # The model is loaded; its bytes, several times its size, are not needed any more.
+            loaded = await anyio.to_thread.run_sync(self.mirror.load, hello, abandon_on_cancel=True)
+        # From here on nothing waits until all is taken over: cancelled or not, model and wrappers belong together.
+        # The model's bytes, several times its size, are not needed any more.
         hello.mjb = hello.mjb_base64 = hello.mjcf_compiled = hello.vfs_assets = None
         played = self.hello is not None and self.hello.manager_present
         with self.mirror.lock:
+            if self._local_model:
+                self.mirror.use(loaded)
             self.hello = hello
             self._bind_articulations(hello.articulations)
             self._bind_entities(hello.entities or {})
@@ -220,16 +243,24 @@ class SimState:
         if not hello.manager_present:
             self.mode = StepMode.LIVE
         elif self._promote and self.wanted_mode in (StepMode.DIRECT, StepMode.PUPPET):
-            reply = await self.session.call(SetMode(mode=self.wanted_mode), timeout=timeout)
-            self.mode = StepMode(reply.current_mode)
-            if reply.previous_mode != reply.current_mode:
-                self.promoted_from = StepMode(reply.previous_mode)
+            previous = await self.ask_mode(self.wanted_mode, timeout=timeout)
+            if previous is not self.mode:
+                self.promoted_from = previous
         else:
             self.mode = StepMode.LIVE if self.wanted_mode is StepMode.AUTO else self.wanted_mode
+        if self.on_adopted is not None:
+            self.on_adopted()
         log.info(
             "session with %s, MuJoCo %s: %d articulations, mode %s",
             hello.urlab_version, hello.mujoco_version, len(self.articulations), self.mode,
         )  # fmt: skip
+
+    async def ask_mode(self, mode: StepMode, *, timeout: Timeout = DEFAULT) -> StepMode:
+        """Bring the server into a step mode, take over the one in force, and return the one before."""
+        with self.doubts.about_mode(mode):
+            reply = await self.session.call(SetMode(mode=mode), timeout=timeout)
+        self.mode = StepMode(reply.current_mode)
+        return StepMode(reply.previous_mode)
 
     def _global_camera(self, name: str, info: CameraInfo) -> URLabCameraView:
         view = self.global_cameras.get(name)
@@ -294,6 +325,13 @@ class SimState:
         age = self.wall_time_sec - snapshot.wall_time.sec + (self.wall_time_nsec - snapshot.wall_time.nsec) / 1e9
         if 0 < age < _OVERTAKEN_S:
             return  # sent before the last reply, arrived after it
+        if not self.session.confirmed:
+            return  # the connection was lost: this may be another server's
+        if snapshot.per_articulation.keys() != self._records.keys():
+            raise ProtocolError(
+                f"state/full: it holds {_listed(snapshot.per_articulation)}, the handshake {_listed(self._records)}.",
+                hint="The world changed on the server: call discover().",
+            )
         self.absorb(snapshot, "state/full")
 
     def absorb(self, reply: StateReply | StateSnapshot, op: str, *, into_mirror: bool = True) -> None:
@@ -316,6 +354,9 @@ class SimState:
         frames: list[tuple[URLabCameraView, Pixels]] = []
         if isinstance(reply, (StepOk, StateSnapshot)):
             entities = reply.entities or {}
+            for name, entity in entities.items():
+                if name in self._entity_records:
+                    self._entity_records[name].check_pose(entity, op)
         if isinstance(reply, StepOk):
             frames = [(view, _pixels(view, frame)) for view, frame in self._frames(reply.cameras or {})]
         with self.mirror.lock:
@@ -381,6 +422,8 @@ class SimState:
         self.promoted_from = None
         if played:
             self.publishers.events.publish(PlayEnded(reason=reason))
+            if self.on_adopted is not None:
+                self.on_adopted()
 
     def note_missing_frames(self, asked: bool | Mapping[str, str | None], reply: StepOk) -> None:
         """Mark the cameras whose frame was asked for and did not come: the server just leaves them out."""
@@ -412,6 +455,10 @@ class SimState:
         # As on the server, the articulation listed last wins when several have a camera of that name.
         owners = [art for art in self.articulations.values() if name in art.cameras]
         return owners[-1].cameras[name] if owners else self.global_cameras.get(name)
+
+
+def _listed(keys: Iterable[str]) -> str:
+    return ", ".join(keys) or "no articulation"
 
 
 def _pixels(view: URLabCameraView, frame: CameraFrame) -> Pixels:

@@ -226,6 +226,7 @@ class _Channel(Sink, Generic[T]):
             if lost and not self._tolerant:
                 raise StreamOverflow(
                     f"{self._source.name}: the reader fell behind: {lost} messages were lost, {waiting} wait.",
+                    lost=lost,
                     hint="Reading goes on with the oldest that waits. Read faster, or allow a larger buffer=….",
                 )
             if entry is None:

@@ -196,7 +196,17 @@ class URLabVersionMismatch(URLabError):
 
 
 class StreamOverflow(URLabError):
-    """A stream read with policy `all` fell behind its bounded buffer."""
+    """A stream read with policy `all` fell behind its bounded buffer. Reading goes on with the oldest that is left.
+
+    Attributes:
+        lost: Messages that were lost.
+    """
+
+    lost: int
+
+    def __init__(self, message: str, *, lost: int, hint: str | None = None) -> None:
+        super().__init__(message, hint=hint)
+        self.lost = lost
 
 
 class ConcurrentReadError(URLabError):

@@ -30,6 +30,7 @@ __all__ = [
     "RecordingSummary",
     "ReplaySession",
     "ReplayStatus",
+    "Resync",
     "SceneActor",
     "SceneSnapshot",
     "SimOptions",
@@ -91,6 +92,35 @@ class Diagnosis(Struct, frozen=True):
 
     def __str__(self) -> str:
         return "\n".join(f"{finding.verdict:<8}{finding.subject}: {finding.text}" for finding in self.findings)
+
+
+class Resync(Struct, frozen=True, kw_only=True):
+    """What `client.resync()` found out.
+
+    Attributes:
+        session_held: Whether the server still knew the session: it neither restarted nor was taken over.
+        session_renewed: Whether a new session was opened: because the old one was gone, or so that a request which
+            may still travel is refused when it arrives.
+        playing: Whether a play session runs. Without one there is no state: `step` and `time` are 0.
+        step: The server's step counter; counts from the session's beginning or the last reset.
+        time: Simulation time, seconds.
+        steps_sent: Steps in doubt: sent since the last reply, their own replies lost. Pushes in puppet mode.
+        steps_applied: How many of those were executed; None where it cannot be known, because the session was gone or
+            something else moved the counter as well.
+        reset_applied: Whether a reset in doubt was executed; None if there was none, or it cannot be known.
+        settled: Whether nothing that was in doubt can still take effect. False when the server has queued steps that it
+            could not do yet, as after `StepTimeout`.
+    """
+
+    session_held: bool
+    session_renewed: bool
+    playing: bool
+    step: int = 0
+    time: float = 0.0
+    steps_sent: int = 0
+    steps_applied: int | None = None
+    reset_applied: bool | None = None
+    settled: bool = True
 
 
 class ClientConfig(Struct, frozen=True, kw_only=True):

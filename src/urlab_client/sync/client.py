@@ -21,7 +21,7 @@ from urlab_client.protocol.messages.session import OpInfo, ResetOk, StepOk
 from urlab_client.protocol.messages.streams import ClientEvent, RowSample, StateSnapshot, StreamPolicy
 from urlab_client.protocol.names import NameMap
 from urlab_client.protocol.rows import TopicKind
-from urlab_client.protocol.types import ClientConfig, Diagnosis
+from urlab_client.protocol.types import ClientConfig, Diagnosis, Resync
 from urlab_client.sync._portal import FacadeRoot
 from urlab_client.sync.articulation import URLabArticulation, URLabEntity
 from urlab_client.sync.cameras import URLabCameraView
@@ -322,7 +322,7 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
 
         Raises:
             StepTimeout: The server did not finish within its 5 s; the steps are still queued there.
-            OutcomeUnknown: The connection broke: the steps may or may not have been taken.
+            OutcomeUnknown: The connection broke: the steps may or may not have been taken. `resync()` finds out.
             KeyError: Unknown camera; nothing was sent.
         """
         return self._portal.call(
@@ -353,6 +353,25 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
             KeyError: Unknown articulation or joint; nothing was sent.
         """
         return self._portal.call(self._aio.reset(keyframe_name, seed, per_articulation_qpos, timeout=timeout))
+
+    def resync(self, *, timeout: Timeout = DEFAULT) -> Resync:
+        """Find out what became of steps, resets and mode changes whose replies were lost, and go on from there.
+
+        To be called after `OutcomeUnknown`, after `URLabTimeoutError` of a step, or after a step was cancelled. Asks
+        the server for its step counter and time without stepping it, takes over the state, and opens a new session
+        when the old one is gone, or when a lost request may still be on its way: it is then refused when it arrives.
+        No step and no reset is sent a second time; whether to repeat them is the caller's decision.
+
+        Args:
+            timeout: Seconds to wait; None waits without limit.
+
+        Returns:
+            What was found; with nothing in doubt, just where the simulation stands.
+
+        Raises:
+            URLabConnectionError: The server is not back yet. What is in doubt stays so for the next attempt.
+        """
+        return self._portal.call(self._aio.resync(timeout=timeout))
 
     def state_stream(
         self,

@@ -13,7 +13,7 @@ from urlab_client.aio.namespaces._ops import RuntimeOps
 from urlab_client.aio.session import Session
 from urlab_client.aio.state import SimState
 from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.messages.runtime import ContactFilter, GetContacts, SetMode, SetQpos, SetSimOptions
+from urlab_client.protocol.messages.runtime import ContactFilter, GetContacts, SetQpos, SetSimOptions
 from urlab_client.protocol.messages.session import Forward, ForwardOk
 from urlab_client.protocol.types import ContactsResult, SimOptions
 
@@ -108,9 +108,7 @@ class RuntimeNamespace(RuntimeOps):
         """
         wanted = StepMode(mode)
         # On the wire `auto` is a mode in which every step times out.
-        request = SetMode(mode=StepMode.LIVE if wanted is StepMode.AUTO else wanted)
-        reply = await self._call(request, timeout)
-        self._state.mode = StepMode(reply.current_mode)
+        await self._state.ask_mode(StepMode.LIVE if wanted is StepMode.AUTO else wanted, timeout=timeout)
         self._state.wanted_mode = self._state.mode
         return self._state.mode
 

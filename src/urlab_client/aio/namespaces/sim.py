@@ -98,13 +98,17 @@ class SimNamespace(Namespace):
             URLabTimeoutError: The editor agreed, but play has not ended after ten seconds.
         """
         loop = asyncio.get_running_loop()
-        await self._call(StopPie(), timeout)
-        # The plugin answers when the end has been requested.
-        deadline = loop.time() + _WIND_DOWN_S
-        while (await self.status(timeout=timeout)).state is not PIEState.OFF:
-            if loop.time() > deadline:
-                raise URLabTimeoutError(f"stop_pie: play has not ended within {_WIND_DOWN_S:g} s.", op="stop_pie")
-            await asyncio.sleep(_STOP_POLL_S)
+        self._state.stopping = True
+        try:
+            await self._call(StopPie(), timeout)
+            # The plugin answers when the end has been requested.
+            deadline = loop.time() + _WIND_DOWN_S
+            while (await self.status(timeout=timeout)).state is not PIEState.OFF:
+                if loop.time() > deadline:
+                    raise URLabTimeoutError(f"stop_pie: play has not ended within {_WIND_DOWN_S:g} s.", op="stop_pie")
+                await asyncio.sleep(_STOP_POLL_S)
+        finally:
+            self._state.stopping = False
         self._state.on_play_ended("stopped by this client")
 
     async def status(self, *, timeout: Timeout = DEFAULT) -> PIEStatus:

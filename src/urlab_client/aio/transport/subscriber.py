@@ -22,6 +22,7 @@ import zmq
 from msgspec import Struct
 from zmq.utils.monitor import recv_monitor_message
 
+from urlab_client.aio.transport import line
 from urlab_client.aio.transport.curve import SERVER_KEY_HINT, ClientKeys
 from urlab_client.protocol.errors import ClientClosed, ProtocolError, URLabError
 from urlab_client.protocol.rows import BytesLike
@@ -29,11 +30,6 @@ from urlab_client.protocol.rows import BytesLike
 __all__ = ["Line", "Sink", "Subscription", "Subscriptions", "client_closed"]
 
 log = logging.getLogger("urlab_client.transport")
-
-_HEARTBEAT_MS = 1000
-_SILENCE_MS = 3000
-_RECONNECT_MS = 50
-_RECONNECT_MAX_MS = 1000
 
 # Set before connecting. These queues fill only while the loop is blocked: a backlog of small messages is worth
 # keeping for streams that want all, and is skimmed in milliseconds by those that want the newest. Pictures are large.
@@ -45,21 +41,9 @@ _MAX_MESSAGE_BYTES = 256 * 1024 * 1024
 _BATCH_MESSAGES = 64
 _BATCH_BYTES = 8 * 1024 * 1024
 
-_WATCHED = (
-    zmq.Event.CONNECTED
-    | zmq.Event.CONNECT_RETRIED
-    | zmq.Event.DISCONNECTED
-    | zmq.Event.HANDSHAKE_SUCCEEDED
-    | zmq.Event.HANDSHAKE_FAILED_AUTH
-    | zmq.Event.HANDSHAKE_FAILED_NO_DETAIL
-    | zmq.Event.HANDSHAKE_FAILED_PROTOCOL
-)
 _OBSTACLES = {
-    zmq.Event.CONNECT_RETRIED: "connection refused",
-    zmq.Event.CONNECTED: "something accepts the connection but does not speak ZeroMQ",
-    zmq.Event.HANDSHAKE_FAILED_AUTH: f"the ZeroMQ handshake failed. {SERVER_KEY_HINT}",
-    zmq.Event.HANDSHAKE_FAILED_NO_DETAIL: f"the ZeroMQ handshake failed. {SERVER_KEY_HINT}",
-    zmq.Event.HANDSHAKE_FAILED_PROTOCOL: f"the ZeroMQ handshake failed. {SERVER_KEY_HINT}",
+    **line.OBSTACLES,
+    **dict.fromkeys(line.FAILED_HANDSHAKES, f"the ZeroMQ handshake failed. {SERVER_KEY_HINT}"),
 }
 # Topics differ for ever only where a server is out of its mind; then forget them.
 _REMEMBERED_TOPICS = 4096
@@ -82,6 +66,9 @@ class Sink(ABC):
 
     def on_drained(self) -> None:  # noqa: B027 - a sink that acts on each message needs nothing here
         """Act on the messages that just came, after the last of a batch."""
+
+    def on_line(self, connected: bool) -> None:  # noqa: B027 - most sinks need not know
+        """Take note that the connection was made or lost."""
 
     def on_gap(self, why: str) -> None:  # noqa: B027 - a sink that keeps only the newest misses nothing
         """Take note that messages are missing before the next one."""
@@ -142,17 +129,12 @@ class _Subscriber:
         self._down_since: float | None = None
         self._closed = False
         socket = self._socket = context.socket(zmq.SUB)
-        socket.linger = 0
+        line.configure(socket)
         socket.rcvhwm = _QUEUED_PICTURES if pictures else _QUEUED_MESSAGES
         socket.maxmsgsize = _MAX_MESSAGE_BYTES
-        socket.heartbeat_ivl = _HEARTBEAT_MS
-        socket.heartbeat_timeout = _SILENCE_MS
-        socket.heartbeat_ttl = _SILENCE_MS
-        socket.reconnect_ivl = _RECONNECT_MS
-        socket.reconnect_ivl_max = _RECONNECT_MAX_MS
         if keys is not None:
             keys.protect(socket)
-        self._monitor = socket.get_monitor_socket(_WATCHED)
+        self._monitor = socket.get_monitor_socket(line.WATCHED)
         try:
             socket.connect(endpoint)
             loop.add_reader(self._monitor, self._on_event)
@@ -187,8 +169,9 @@ class _Subscriber:
         self._loop.call_soon(self._on_readable)
 
     def close(self) -> None:
-        self._loop.remove_reader(self._socket)
-        self._loop.remove_reader(self._monitor)
+        if not self._loop.is_closed():  # an abandoned client may outlive its loop
+            self._loop.remove_reader(self._socket)
+            self._loop.remove_reader(self._monitor)
         self._release()
 
     def _release(self) -> None:
@@ -262,6 +245,7 @@ class _Subscriber:
             self.connected = True
             self.connects += 1
             log.info("receiving from %s", self.endpoint)
+            self._tell_line()
             if self._down_since is not None:
                 why = f"reconnected after {self._loop.time() - self._down_since:.2f} s"
                 self._down_since = None
@@ -273,17 +257,22 @@ class _Subscriber:
                 log.info("lost %s; reconnecting", self.endpoint)
                 self.connected = False
                 self._down_since = self._loop.time()
+                self._tell_line()
         elif event in _OBSTACLES and self.connects == 0:
             self.obstacle = _OBSTACLES[event]
         if event in (zmq.Event.HANDSHAKE_FAILED_AUTH, zmq.Event.HANDSHAKE_FAILED_PROTOCOL):
             # ZeroMQ does not try again by itself, but the server may learn the key.
-            self._loop.call_later(_RECONNECT_MAX_MS / 1000, self._reconnect)
+            self._loop.call_later(line.RECONNECT_MAX_MS / 1000, self._reconnect)
 
     def _reconnect(self) -> None:
         if not self._closed:
             with contextlib.suppress(zmq.ZMQError):
                 self._socket.disconnect(self.endpoint)
             self._socket.connect(self.endpoint)
+
+    def _tell_line(self) -> None:
+        for sink in tuple(self._sinks):
+            sink.on_line(self.connected)
 
 
 class Subscriptions:

@@ -17,6 +17,7 @@ from typing import Any, cast
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
+from urlab_client.aio.transport import line
 from urlab_client.aio.transport.base import TransportStats
 from urlab_client.aio.transport.curve import ClientKeys
 from urlab_client.protocol.base import Op, Timing
@@ -29,33 +30,21 @@ from urlab_client.protocol.errors import (
     URLabError,
     URLabTimeoutError,
 )
-from urlab_client.protocol.messages.streams import ClientEvent, ServerConnected, ServerLost, ServerReconnected
+from urlab_client.protocol.messages.streams import (
+    ClientEvent,
+    ServerAnswers,
+    ServerConnected,
+    ServerLost,
+    ServerReconnected,
+    ServerSilent,
+)
 
 __all__ = ["ZmqTransport"]
 
 log = logging.getLogger("urlab_client.transport")
 
-_HEARTBEAT_MS = 1000
-_SILENCE_MS = 3000  # three missed heartbeats: answered by the peer's I/O thread even while its worker is busy
-_RECONNECT_MS = 50
-_RECONNECT_MAX_MS = 1000
-
-_WATCHED = (
-    zmq.Event.CONNECTED
-    | zmq.Event.CONNECT_RETRIED
-    | zmq.Event.DISCONNECTED
-    | zmq.Event.HANDSHAKE_SUCCEEDED
-    | zmq.Event.HANDSHAKE_FAILED_AUTH
-    | zmq.Event.HANDSHAKE_FAILED_NO_DETAIL
-    | zmq.Event.HANDSHAKE_FAILED_PROTOCOL
-)
 _MECHANISM_MISMATCH = 0x11000002  # ZMQ_PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH
 _CERTAIN = 3  # a server that is just ending breaks a handshake off once; one with another key always does
-_HANDSHAKE_FAILURES = (
-    zmq.Event.HANDSHAKE_FAILED_AUTH,
-    zmq.Event.HANDSHAKE_FAILED_NO_DETAIL,
-    zmq.Event.HANDSHAKE_FAILED_PROTOCOL,
-)
 
 
 @dataclass(slots=True)
@@ -88,6 +77,7 @@ class ZmqTransport:
         self._closed = False
         self._obstacle = "the host does not answer"
         self._down_since = 0.0
+        self._silent_since: float | None = None
         self.on_event: Callable[[ClientEvent], None] | None = None
 
     @property
@@ -116,8 +106,10 @@ class ZmqTransport:
             try:
                 socket.send_multipart((key, b"", frame), zmq.NOBLOCK)
             except zmq.Again:
-                # The line went down and the event that says so has not been read yet.
-                self._connected = False
+                # Either the line went down, and the event that says so has not been read yet, or the queue is full.
+                self._on_event()
+                if self._connected:
+                    raise self._clogged(op) from None
                 continue
             break
         started = loop.time()
@@ -148,8 +140,9 @@ class ZmqTransport:
                 waiter.set_exception(closed)
         if self._loop is None or self._socket is None or self._monitor is None or self._context is None:
             return
-        self._loop.remove_reader(self._socket)
-        self._loop.remove_reader(self._monitor)
+        if not self._loop.is_closed():  # an abandoned client may outlive its loop
+            self._loop.remove_reader(self._socket)
+            self._loop.remove_reader(self._monitor)
         self._socket.disable_monitor()
         self._monitor.close(linger=0)
         self._socket.close(linger=0)
@@ -167,17 +160,12 @@ class ZmqTransport:
             return loop, self._socket
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         socket = context.socket(zmq.DEALER)
-        socket.linger = 0
+        line.configure(socket)
         # A request must not wait in a queue for a server that is gone: it would reach the next one.
         socket.immediate = True
-        socket.heartbeat_ivl = _HEARTBEAT_MS
-        socket.heartbeat_timeout = _SILENCE_MS
-        socket.heartbeat_ttl = _SILENCE_MS
-        socket.reconnect_ivl = _RECONNECT_MS
-        socket.reconnect_ivl_max = _RECONNECT_MAX_MS
         if self._keys is not None:
             self._keys.protect(socket)
-        monitor = socket.get_monitor_socket(_WATCHED)
+        monitor = socket.get_monitor_socket(line.WATCHED)
         try:
             loop.add_reader(monitor, self._on_event)
             loop.add_reader(socket, self._on_readable)
@@ -235,9 +223,12 @@ class ZmqTransport:
             URLabTimeoutError(
                 f"{entry.op.name}: no reply from {self._endpoint} within {_ms(seconds)}.{executed}",
                 op=entry.op.name,
-                hint="The server is on the line but busy or blocked; allow more time with timeout=…",
+                hint="The connection stands, so the server is busy or blocked; allow more time with timeout=…",
             )
         )
+        if self._loop is not None and self._silent_since is None:
+            self._silent_since = self._loop.time() - seconds
+            self._tell(ServerSilent(endpoint=self._endpoint, op=entry.op.name, waited_s=seconds))
 
     def _on_readable(self) -> None:
         socket = self._socket
@@ -252,6 +243,9 @@ class ZmqTransport:
             self._deliver(frames)
 
     def _deliver(self, frames: list[bytes]) -> None:
+        if self._silent_since is not None and self._loop is not None:
+            silent, self._silent_since = self._loop.time() - self._silent_since, None
+            self._tell(ServerAnswers(endpoint=self._endpoint, silent_s=silent))
         entry = self._sent.get(frames[0]) if len(frames) == 3 else None
         if entry is None or entry.reply.done():
             self.stats.late += 1
@@ -280,14 +274,11 @@ class ZmqTransport:
                     waiter.set_result(None)
         elif event is zmq.Event.DISCONNECTED:
             self._lose()
-        elif event is zmq.Event.CONNECT_RETRIED:
-            self._obstacle = "connection refused"
-        elif event is zmq.Event.CONNECTED:
-            self._obstacle = "something accepts the connection but does not speak ZeroMQ"
-        elif event in _HANDSHAKE_FAILURES:
-            self._obstacle = "the ZeroMQ handshake failed"
-            self._rejections += 1
-            self._note_rejection(event, value)
+        elif event in line.OBSTACLES:
+            self._obstacle = line.OBSTACLES[event]
+            if event in line.FAILED_HANDSHAKES and value != errno.EAGAIN:  # which says that time was up
+                self._rejections += 1
+                self._note_rejection(event, value)
 
     def _note_rejection(self, event: zmq.Event, value: int) -> None:
         """Tell those who wait, once it is certain that trying again would not help."""
@@ -316,6 +307,7 @@ class ZmqTransport:
                 self._down_since = self._loop.time()
             self._tell(ServerLost(endpoint=self._endpoint))
         self._connected = False
+        self._silent_since = None
         self._obstacle = "the connection was lost and not restored"
         self._fail_sent(self._lost)
 
@@ -335,7 +327,14 @@ class ZmqTransport:
         if entry.op.effect is Timing.READ:
             return ConnectionLost(text, op=name, hint="The op changes nothing: it can be sent again.")
         return OutcomeUnknown(
-            text, op=name, hint="Whether it was executed is unknown: call discover() and look at the state."
+            text, op=name, hint="Whether it was executed is unknown: client.resync() finds out, and goes on."
+        )
+
+    def _clogged(self, op: Op) -> ServerUnreachable:
+        return ServerUnreachable(
+            f"{op.name}: {self._endpoint} has not taken the requests before this one. Nothing was sent.",
+            op=op.name,
+            hint="The connection stands, but the server does not read from it: restart it.",
         )
 
     def _fail_sent(self, error: Callable[[_Sent], URLabError]) -> None:

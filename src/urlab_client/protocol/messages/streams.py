@@ -21,9 +21,11 @@ __all__ = [
     "PlayEnded",
     "PlayStarted",
     "RowSample",
+    "ServerAnswers",
     "ServerConnected",
     "ServerLost",
     "ServerReconnected",
+    "ServerSilent",
     "SessionLost",
     "SessionOpened",
     "StateSnapshot",
@@ -150,6 +152,21 @@ class ServerReconnected(ClientEvent, tag="reconnected", kw_only=True, omit_defau
     down_s: Annotated[float, doc("Seconds without a connection.")]
 
 
+class ServerSilent(ClientEvent, tag="silent", kw_only=True, omit_defaults=True):
+    """A reply is overdue while the connection stands: the server is busy, blocked by a dialog, or stuck."""
+
+    endpoint: Annotated[str, doc("Where the server is.")]
+    op: Annotated[str, doc("Op whose reply did not come in time.")]
+    waited_s: Annotated[float, doc("Seconds that were waited for it.")]
+
+
+class ServerAnswers(ClientEvent, tag="answers", kw_only=True, omit_defaults=True):
+    """A server that was silent answers again."""
+
+    endpoint: Annotated[str, doc("Where the server is.")]
+    silent_s: Annotated[float, doc("Seconds since the request that it left unanswered.")]
+
+
 class SessionOpened(ClientEvent, tag="session_opened", kw_only=True, omit_defaults=True):
     """A handshake was answered."""
 
@@ -168,7 +185,9 @@ class SessionLost(ClientEvent, tag="session_lost", kw_only=True, omit_defaults=T
 class PlayStarted(ClientEvent, tag="play_started", kw_only=True, omit_defaults=True):
     """A play world is there to be driven."""
 
-    articulations: Annotated[list[str], doc("Keys of its articulations.")] = []
+    articulations: Annotated[
+        list[str], doc("Keys of its articulations; empty when somebody else started it: `discover()` tells them.")
+    ] = []
 
 
 class PlayEnded(ClientEvent, tag="play_ended", kw_only=True, omit_defaults=True):

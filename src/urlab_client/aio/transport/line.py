@@ -1,0 +1,60 @@
+"""What all ZeroMQ connections of the client have in common: how they notice a dead peer, and what stands in their way.
+
+A peer that is gone without a word (a pulled cable, a suspended machine, a stopped process) is noticed after
+`HEARTBEAT_MS + SILENCE_MS` at the latest, one whose system closes the connection at once. Heartbeats are answered by
+the peer's I/O thread, also while its worker is busy for minutes: they tell a dead server, not a wedged one.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import zmq
+
+__all__ = ["FAILED_HANDSHAKES", "NOTICED_S", "OBSTACLES", "WATCHED", "configure"]
+
+HEARTBEAT_MS = 1000
+SILENCE_MS = 3000
+# The system's own limits are minutes: with them a cable plugged in again would be noticed as late.
+_CONNECT_MS = 3000
+_RECONNECT_MS = 50
+RECONNECT_MAX_MS = 1000
+
+NOTICED_S: Final = (HEARTBEAT_MS + SILENCE_MS) / 1000
+"""Seconds after which a connection to a silent peer is given up."""
+
+FAILED_HANDSHAKES: Final = (
+    zmq.Event.HANDSHAKE_FAILED_AUTH,
+    zmq.Event.HANDSHAKE_FAILED_NO_DETAIL,
+    zmq.Event.HANDSHAKE_FAILED_PROTOCOL,
+)
+
+WATCHED: Final = (
+    zmq.Event.CONNECTED
+    | zmq.Event.CONNECT_RETRIED
+    | zmq.Event.DISCONNECTED
+    | zmq.Event.HANDSHAKE_SUCCEEDED
+    | zmq.Event.HANDSHAKE_FAILED_AUTH
+    | zmq.Event.HANDSHAKE_FAILED_NO_DETAIL
+    | zmq.Event.HANDSHAKE_FAILED_PROTOCOL
+)
+"""Events that a monitor of a connection must bring."""
+
+OBSTACLES: Final = {
+    zmq.Event.CONNECT_RETRIED: "connection refused",
+    zmq.Event.CONNECTED: "something accepts the connection but does not speak ZeroMQ, or is suspended",
+    **dict.fromkeys(FAILED_HANDSHAKES, "the ZeroMQ handshake failed"),
+}
+"""What an event says about why there is no connection."""
+
+
+def configure(socket: zmq.Socket[bytes]) -> None:
+    """Set what makes `socket` notice a dead peer and come back; before it connects."""
+    socket.linger = 0
+    socket.heartbeat_ivl = HEARTBEAT_MS
+    socket.heartbeat_timeout = SILENCE_MS
+    socket.heartbeat_ttl = SILENCE_MS
+    socket.connect_timeout = _CONNECT_MS
+    socket.handshake_ivl = _CONNECT_MS
+    socket.reconnect_ivl = _RECONNECT_MS
+    socket.reconnect_ivl_max = RECONNECT_MAX_MS

@@ -1,0 +1,243 @@
+"""Lost replies: the client says what is in doubt, finds out, and goes on, without ever stepping twice."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Iterator
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from relay import Relay
+
+import urlab_client
+from urlab_client import OutcomeUnknown, SessionTakenOver, StepTimeout, URLabTimeoutError
+from urlab_client.aio import URLabClient
+from urlab_client.server import SimulatedServer
+
+MESSAGE = 60  # bytes: more than some heartbeats, less than any request or reply
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[SimulatedServer]:
+    with SimulatedServer("arm", play=True) as made:
+        yield made
+
+
+@pytest.fixture
+async def relay(server: SimulatedServer) -> AsyncIterator[Relay]:
+    async with Relay(server.client_options()["step_port"]) as made:
+        yield made
+
+
+def options(server: SimulatedServer, relay: Relay) -> dict[str, Any]:
+    return server.client_options() | {"step_mode": "direct", "step_port": relay.port}
+
+
+@pytest.fixture
+async def client(server: SimulatedServer, relay: Relay) -> AsyncIterator[URLabClient]:
+    async with URLabClient(**options(server, relay)) as made:
+        await made.discover()
+        await made.reset()
+        await made.step(5)
+        yield made
+
+
+async def lose_the_reply(relay: Relay, call: asyncio.Task[Any]) -> None:
+    relay.hold_replies()
+    await relay.until_held(MESSAGE)
+    relay.cut()
+    relay.thaw()
+    with pytest.raises(OutcomeUnknown, match=r"resync\(\)"):
+        await call
+
+
+async def lose_the_request(relay: Relay, call: asyncio.Task[Any]) -> None:
+    relay.freeze()
+    await relay.until_swallowed(MESSAGE)
+    relay.cut()
+    relay.thaw()
+    with pytest.raises(OutcomeUnknown):
+        await call
+
+
+async def test_a_step_whose_reply_was_lost_is_counted_and_not_repeated(client: URLabClient, relay: Relay) -> None:
+    session = client.session_id
+    await lose_the_reply(relay, asyncio.create_task(client.step(3)))
+    found = await client.resync()
+    assert (found.session_held, found.session_renewed, found.playing, found.settled) == (True, False, True, True)
+    assert (found.steps_sent, found.steps_applied, found.step) == (3, 3, 8)
+    assert found.time == client.sim_time == pytest.approx(0.016)
+    assert client.session_id == session
+    assert (await client.step()).step == client.step_count == 9
+
+
+async def test_a_step_that_never_arrived_is_shut_out_before_it_may_be_repeated(
+    client: URLabClient, relay: Relay
+) -> None:
+    session, arm = client.session_id, client.articulations["arm"]
+    await lose_the_request(relay, asyncio.create_task(client.step(3)))
+    found = await client.resync()
+    assert (found.session_held, found.session_renewed, found.settled) == (True, True, True)
+    assert (found.steps_sent, found.steps_applied) == (3, 0)
+    assert found.time == pytest.approx(0.01)
+    assert client.session_id != session
+    assert client.articulations["arm"] is arm
+    await client.step(3)
+    assert client.sim_time == pytest.approx(0.016)
+    assert arm.qpos_array.tolist() == client.data.qpos.tolist()  # type: ignore[union-attr]  # there is a model
+
+
+async def test_the_blocking_client_does_the_same(server: SimulatedServer, relay: Relay) -> None:
+    def drive(lost: asyncio.Event, loop: asyncio.AbstractEventLoop) -> tuple[Any, float]:
+        with urlab_client.URLabClient(**options(server, relay)) as client:
+            client.discover()
+            client.reset()
+            loop.call_soon_threadsafe(lost.set)
+            try:
+                while True:
+                    client.step(2)
+            except OutcomeUnknown:
+                return client.resync(), client.sim_time
+
+    ready = asyncio.Event()
+    blocking = asyncio.create_task(asyncio.to_thread(drive, ready, asyncio.get_running_loop()))
+    await ready.wait()
+    relay.hold_replies()
+    await relay.until_held(MESSAGE)
+    relay.cut()
+    relay.thaw()
+    found, time = await blocking
+    assert (found.session_held, found.steps_sent, found.steps_applied) == (True, 2, 2)
+    assert time == found.time == pytest.approx(found.step * 0.002)
+
+
+async def test_a_timed_out_and_a_cancelled_step_are_counted_together(client: URLabClient, relay: Relay) -> None:
+    relay.hold_replies()
+    with pytest.raises(URLabTimeoutError):
+        await client.step(2, timeout=0.05)
+    with pytest.raises(TimeoutError):
+        async with asyncio.timeout(0.05):
+            await client.step(4)
+    relay.thaw()
+    found = await client.resync()
+    assert (found.session_held, found.session_renewed) == (True, False), "the connection stood: nothing is on its way"
+    assert (found.steps_sent, found.steps_applied, found.step) == (6, 6, 11)
+
+
+async def test_a_refused_step_leaves_no_doubt(client: URLabClient) -> None:
+    await client.sim.stop()
+    with pytest.raises(urlab_client.NoActiveManager):
+        await client.step(3)
+    found = await client.resync()
+    assert (found.playing, found.steps_sent, found.steps_applied, found.settled) == (False, 0, 0, True)
+    await client.sim.start()
+    await client.step(3)
+
+
+async def test_steps_that_the_server_has_queued_stay_open(scripted: Any) -> None:
+    clock = {"time": 0.0, "step": 4.0, "sim_time": {"sec": 0.0, "nsec": 0.0}, "wall_time": {"sec": 0.0, "nsec": 0.0}}
+    scripted.on("step", {"op": "error", "code": "step_timeout", "message": ""})
+    scripted.on("forward", {"op": "forward_ok", **clock, "step": 0.0, "per_articulation": {}})
+    hello = scripted.answers["hello"]({}) | {"manager_present": True, "entities": {}}
+    scripted.on("hello", hello)
+    scripted.on("set_mode", {"op": "set_mode_ok", "previous_mode": "direct", "current_mode": "direct"})
+    async with URLabClient(f"tcp://127.0.0.1:{scripted.port}", step_mode="direct", local_model=False) as client:
+        await client.discover()
+        with pytest.raises(StepTimeout):
+            await client.step(3)
+        found = await client.resync()
+    assert (found.steps_sent, found.steps_applied, found.settled) == (3, 0, False)
+
+
+@pytest.mark.parametrize("lose", [lose_the_reply, lose_the_request])
+async def test_a_lost_reset_is_found_out(client: URLabClient, relay: Relay, lose: Any) -> None:
+    await lose(relay, asyncio.create_task(client.reset()))
+    found = await client.resync()
+    assert found.reset_applied is (lose is lose_the_reply)
+    assert found.session_renewed is (lose is lose_the_request)
+    assert found.time == client.sim_time == (0.0 if found.reset_applied else pytest.approx(0.01))
+
+
+@pytest.mark.parametrize("lose", [lose_the_reply, lose_the_request])
+async def test_a_lost_mode_change_is_made_certain(client: URLabClient, relay: Relay, lose: Any) -> None:
+    await client.runtime.set_mode("live")
+    await lose(relay, asyncio.create_task(client.runtime.set_mode("direct", timeout=5)))
+    assert client.step_mode == "live"
+    await client.resync()
+    assert client.step_mode == "direct"
+    before = client.sim_time
+    await client.step(4)
+    assert client.sim_time == pytest.approx(before + 0.008)
+
+
+async def test_a_lost_push_is_found_out_and_the_local_state_stays(client: URLabClient, relay: Relay) -> None:
+    await client.runtime.set_mode("puppet")
+    await client.step(1)
+    data = client.data
+    assert data is not None
+    pending = asyncio.create_task(client.step(10))
+    await lose_the_request(relay, pending)
+    local = data.time
+    found = await client.resync()
+    assert (found.steps_sent, found.steps_applied, found.session_renewed) == (1, 0, False)
+    assert (client.data is data, data.time) == (True, local)
+    await client.step(0)
+    assert client.sim_time == local
+    await client.runtime.set_mode("direct")
+
+
+async def test_a_wrench_acts_once(client: URLabClient, relay: Relay) -> None:
+    arm = client.articulations["arm"]
+    link = list(arm.bodies)[-1]
+
+    async def velocities(*, lost: bool) -> list[float]:
+        await client.reset()
+        arm.apply_xfrc(link, force=(0, 0, 5))
+        if lost:
+            await lose_the_reply(relay, asyncio.create_task(client.step()))
+            assert (await client.resync()).steps_applied == 1
+        else:
+            await client.step()
+        await client.step()
+        return arm.qvel_array.tolist()
+
+    assert await velocities(lost=True) == await velocities(lost=False)
+
+
+async def test_another_client_took_over(client: URLabClient, server: SimulatedServer) -> None:
+    async with URLabClient(**server.client_options()) as other:
+        await other.discover()
+        with pytest.raises(SessionTakenOver):
+            await client.step(2)
+        found = await client.resync()
+    assert (found.session_held, found.session_renewed) == (False, True)
+    await client.step()
+
+
+async def test_resync_of_an_unreachable_server_keeps_the_doubt(client: URLabClient, relay: Relay) -> None:
+    relay.refusing = True
+    await lose_the_reply(relay, asyncio.create_task(client.step(3)))
+    with pytest.raises(urlab_client.URLabConnectionError):
+        await client.resync(timeout=0.2)
+    relay.refusing = False
+    found = await client.resync()
+    assert (found.steps_sent, found.steps_applied) == (3, 3)
+
+
+def test_forward_changes_no_trajectory() -> None:
+    """What `resync` sends to learn the state must not disturb it."""
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><geom type="plane" size="1 1 1"/>
+        <body pos="0 0 .3" euler="20 30 0"><freejoint/><geom type="box" size=".1 .1 .1"/>
+        <body pos=".2 0 0"><joint axis="0 1 0"/><geom size=".05"/></body></body></worldbody></mujoco>"""
+    )
+    plain, disturbed = mujoco.MjData(model), mujoco.MjData(model)
+    for _ in range(400):
+        mujoco.mj_step(model, plain)
+        mujoco.mj_step(model, disturbed)
+        mujoco.mj_forward(model, disturbed)
+    assert plain.ncon > 0
+    assert np.array_equal(plain.qpos, disturbed.qpos)
+    assert np.array_equal(plain.qvel, disturbed.qvel)
