@@ -97,7 +97,7 @@ def test_each_test_finds_the_initial_state(pytester: pytest.Pytester) -> None:
     run(pytester, text).assert_outcomes(passed=6)
 
 
-def test_faults(pytester: pytest.Pytester) -> None:
+def test_faults_go_with_the_test(pytester: pytest.Pytester) -> None:
     text = """
         import pytest
         from urlab_client import URLabTimeoutError
