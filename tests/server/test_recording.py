@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -74,7 +76,7 @@ def test_102_nothing_to_save(bot: Wire) -> None:
     assert (reply["op"], reply["code"]) == ("error", "path_not_writable")
 
 
-@pytest.mark.parametrize("path", ["/etc/ep.json", "../../../ep.json", "a\0b"])
+@pytest.mark.parametrize("path", ["/etc/ep.json", "../../../ep.json", "a\0b", ".", "..", "inner/"])
 def test_files_elsewhere_are_refused(bot: Wire, path: str) -> None:
     bot.ask("recording_start")
     bot.ask("step")
@@ -130,7 +132,20 @@ def test_a_file_of_the_plugin(encoding: str) -> None:
     assert second.layout.joints == {}
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"Frames": 3}', '{"Frames": ['])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[]",
+        "{}",
+        '{"Frames": 3}',
+        '{"Frames": [',
+        '{"Frames": ' + 100_000 * "[",
+        '{"frames": [{"timestamp": 1' + 400 * "0" + "}]}",
+        '{"Frames": [{"timestamp": 1e400}]}',
+    ],
+    ids=lambda text: text[:30],
+)
 def test_no_recordings(text: str) -> None:
     with pytest.raises(ValueError, match=r"."):
         decode_json(text.encode())
@@ -143,3 +158,85 @@ def test_tables() -> None:
     assert [frame.time for frame in decode_csv(b"a\n1\n2\n")] == [0.0, 0.002]
     with pytest.raises(ValueError, match="row 2"):
         decode_csv(b"a,b\n1\n")
+    with pytest.raises(ValueError, match="no table"):
+        decode_csv(b"a\n" + 200_000 * b"x")
+
+
+def test_live_physics_is_recorded_step_by_step(serve: Serve, tmp_path: Path) -> None:
+    wire = serve("bot", play=True, saved_dir=tmp_path / "saved")
+    wire.ask("recording_start")
+    wire.ask("set_paused", paused=False)
+    for status in wire.until("pie_status"):
+        if status["sim_time"] > 0.05:
+            break
+    wire.ask("set_paused", paused=True)
+    stopped = wire.ask("recording_stop")
+    times = [frame["timestamp"] for frame in json.loads(saved(wire))["Frames"]]
+    assert len(times) == stopped["frame_count"]
+    assert np.allclose(times, 0.002 * np.arange(1, len(times) + 1))
+    assert stopped["sim_duration_s"] == pytest.approx(times[-1] - times[0])
+
+
+def test_pushes_are_recorded_one_by_one(serve: Serve, tmp_path: Path) -> None:
+    wire = serve("bot", play=True, saved_dir=tmp_path / "saved")
+    wire.ask("set_mode", mode="puppet")
+    wire.ask("recording_start", max_duration_s=-1)
+    for at in (0.5, 0.25, 7.0):
+        wire.ask("step", qpos=[0, 0, 1, 1, 0, 0, 0, at], time=at, n_steps=10)
+    assert wire.ask("recording_stop")["frame_count"] == 3
+    frames = json.loads(saved(wire))["Frames"]
+    assert [(frame["timestamp"], joint(frame, "_j")) for frame in frames] == [(at, [at]) for at in (0.5, 0.25, 7.0)]
+
+
+def test_clearing_goes_on_recording(bot: Wire) -> None:
+    bot.ask("recording_start")
+    bot.ask("step", n_steps=5)
+    bot.ask("recording_clear")
+    bot.ask("step", n_steps=3)
+    assert bot.ask("recording_stop")["frame_count"] == 3
+
+
+def saved(wire: Wire) -> bytes:
+    return Path(wire.ask("recording_save")["absolute_path"]).read_bytes()
+
+
+def joint(frame: dict[str, Any], suffix: str) -> list[float]:
+    (found,) = (state["qPos"] for name, state in frame["jointStates"].items() if name.endswith(suffix))
+    return found
+
+
+SAVER = """
+import os, random, signal, sys, time
+from pathlib import Path
+import numpy as np
+from urlab_client.server.content import write_atomic
+from urlab_client.server.recording import Frame, Layout, encode_json
+
+layout = Layout.of([("j", 1, 1)])
+file, chance = Path(sys.argv[1]), random.Random(0)
+
+def content(version):
+    return encode_json([Frame(float(version), layout, np.full(1, version), np.zeros(1))] * 2000)
+
+contents = [content(version) for version in range(8)]
+killed = 0
+for _ in range(60):
+    child = os.fork()
+    if child == 0:
+        while True:
+            for one in contents:
+                write_atomic(file, one)
+    time.sleep(chance.uniform(0.0, 0.02))
+    os.kill(child, signal.SIGKILL)
+    killed += os.WIFSIGNALED(os.waitpid(child, 0)[1])
+    if file.exists() and file.read_bytes() not in contents:
+        sys.exit("half a file")
+print(killed, file.exists())
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="processes are forked")
+def test_a_kill_while_saving_leaves_one_file_or_the_other(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", SAVER, str(tmp_path / "ep.json")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.stdout.strip(), done.stderr) == ("60 True", "")

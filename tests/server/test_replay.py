@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -82,6 +84,66 @@ def test_a_live_recording_comes_back_exactly(bot: Wire) -> None:
     assert np.allclose(played, recorded[1:], atol=1e-6)
     bot.ask("recording_start")
     assert bot.ask("step")["time"] == pytest.approx(0.002), "a recording ends the replay"
+
+
+def test_only_what_was_there_at_the_start_is_found(bot: Wire, replays: Path) -> None:
+    (replays / "later.json").write_bytes((replays / "ep.json").read_bytes())
+    os.mkfifo(replays / "fifo.json")  # to read it would block for ever
+    assert bot.ask("replay_list_sessions")["sessions"] == ["Live Recording", "ep", "table"]
+    bot.ask("stop_pie")
+    bot.ask("begin_pie")
+    assert bot.ask("replay_list_sessions")["sessions"] == ["Live Recording", "ep", "later", "table"]
+    assert bot.refused("replay_load", path="fifo.json") == "path_not_readable"
+
+
+def test_a_loaded_session_is_saved_as_it_is_and_replaces_its_namesake(bot: Wire, replays: Path) -> None:
+    bot.ask("replay_load", path="ep.json")
+    copy = Path(bot.ask("recording_save", path="copy.json")["absolute_path"])
+    original = json.loads((replays / "ep.json").read_text())["Frames"]
+    frames = json.loads(copy.read_text())["Frames"]
+    assert [frame["timestamp"] for frame in frames] == [frame["timestamp"] for frame in original]
+    assert [frame["jointStates"]["old_root"]["qPos"] for frame in frames] == [
+        frame["jointStates"]["old_root"]["qPos"] for frame in original
+    ]
+    (replays / "ep.json").write_text(json.dumps({"Frames": original[:1]}))
+    bot.ask("replay_load", path="ep.json")
+    bot.ask("set_mode", mode="direct")
+    assert bot.ask("replay_start")["total_frames"] == 1
+    assert bot.ask("step", n_steps=7)["replay"] == {"current_frame": 0.0, "total_frames": 1.0}
+    assert bot.ask("replay_list_sessions")["sessions"] == ["Live Recording", "ep", "table"]
+
+
+def test_one_robots_recording_drives_another_and_turns_along_the_arc(
+    serve: Callable[..., Wire], tmp_path: Path, replays: Path
+) -> None:
+    half = math.sqrt(0.5)
+    states = [
+        {"bot_C_7_root": {"qPos": [3, 4, 5, 1, 0, 0, 0]}, "bot_C_7_j": {"qPos": [0.0], "qVel": [2.0]}},
+        {"bot_C_7_root": {"qPos": [3, 4, 7, half, 0, 0, half]}, "bot_C_7_j": {"qPos": [1.0], "qVel": [3.0]}},
+    ]
+    frames = [{"timestamp": 5 + 0.006 * at, "jointStates": state} for at, state in enumerate(states)]
+    (replays / "turn.json").write_text(json.dumps({"Frames": frames}))
+    wire = serve("bot", play=True, saved_dir=tmp_path / "saved")
+    wire.ask("set_mode", mode="direct")
+    start = state(wire.ask("reset"))["qpos"][:3]
+    wire.ask("replay_load", path="turn.json")
+    wire.ask("replay_start")
+    third = state(wire.ask("step"))
+    angle = math.radians(90 / 3) / 2
+    assert third["qpos"] == pytest.approx([*start[:2], start[2] + 2 / 3, math.cos(angle), 0, 0, math.sin(angle), 1 / 3])
+    assert third["qvel"][-1] == 2.0, "velocities are those of the earlier frame"
+
+
+def test_a_replay_ends_with_the_mode_and_not_with_a_reset(bot: Wire) -> None:
+    bot.ask("set_mode", mode="direct")
+    bot.ask("replay_load", path="ep.json")
+    bot.ask("replay_start")
+    bot.ask("step")
+    bot.ask("reset")
+    assert bot.ask("step")["replay"]["current_frame"] == 1
+    bot.ask("set_mode", mode="live")
+    bot.ask("set_mode", mode="direct")
+    assert "replay" not in bot.ask("step")
 
 
 def test_nothing_to_play_and_nothing_to_stop(bot: Wire) -> None:

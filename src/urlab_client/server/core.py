@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import copy
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from urlab_client.server.markers import Drawings
 from urlab_client.server.observe import Observer
 from urlab_client.server.play import Play, Running
 from urlab_client.server.rendering import CameraStudio
+from urlab_client.server.replay import recordings, replay_folder
 from urlab_client.server.scene import ArticulationIndex, Scene, compile_scene
 from urlab_client.server.session import Session
 from urlab_client.server.viewport import Viewport
@@ -104,7 +105,7 @@ class ServerCore:
         def build() -> Running:
             scene = compile_scene(actors, honour_mjcf_options=physics.mjcf_options, camera_size=physics.camera_size)
             self.compiled = _Compiled(actors, scene, copy.copy(scene.model.opt))
-            return _run(scene, physics, _classes(actors))
+            return self._run(scene, actors)
 
         self.play.begin(build)
         self.world.pie_running = True
@@ -130,11 +131,30 @@ class ServerCore:
         def build() -> Running:
             data = mujoco.MjData(model)
             mujoco.mj_forward(model, data)
-            return _run(replace(compiled.scene, data=data), self.physics, _classes(actors))
+            return self._run(replace(compiled.scene, data=data), actors)
 
         self.play.begin(build)
         self.world.pie_running = True
         return self.play.wait(timeout) is PIEState.READY
+
+    def _run(self, scene: Scene, actors: Sequence[Actor]) -> Running:
+        physics = self.physics
+        files = recordings(replay_folder(self.world.content.root))
+        controllers = {index.key: config for index in scene.articulations if (config := physics.controller(index))}
+        _warn_of_strangers(scene, physics)
+        engine = Engine(scene, pinned_mode=physics.step_mode, paused=not physics.unpaused, controllers=controllers)
+        modes = {
+            (index.key, camera.name): physics.camera_mode(index, camera.name)
+            for index in scene.articulations
+            for camera in index.cameras
+        }
+        return Running(
+            scene,
+            engine.start(),
+            Observer(scene, engine.controls),
+            CameraStudio(scene, modes, {actor.name: _kind(actor) for actor in actors}),
+            files,
+        )
 
     def stop_play(self) -> None:
         """End play, if it runs."""
@@ -152,26 +172,10 @@ class _Compiled:
     options: mujoco.MjOption
 
 
-def _classes(actors: Iterable[Actor]) -> dict[str, str]:
-    return {actor.name: _kind(actor) for actor in actors}
-
-
 def _kind(actor: Actor) -> str:
     """Return what has one colour in a semantic image: the class, or the mesh."""
     mesh = actor.mesh
     return actor.class_name if mesh is None else Path(mesh.file).stem or mesh.shape
-
-
-def _run(scene: Scene, physics: PhysicsConfig, classes: Mapping[str, str]) -> Running:
-    controllers = {index.key: config for index in scene.articulations if (config := physics.controller(index))}
-    _warn_of_strangers(scene, physics)
-    engine = Engine(scene, pinned_mode=physics.step_mode, paused=not physics.unpaused, controllers=controllers)
-    modes = {
-        (index.key, camera.name): physics.camera_mode(index, camera.name)
-        for index in scene.articulations
-        for camera in index.cameras
-    }
-    return Running(scene, engine.start(), Observer(scene, engine.controls), CameraStudio(scene, modes, classes))
 
 
 def _warn_of_strangers(scene: Scene, physics: PhysicsConfig) -> None:

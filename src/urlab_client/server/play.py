@@ -9,9 +9,10 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Final
 
 from urlab_client.protocol.enums import PIEState
@@ -39,12 +40,14 @@ class Running:
         engine: What steps it; started.
         observer: What reads its state.
         cameras: What draws its cameras.
+        recordings: Files in the folder of recordings at the start.
     """
 
     scene: Scene
     engine: Engine
     observer: Observer
     cameras: CameraStudio
+    recordings: Sequence[Path] = ()
 
     @cached_property
     def options(self) -> OptionOverrides:
@@ -54,7 +57,7 @@ class Running:
     @cached_property
     def sessions(self) -> ReplaySessions:
         """The recorded sessions."""
-        return ReplaySessions(self.scene)
+        return ReplaySessions(self.scene, self.recordings)
 
     def close(self, timeout: float = 1.0) -> bool:
         """End it within about `timeout` seconds; return False when something was still busy then."""

@@ -175,7 +175,9 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
 
 def encode_json(frames: Iterable[Frame]) -> bytes:
     """Return the content of a recording file."""
-    return msgspec.json.encode(_File([_to_file(frame) for frame in frames]))
+    # Frame by frame: one call for all of them would keep physics from running for as long as it takes.
+    encode = msgspec.json.Encoder().encode
+    return b"".join((b'{"Frames":[', b",".join(encode(_to_file(frame)) for frame in frames), b"]}"))
 
 
 def _to_file(frame: Frame) -> _Frame:
@@ -192,9 +194,12 @@ def decode_json(content: bytes) -> list[Frame]:
     """
     text = _text(content)
     try:
-        frames = msgspec.json.decode(text, type=_File).Frames
-    except msgspec.ValidationError:
-        frames = _read_loosely(msgspec.json.decode(text))
+        try:
+            frames = msgspec.json.decode(text, type=_File).Frames
+        except msgspec.ValidationError:
+            frames = _read_loosely(msgspec.json.decode(text))
+    except (RecursionError, OverflowError) as error:
+        raise ValueError(f"it is no recording: {error}") from None
     made: dict[tuple[tuple[str, int, int], ...], Layout] = {}
     return [_from_file(frame, made) for frame in frames]
 
@@ -253,7 +258,10 @@ def decode_csv(content: bytes) -> list[Frame]:
     Raises:
         ValueError: It has no header, or a cell is no number.
     """
-    rows = [row for row in csv.reader(io.StringIO(_text(content))) if row]
+    try:
+        rows = [row for row in csv.reader(io.StringIO(_text(content))) if row]
+    except csv.Error as error:
+        raise ValueError(f"it is no table: {error}") from None
     if not rows:
         raise ValueError("the table is empty")
     header = [name.strip() for name in rows[0]]

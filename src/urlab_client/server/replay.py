@@ -26,7 +26,7 @@ from urlab_client.server.recording import (
 )
 from urlab_client.server.scene import Scene
 
-__all__ = ["Player", "ReplaySessions"]
+__all__ = ["Player", "ReplaySessions", "recordings", "replay_folder"]
 
 logger = logging.getLogger("urlab_client.server")
 
@@ -192,11 +192,17 @@ class ReplaySessions:
         active: Name of the session that is saved and played.
     """
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, files: Sequence[Path] = ()) -> None:
+        """Start with an empty recording.
+
+        Args:
+            scene: What is recorded.
+            files: The recordings that were there when play started; `scan` loads them.
+        """
         self.live = LiveRecording(scene)
         self.active = LIVE_SESSION
         self._loaded: dict[str, list[Frame]] = {}
-        self._scanned = False
+        self._unread = files
 
     @property
     def names(self) -> list[str]:
@@ -208,17 +214,14 @@ class ReplaySessions:
         """The frames of the active session."""
         return list(self.live.frames) if self.active == LIVE_SESSION else self._loaded[self.active]
 
-    def scan(self, folder: Path) -> None:
-        """Load all recordings of the replay directory, once; what cannot be read is logged and left out."""
-        if self._scanned:
-            return
-        self._scanned = True
-        for file in sorted(folder.glob("*")):
-            if file.suffix.casefold() in (".json", ".csv"):
-                try:
-                    self._loaded[file.stem] = read_frames(file)
-                except (OSError, ValueError) as error:
-                    logger.warning("%s is no recording and left out: %s", file, error)
+    def scan(self) -> None:
+        """Load the recordings that were there at the start, once; what cannot be read is logged and left out."""
+        unread, self._unread = self._unread, ()
+        for file in unread:
+            try:
+                self._loaded[file.stem] = read_frames(file)
+            except (OSError, ValueError) as error:
+                logger.warning("%s is no recording and left out: %s", file, error)
 
     def load(self, file: Path) -> str:
         """Load a file as a session of its stem, make it active and return the name.
@@ -242,12 +245,24 @@ class ReplaySessions:
         return found is not None
 
 
+def replay_folder(root: Path) -> Path:
+    """Return the folder of recordings below a content root."""
+    return root / "URLab" / "Replays"
+
+
+def recordings(folder: Path) -> list[Path]:
+    """Return the files of a folder that look like recordings."""
+    return sorted(file for file in folder.glob("*") if file.suffix.casefold() in (".json", ".csv"))
+
+
 def read_frames(file: Path) -> list[Frame]:
     """Read a recording.
 
     Raises:
         OSError, ValueError: It cannot be read, or is no recording.
     """
+    if file.exists() and not file.is_file():
+        raise ValueError("it is no regular file")
     size = file.stat().st_size
     if size > MAX_FILE_BYTES:
         raise ValueError(f"{size} bytes exceed the limit {MAX_FILE_BYTES}")

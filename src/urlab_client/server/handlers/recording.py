@@ -36,20 +36,16 @@ from urlab_client.server.dispatch import handles
 from urlab_client.server.play import Running
 from urlab_client.server.recording import LIVE_SESSION, duration, encode_json
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.replay import Player, ReplaySessions
+from urlab_client.server.replay import Player, ReplaySessions, replay_folder
 from urlab_client.server.requests import need
 
 UNLIMITED_S: Final = 3.4028234663852886e38
 """The largest float32."""
 
 
-def _folder(server: ServerCore) -> Path:
-    return server.world.content.root / "URLab" / "Replays"
-
-
 def _sessions(server: ServerCore) -> tuple[Running, ReplaySessions]:
     running = server.play.running()
-    running.sessions.scan(_folder(server))
+    running.sessions.scan()
     return running, running.sessions
 
 
@@ -61,11 +57,14 @@ def _locate(server: ServerCore, path: str, code: str) -> Path:
     """
     content = server.world.content
     try:
-        file = Path(os.path.abspath(_folder(server) / path))
+        folder = replay_folder(content.root)
+        file = Path(os.path.abspath(folder / path))
         real = file.resolve()
     except (OSError, ValueError, RuntimeError) as error:  # too long, a null byte, a loop of links
         raise Refusal(code, f"{path!r} is no usable path: {error}", absolute_path=path) from None
     roots = (content.root, *content.model_roots)
+    if path.endswith(("/", os.sep)) or folder.is_relative_to(real) or real.is_dir():
+        raise Refusal(code, f"{file} is a folder", absolute_path=str(file))
     if not any(real.is_relative_to(root) and real != root for root in roots):
         text = ", ".join(map(str, roots))
         raise Refusal(code, f"{file} lies outside the folders of recordings ({text})", absolute_path=str(file))
