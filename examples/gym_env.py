@@ -1,0 +1,23 @@
+"""A Gymnasium environment over a simulated server: a proportional controller for the arm, and a picture of the end."""
+
+from pathlib import Path
+
+import gymnasium
+import matplotlib.image
+import numpy as np
+
+import urlab_client.integrations.gym  # registers the environments  # noqa: F401
+
+env = gymnasium.make("urlab/Arm-v0", render_mode="rgb_array", render_camera="arm/overview")
+observation, info = env.reset(seed=1)
+arm = info["articulations"]["arm"]
+target = np.array([0.52, -0.1, 0.15, 0.0, -0.05, 0.0, 0.04], dtype=np.float32)
+score = 0.0
+for _ in range(env.spec.max_episode_steps):
+    observation, reward, terminated, truncated, info = env.step(target)
+    score += reward
+    if terminated or truncated:
+        break
+print(f"score {score:.1f} after {info['sim_time']:.1f} s, hand at {np.round(arm.get_sensors()['grip_position'], 2)}")
+matplotlib.image.imsave(Path("arm.png"), env.render())
+env.close()

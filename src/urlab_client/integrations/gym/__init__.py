@@ -1,0 +1,23 @@
+"""Gymnasium environments: `URLabEnv` over one client, `URLabVectorEnv` over many, `URLabBatchEnv` without a wire.
+
+Needs the extra `gym`. Importing this package registers the environments of `tasks`, for `gymnasium.make`.
+"""
+
+from urlab_client.integrations.gym.batch import URLabBatchEnv
+from urlab_client.integrations.gym.env import RewardFn, TerminationFn, URLabEnv
+from urlab_client.integrations.gym.spaces import SpaceMapping, SpaceMode
+from urlab_client.integrations.gym.tasks import TASKS, register
+from urlab_client.integrations.gym.vector import URLabVectorEnv
+
+__all__ = [
+    "TASKS",
+    "RewardFn",
+    "SpaceMapping",
+    "SpaceMode",
+    "TerminationFn",
+    "URLabBatchEnv",
+    "URLabEnv",
+    "URLabVectorEnv",
+]
+
+register()

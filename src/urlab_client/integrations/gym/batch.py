@@ -1,0 +1,168 @@
+"""`URLabBatchEnv`: the robots of a scene stepped in batch by MuJoCo itself, without a wire."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any
+
+import mujoco
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from mujoco.batch import Batch
+from numpy.typing import NDArray
+
+from urlab_client.aio.layout import ArticulationLayout
+from urlab_client.aio.mirror import model_names
+from urlab_client.integrations.gym.env import RewardFn, TerminationFn
+from urlab_client.integrations.gym.episode import fields_of
+from urlab_client.integrations.gym.spaces import Field, Observation, SpaceMapping, SpaceMode
+from urlab_client.integrations.gym.vectorized import Floats, Indices, Vectorized
+from urlab_client.protocol.errors import UnknownKeyframe, URLabError
+from urlab_client.sync.client import URLabClient
+
+__all__ = ["URLabBatchEnv"]
+
+
+class URLabBatchEnv(Vectorized):
+    """Many copies of one scene in this process, stepped by `mujoco.batch` on a thread pool.
+
+    The scene is what a server compiles: it is fetched once, and the server is not needed any more. Observations,
+    rewards and autoreset are those of `URLabVectorEnv`, bit for bit for the same seeds and actions, as long as no
+    controller is attached and no wrench is applied; there are no cameras.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        num_envs: int,
+        *,
+        space_mode: SpaceMode = "flat",
+        observations: str | Sequence[str] = "standard",
+        reward_fn: RewardFn | None = None,
+        termination_fn: TerminationFn | None = None,
+        max_episode_steps: int | None = None,
+        n_substeps: int = 1,
+        reset_noise: float = 0.0,
+        autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
+        n_threads: int = 0,
+        client_options: Mapping[str, Any] = MappingProxyType({}),
+    ) -> None:
+        """Fetch the scene and make the batch.
+
+        Args:
+            address: Where the scene comes from: `sim://MODEL`, or a server during play.
+            num_envs: Number of copies.
+            space_mode: See `URLabEnv`, here and for the arguments down to `n_substeps`.
+            observations: See `URLabEnv`.
+            reward_fn: See `URLabVectorEnv`.
+            termination_fn: See `URLabVectorEnv`.
+            max_episode_steps: See `URLabEnv`.
+            n_substeps: See `URLabEnv`.
+            reset_noise: See `URLabEnv`.
+            autoreset_mode: `NEXT_STEP`, `SAME_STEP` or `DISABLED`.
+            n_threads: Threads that step, the caller's included; 0 for one per processor.
+            client_options: Further options of the client that fetches the scene.
+
+        Raises:
+            URLabError: The scene cannot be fetched, or an articulation has a controller.
+            ValueError: An option out of range.
+        """
+        if num_envs < 1 or n_substeps < 1 or reset_noise < 0:
+            raise ValueError("num_envs and n_substeps are at least 1, and reset_noise is 0 or more")
+        model, keys = _fetch(address, {"step_mode": "direct", **client_options})
+        mapping = SpaceMapping(model, keys, fields_of(observations), space_mode)
+        super().__init__(
+            num_envs=num_envs,
+            mapping=mapping,
+            observation_space=mapping.observation_space,
+            reward_fn=reward_fn,
+            termination_fn=termination_fn,
+            max_episode_steps=max_episode_steps,
+            autoreset_mode=autoreset_mode,
+        )
+        self.model = model
+        self._n_substeps = n_substeps
+        self._noise = reset_noise
+        self._batch = Batch(model, num_envs, n_threads)
+        # Bound before the first call: a derived field is computed only where somebody looks at it.
+        self._arrays = {name: self._batch.bind(name) for name in ("qpos", "qvel", "ctrl", "act", "sensordata", "time")}
+        self._keyframes = {name: i for i, name in enumerate(model_names(model, "key"))}
+        self._noisy = {
+            key: model.jnt_qposadr[[mapping.layout(key).joints[name] for name in mapping.joint_names(key, model)]]
+            for key in mapping.keys
+        }
+        self._sensors = {key: _sensor_addresses(model, mapping.layout(key)) for key in mapping.keys}
+        self._step_count = np.zeros(num_envs, dtype=np.int64)
+
+    def _reset_some(self, indices: Indices, keyframe: str | None) -> tuple[Observation, Mapping[int, Exception]]:
+        self._batch.reset(indices, -1 if keyframe is None else self._keyframe_id(keyframe))
+        if self._noise:
+            qpos = self._arrays["qpos"]
+            for i in map(int, indices):
+                for key in self.mapping.keys:
+                    address = self._noisy[key]
+                    qpos[i, address] += self._rngs[i].uniform(-self._noise, self._noise, len(address))
+            self._batch.forward(indices)
+        self._step_count[indices] = 0
+        return self._observe(indices), {}
+
+    def _step_some(self, indices: Indices, actions: Any) -> tuple[Observation, Mapping[int, Exception]]:
+        ctrl = self._arrays["ctrl"]
+        for key, values in self.mapping.set_points(actions).items():
+            ctrl[np.ix_(indices, self.mapping.layout(key).ctrl_adr)] = values[indices]
+        self._batch.step(indices, nstep=self._n_substeps)
+        self._step_count[indices] += self._n_substeps
+        return self._observe(indices), {}
+
+    def _clocks(self) -> dict[str, NDArray[Any]]:
+        return {"sim_time": self._arrays["time"].copy(), "step_count": self._step_count.copy()}
+
+    def _observe(self, indices: Indices) -> Observation:
+        def read(key: str, field: Field) -> Floats:
+            return self._read(self.mapping.layout(key), self._sensors[key], field)[indices]
+
+        return self.mapping.observe(read)
+
+    def _read(self, layout: ArticulationLayout, sensors: Indices, field: Field) -> Floats:
+        match field:
+            case "qpos":
+                return self._arrays["qpos"][:, layout.qpos_adr]
+            case "qvel":
+                return self._arrays["qvel"][:, layout.qvel_adr]
+            case "ctrl":
+                return self._arrays["ctrl"][:, layout.ctrl_adr]
+            case "act":
+                act = np.zeros((self.num_envs, len(layout.ctrl_adr)))
+                act[:, layout.act_from] = self._arrays["act"][:, layout.act_adr]
+                return act
+            case "sensors":
+                return self._arrays["sensordata"][:, sensors]
+
+    def _keyframe_id(self, name: str) -> int:
+        found = [full for full in self._keyframes if full in {name, *(f"{key}_{name}" for key in self.mapping.keys)}]
+        if len(found) != 1:
+            raise UnknownKeyframe(
+                "unknown_keyframe", f"{name!r} is none of, or several of, {', '.join(self._keyframes) or 'none'}"
+            )
+        return self._keyframes[found[0]]
+
+
+def _fetch(address: str, client_options: Mapping[str, Any]) -> tuple[mujoco.MjModel, list[str]]:
+    with URLabClient(address, **client_options) as client:
+        client.discover()
+        controlled = [key for key, articulation in client.articulations.items() if articulation.controller is not None]
+        if controlled:
+            raise URLabError(
+                f"{', '.join(controlled)} has a controller, which runs on a server only.",
+                hint="Use URLabVectorEnv, or serve the scene without controllers.",
+            )
+        model = client.model
+        if model is None or not client.articulations:
+            raise URLabError(f"There is no articulation at {address}.", hint="Start play first.")
+        return model, list(client.articulations)
+
+
+def _sensor_addresses(model: mujoco.MjModel, layout: ArticulationLayout) -> Indices:
+    ranges = [np.arange(model.sensor_dim[i], dtype=np.intp) + model.sensor_adr[i] for i in layout.sensors.values()]
+    return np.concatenate(ranges) if ranges else np.zeros(0, dtype=np.intp)

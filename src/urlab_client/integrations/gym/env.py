@@ -1,0 +1,220 @@
+"""`URLabEnv`: a Gymnasium environment over one client."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Coroutine, Sequence
+from typing import Any, Final, Literal, TypeVar
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from urlab_client.integrations.gym.episode import Episode
+from urlab_client.integrations.gym.spaces import Observation, SpaceMapping, SpaceMode
+from urlab_client.protocol.enums import CameraMode
+from urlab_client.sync._portal import aio_of
+from urlab_client.sync.client import URLabClient
+
+__all__ = ["RewardFn", "TerminationFn", "URLabEnv", "keyframe_option"]
+
+T = TypeVar("T")
+
+RewardFn = Callable[[Observation, Any, Observation, dict[str, Any]], Any]
+"""`(observation, action, next_observation, info) -> reward`."""
+
+TerminationFn = Callable[[Observation, dict[str, Any]], Any]
+"""`(observation, info) -> terminated`."""
+
+_FALLBACK_FPS: Final = 50.0
+
+
+class URLabEnv(gymnasium.Env[Observation, Any]):
+    """A Gymnasium environment over a discovered client in `direct` or `puppet` mode.
+
+    An action holds the set-points of all actuators, for `n_substeps` physics steps; an observation holds what
+    `observations` names (see `SpaceMapping`). `info` carries `client`, `articulations`, `entities`, `step_count`
+    (physics steps since the reset) and `sim_time` (seconds).
+
+    A reset puts the simulation into its initial state, or into the keyframe that `options={"keyframe": NAME}` names,
+    clears the set-points, and with `reset_noise` moves hinge and slide joints by uniform noise. The noise is all that
+    depends on the seed. Physics is deterministic: the same seed and actions give the same observations, bit for bit,
+    on the same build of MuJoCo.
+
+    `render_mode="rgb_array"` makes `render` return the frame of `render_camera`. It is drawn with each step, which
+    costs time; images never change the physics.
+
+    Attributes:
+        client: The client.
+        reward_fn: The reward function, or None for rewards of 0.
+        termination_fn: The termination function, or None for episodes that never end by themselves.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": _FALLBACK_FPS}  # noqa: RUF012 - Gymnasium's
+
+    def __init__(
+        self,
+        client: URLabClient,
+        *,
+        space_mode: SpaceMode = "flat",
+        observations: str | Sequence[str] = "standard",
+        reward_fn: RewardFn | None = None,
+        termination_fn: TerminationFn | None = None,
+        max_episode_steps: int | None = None,
+        cameras: Sequence[str] = (),
+        n_substeps: int = 1,
+        render_mode: Literal["rgb_array"] | None = None,
+        render_camera: str | None = None,
+        reset_noise: float = 0.0,
+        owns_client: bool = False,
+    ) -> None:
+        """Make an environment.
+
+        Args:
+            client: A client after `discover()`, during play.
+            space_mode: `flat` for one array, `dict` for dictionaries by articulation and field.
+            observations: An observation level, `minimal` (qpos, qvel) or `standard` (adds ctrl, act, sensors), or a
+                sequence of those fields.
+            reward_fn: Called with the observation before, the action, the observation after, and `info`; 0 without.
+            termination_fn: Called with the observation after and `info`; episodes never end by themselves without.
+            max_episode_steps: Actions after which an episode is truncated; None for endless ones.
+            cameras: Cameras whose frames are part of the observation, under `cameras`, as `ARTICULATION/CAMERA` or as
+                the name of a scene-level one; with `space_mode="dict"` only.
+            n_substeps: Physics steps per action.
+            render_mode: None or `rgb_array`.
+            render_camera: Camera that `render` shows; the first one of the scene by default.
+            reset_noise: Largest deviation of hinge and slide joints at a reset, radians or metres.
+            owns_client: Close the client with the environment.
+
+        Raises:
+            URLabError: The client has no model, no articulation, or is in live mode.
+            KeyError: An unknown camera.
+            ValueError: An option out of range, or rendering of a scene without a camera.
+        """
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"render_mode is None or 'rgb_array', not {render_mode!r}")
+        if max_episode_steps is not None and max_episode_steps < 1:
+            raise ValueError(f"max_episode_steps is at least 1 or None, not {max_episode_steps}")
+        self.client = client
+        self.render_mode = render_mode
+        self._rendered = () if render_mode is None else (render_camera or _first_camera(client),)
+        self._episode = Episode(
+            aio_of(client),
+            space_mode=space_mode,
+            observations=observations,
+            cameras=cameras,
+            rendered=self._rendered,
+            n_substeps=n_substeps,
+            reset_noise=reset_noise,
+        )
+        self.action_space = self.mapping.action_space
+        self.observation_space = self._episode.observation_space
+        model = client.model
+        self.metadata = {
+            **self.metadata,
+            "render_fps": 1.0 / (model.opt.timestep * n_substeps) if model else _FALLBACK_FPS,
+        }
+        self.reward_fn = reward_fn
+        self.termination_fn = termination_fn
+        self._max_episode_steps = max_episode_steps
+        self._owns_client = owns_client
+        self._observation: Observation = None
+        self._elapsed = 0
+
+    @property
+    def mapping(self) -> SpaceMapping:
+        """The client's articulations as spaces."""
+        return self._episode.mapping
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode.
+
+        Args:
+            seed: Seeds the noise; None goes on with the present generator.
+            options: `keyframe`: name of the keyframe to start from.
+
+        Raises:
+            ValueError: An unknown option.
+            UnknownKeyframe: No keyframe, or more than one, has this name.
+        """
+        super().reset(seed=seed)
+        keyframe = keyframe_option(options)
+        self._observation = self._run(self._episode.reset(self.np_random, keyframe))
+        self._elapsed = 0
+        return self._observation, self._info()
+
+    def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Act for `n_substeps` physics steps.
+
+        Raises:
+            gymnasium.error.ResetNeeded: There was no reset yet.
+            ValueError: The action does not fit; nothing was sent.
+        """
+        if self._observation is None:
+            raise gymnasium.error.ResetNeeded("call reset() before step()")
+        before = self._observation
+        after = self._observation = self._run(self._episode.step(action))
+        self._elapsed += 1
+        info = self._info()
+        reward = 0.0 if self.reward_fn is None else float(self.reward_fn(before, action, after, info))
+        terminated = self.termination_fn is not None and bool(self.termination_fn(after, info))
+        truncated = self._max_episode_steps is not None and self._elapsed >= self._max_episode_steps
+        return after, reward, terminated, truncated, info
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]  # Gymnasium's base names frames of all kinds
+        """Return the frame of the last reset or step, shape (H, W, 3), RGB; None without a render mode.
+
+        Raises:
+            gymnasium.error.ResetNeeded: There was no reset yet.
+        """
+        if not self._rendered:
+            gymnasium.logger.warn("render() without a render mode: make the environment with render_mode='rgb_array'")
+            return None
+        frame = self._episode.frames.get(self._rendered[0])
+        if frame is None:
+            raise gymnasium.error.ResetNeeded("call reset() before render()")
+        return np.array(frame[..., :3], dtype=np.uint8)
+
+    def close(self) -> None:
+        """Close the client, if it was made for this environment."""
+        if self._owns_client:
+            self.client.close()
+        super().close()
+
+    def _run(self, coro: Coroutine[Any, Any, T]) -> T:
+        return self.client._portal.call(coro)  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
+
+    def _info(self) -> dict[str, Any]:
+        client = self.client
+        return {
+            "client": client,
+            "articulations": dict(client.articulations),
+            "entities": dict(client.entities),
+            "step_count": client.step_count,
+            "sim_time": client.sim_time,
+        }
+
+
+def keyframe_option(options: dict[str, Any] | None) -> str | None:
+    """Return the keyframe that the options of a reset name.
+
+    Raises:
+        ValueError: An unknown option.
+    """
+    unknown = set(options or {}) - {"keyframe"}
+    if unknown:
+        raise ValueError(f"unknown reset options {', '.join(sorted(unknown))}; there is 'keyframe'")
+    return None if options is None else options.get("keyframe")
+
+
+def _first_camera(client: URLabClient) -> str:
+    """Return the first camera that shows colours."""
+    for key, articulation in client.articulations.items():
+        for name, view in articulation.cameras.items():
+            if view.mode == CameraMode.REAL:
+                return f"{key}/{name}"
+    for name, view in client.global_cameras.items():
+        if view.mode == CameraMode.REAL:
+            return name
+    raise ValueError("the scene has no colour camera to render: add one to its MJCF, or use render_mode=None")

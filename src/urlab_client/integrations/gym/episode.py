@@ -1,0 +1,217 @@
+"""Episodes over one async client: what a single environment and each session of a vector environment do the same."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
+
+import numpy as np
+from gymnasium import spaces
+
+from urlab_client.aio.cameras import URLabCameraView
+from urlab_client.aio.client import URLabClient
+from urlab_client.integrations.gym.spaces import LEVELS, Field, Observation, Space, SpaceMapping, SpaceMode, dict_space
+from urlab_client.protocol.base import Floats
+from urlab_client.protocol.enums import CameraMode, ObservationLevel, StepMode
+from urlab_client.protocol.errors import URLabError
+from urlab_client.protocol.rows import Pixels
+
+__all__ = ["Episode"]
+
+
+def fields_of(observations: str | Sequence[str]) -> tuple[Field, ...]:
+    """Return the fields meant by an observation level, or by their names.
+
+    Raises:
+        ValueError: An unknown level.
+    """
+    if not isinstance(observations, str):
+        return tuple(observations)  # type: ignore[return-value]  # SpaceMapping refuses unknown names
+    if observations not in LEVELS:
+        raise ValueError(
+            f"observations is {' or '.join(map(repr, LEVELS))}, or a sequence of fields, not {observations!r}"
+        )
+    return LEVELS[observations]
+
+
+class Episode:
+    """One client that is reset and stepped as an environment.
+
+    Attributes:
+        client: The client, discovered and in `direct` or `puppet` mode.
+        mapping: Its articulations as spaces.
+        observation_space: That of the mapping, with `cameras` added where there are any.
+        frames: The last frames by camera, as they were asked for.
+    """
+
+    def __init__(
+        self,
+        client: URLabClient,
+        *,
+        space_mode: SpaceMode,
+        observations: str | Sequence[str],
+        cameras: Sequence[str],
+        rendered: Sequence[str],
+        n_substeps: int,
+        reset_noise: float,
+    ) -> None:
+        """Describe the episodes of a client.
+
+        Args:
+            client: The client.
+            space_mode: `flat` or `dict`.
+            observations: `minimal`, `standard`, or a sequence of fields.
+            cameras: Cameras whose frames come with each observation, `ARTICULATION/CAMERA` or a scene-level name.
+            rendered: Further cameras whose frames are to be in `frames`.
+            n_substeps: Physics steps per action.
+            reset_noise: Largest deviation of hinge and slide joints at a reset, radians or metres.
+
+        Raises:
+            URLabError: The client has no model, no articulation, or is in live mode.
+            KeyError: An unknown camera.
+            ValueError: An option out of range.
+        """
+        if n_substeps < 1:
+            raise ValueError(f"n_substeps is at least 1, not {n_substeps}")
+        if not 0 <= reset_noise < np.inf:
+            raise ValueError(f"reset_noise is 0 or more, not {reset_noise}")
+        model = client.model
+        if model is None or not client.articulations:
+            raise URLabError(
+                "The client knows no articulation to act on.",
+                hint="Start play and call discover() first, with local_model=True.",
+            )
+        if client.step_mode not in (StepMode.DIRECT, StepMode.PUPPET):
+            raise URLabError(
+                f"An environment steps physics itself, but the step mode is {client.step_mode}.",
+                hint="Make the client with step_mode='direct'.",
+            )
+        self.client = client
+        self.frames: dict[str, Pixels] = {}
+        self._model = model
+        fields = fields_of(observations)
+        self.mapping = SpaceMapping(model, list(client.articulations), fields, space_mode)
+        minimal = set(fields) <= set(LEVELS["minimal"])
+        self.observation_space = self._with_cameras(cameras)
+        self._observed_cameras = tuple(cameras)
+        self._level = ObservationLevel.MINIMAL if minimal else ObservationLevel.STANDARD
+        self._cameras = {name: client_camera(client, name) for name in (*cameras, *rendered)}
+        self._n_substeps = n_substeps
+        self._noise = reset_noise
+
+    async def reset(self, rng: np.random.Generator, keyframe: str | None = None) -> Observation:
+        """Reset the simulation and return the first observation; set-points become zero."""
+        client = self.client
+        for articulation in client.articulations.values():
+            articulation.ctrl_array[:] = 0.0
+        await client.reset(keyframe)
+        overrides = self._noisy_positions(rng) if self._noise else None
+        if overrides:
+            await client.reset(keyframe, per_articulation_qpos=overrides)
+        if self._cameras:
+            await self._look(keyframe, overrides)
+        return self._observe()
+
+    async def step(self, action: Any) -> Observation:
+        """Apply an action for `n_substeps` and return the observation after it.
+
+        Raises:
+            ValueError: The action does not fit; nothing was sent.
+        """
+        for key, values in self.mapping.set_points(action).items():
+            self.client.articulations[key].ctrl_array[:] = values
+        await self.client.step(
+            self._n_substeps, include_cameras=dict.fromkeys(self._cameras, "sync") or False, observations=self._level
+        )
+        self._take_frames()
+        return self._observe()
+
+    def _noisy_positions(self, rng: np.random.Generator) -> dict[str, dict[str, float]]:
+        """Return the present joint positions with noise on them."""
+        positions: dict[str, dict[str, float]] = {}
+        for key in self.mapping.keys:
+            articulation = self.client.articulations[key]
+            names = self.mapping.joint_names(key, self._model)
+            offsets = rng.uniform(-self._noise, self._noise, len(names))
+            present = articulation.get_qpos()
+            positions[key] = {name: present[name] + float(offset) for name, offset in zip(names, offsets, strict=True)}
+        return positions
+
+    async def _look(self, keyframe: str | None, overrides: Mapping[str, Mapping[str, float]] | None) -> None:
+        """Take the frames of the state as it is. Only a puppet step draws without integrating.
+
+        It leaves traces in the solver's warm start, so the reset is done once more: rollouts are the same with and
+        without cameras.
+        """
+        client, mode = self.client, self.client.step_mode
+        if mode is not StepMode.PUPPET:
+            await client.runtime.set_mode(StepMode.PUPPET)
+        await client.step(0, include_cameras=dict.fromkeys(self._cameras, "sync"))
+        self._take_frames()
+        if mode is not StepMode.PUPPET:
+            await client.runtime.set_mode(mode)
+            await client.reset(keyframe, per_articulation_qpos=overrides)
+
+    def _take_frames(self) -> None:
+        for name, view in self._cameras.items():
+            frame = view.latest_frame
+            if frame is None or not view.delivered:
+                raise URLabError(
+                    f"The server sent no frame of camera {name!r}.",
+                    hint="`urlab doctor` says whether the server can draw.",
+                )
+            self.frames[name] = frame
+
+    def _observe(self) -> Observation:
+        observation = self.mapping.observe(self._read)
+        if self._observed_cameras:
+            observation["cameras"] = {name: self.frames[name] for name in self._observed_cameras}
+        return observation
+
+    def _with_cameras(self, cameras: Sequence[str]) -> Space:
+        mapping = self.mapping
+        if not cameras:
+            return mapping.observation_space
+        if mapping.mode != "dict":
+            raise ValueError("images do not fit into a flat observation: use space_mode='dict' with cameras")
+        if "cameras" in mapping.keys:
+            raise ValueError("an articulation is called 'cameras', which is where images go: give it another actor id")
+        images = {name: camera_space(client_camera(self.client, name)) for name in cameras}
+        observed = cast("Mapping[str, Space]", mapping.observation_space)
+        return dict_space({**observed, "cameras": dict_space(images)})
+
+    def _read(self, key: str, field: Field) -> Floats:
+        articulation = self.client.articulations[key]
+        match field:
+            case "qpos":
+                return articulation.qpos_array
+            case "qvel":
+                return articulation.qvel_array
+            case "ctrl":
+                return articulation.last_applied_ctrl
+            case "act":
+                return articulation.act_array
+            case "sensors":
+                readings = articulation.get_sensors()
+                found = [np.atleast_1d(readings[name]) for name in self.mapping.layout(key).sensors]
+                return np.concatenate(found) if found else np.zeros(0)
+
+
+def client_camera(client: URLabClient, name: str) -> URLabCameraView:
+    """Return a camera by `ARTICULATION/CAMERA`, or a scene-level one by its name.
+
+    Raises:
+        KeyError: There is no such camera.
+    """
+    key, slash, camera = name.partition("/")
+    if slash:
+        return client.articulations[key].cameras[camera]
+    return client.global_cameras[name]
+
+
+def camera_space(view: URLabCameraView) -> Space:
+    """Return the space of a camera's frames: metres for depth, else four bytes per pixel."""
+    width, height = view.resolution
+    if view.mode == CameraMode.DEPTH:
+        return spaces.Box(0.0, np.inf, (height, width), dtype=np.float32)
+    return spaces.Box(0, 255, (height, width, 4), dtype=np.uint8)

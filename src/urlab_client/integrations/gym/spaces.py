@@ -1,0 +1,176 @@
+"""What an agent sees and does: articulations as Gymnasium spaces, flat or as dictionaries, single or in batches."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
+
+import numpy as np
+from gymnasium import spaces
+
+from urlab_client.aio.layout import ArticulationLayout, articulation_layouts
+from urlab_client.protocol.base import Floats
+
+if TYPE_CHECKING:
+    import mujoco
+
+__all__ = ["FIELDS", "LEVELS", "Field", "Observation", "Space", "SpaceMapping", "SpaceMode", "dict_space"]
+
+SpaceMode = Literal["flat", "dict"]
+Field = Literal["qpos", "qvel", "ctrl", "act", "sensors"]
+Space = spaces.Space[Any]
+Observation = Any
+"""An array of shape (…, n) in flat mode, else a dictionary of arrays by articulation and field."""
+
+FIELDS: Final[tuple[Field, ...]] = get_args(Field)
+LEVELS: Final[Mapping[str, tuple[Field, ...]]] = {"minimal": ("qpos", "qvel"), "standard": FIELDS}
+"""Fields of the observation levels that consist of arrays."""
+
+_HINGE_AND_SLIDE: Final = (2, 3)
+
+
+@dataclass(frozen=True)
+class _Articulation:
+    layout: ArticulationLayout
+    low: Floats
+    high: Floats
+    widths: Mapping[Field, int]
+
+
+class SpaceMapping:
+    """How the articulations of a scene map to an action space and an observation space.
+
+    Actions are the set-points in `ctrl_array`, float32 as Gymnasium's own MuJoCo environments have them; their bounds
+    are the actuators' `ctrlrange`, infinite without one. Observations are float64 and unbounded: joints may overshoot
+    their ranges. Articulations come in the order of their keys in `client.articulations`, fields in the order asked
+    for. The flat spaces are the concatenation of the dictionaries' entries in that order.
+
+    Attributes:
+        keys: Articulation keys, in order.
+        fields: Observed fields, in order.
+        mode: `flat` or `dict`.
+        action_space: `Box(n,)`, or `Dict` of one `Box` per articulation.
+        observation_space: `Box(n,)`, or `Dict` of one `Dict` of fields per articulation.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, keys: Sequence[str], fields: Sequence[Field], mode: SpaceMode = "flat"
+    ) -> None:
+        """Map the articulations `keys` of a compiled scene.
+
+        Raises:
+            ValueError: An unknown field or mode, or nothing to observe.
+        """
+        unknown = [field for field in fields if field not in FIELDS]
+        if unknown or not fields:
+            raise ValueError(f"observations are one or more of {', '.join(FIELDS)}, not {list(fields)!r}")
+        if mode not in get_args(SpaceMode):
+            raise ValueError(f"space_mode is 'flat' or 'dict', not {mode!r}")
+        self.keys = tuple(keys)
+        self.fields = tuple(fields)
+        self.mode: SpaceMode = mode
+        layouts = articulation_layouts(model, list(keys))
+        self._parts = {key: _part(model, layouts[key]) for key in keys}
+        self._where = self._slices()
+        self.action_space = self._make_action_space()
+        self.observation_space = self._make_observation_space()
+
+    def layout(self, key: str) -> ArticulationLayout:
+        """Return where an articulation's values live in the compiled model."""
+        return self._parts[key].layout
+
+    def joint_names(self, key: str, model: mujoco.MjModel) -> list[str]:
+        """Return the hinge and slide joints of an articulation: those whose position is one number."""
+        return [name for name, i in self._parts[key].layout.joints.items() if model.jnt_type[i] in _HINGE_AND_SLIDE]
+
+    def set_points(self, action: Any) -> dict[str, Floats]:
+        """Return the set-points of each articulation, shape (…, n_ctrl), from an action.
+
+        Raises:
+            ValueError: The action has another shape, or holds NaN or infinity.
+        """
+        if self.mode == "dict":
+            if set(action) != set(self.keys):
+                raise ValueError(f"the action needs one entry for each of {', '.join(self.keys)}, not {sorted(action)}")
+            found = {key: np.asarray(action[key], dtype=np.float64) for key in self.keys}
+        else:
+            whole = np.asarray(action, dtype=np.float64)
+            ends = np.cumsum([len(part.low) for part in self._parts.values()])
+            if whole.ndim == 0 or whole.shape[-1] != ends[-1]:
+                raise ValueError(f"the action has shape {whole.shape}; its last axis must be {ends[-1]} long")
+            found = dict(zip(self.keys, np.split(whole, ends[:-1], axis=-1), strict=True))
+        for key, values in found.items():
+            n_ctrl = len(self._parts[key].low)
+            if values.ndim == 0 or values.shape[-1] != n_ctrl:
+                raise ValueError(f"the action of {key} has shape {values.shape}; its last axis must be {n_ctrl} long")
+            if not np.isfinite(values).all():
+                raise ValueError(f"the action of {key} holds NaN or infinity: {values}")
+        return found
+
+    def observe(self, read: Callable[[str, Field], Floats]) -> Observation:
+        """Assemble an observation from `read(key, field)`, which returns arrays of shape (…, n)."""
+        if self.mode == "dict":
+            return {key: {field: np.array(read(key, field)) for field in self.fields} for key in self.keys}
+        return np.concatenate([read(key, field) for key in self.keys for field in self.fields], axis=-1)
+
+    def field(self, observation: Observation, key: str, field: Field) -> Floats:
+        """Return the view of one field in an observation of either mode, shape (…, n).
+
+        Reward and termination functions written with this and `[..., i]` serve single and vector environments.
+        """
+        if self.mode == "dict":
+            return observation[key][field]
+        return observation[..., self._where[key, field]]
+
+    def _slices(self) -> dict[tuple[str, Field], slice]:
+        where: dict[tuple[str, Field], slice] = {}
+        at = 0
+        for key, part in self._parts.items():
+            for field in self.fields:
+                where[key, field] = slice(at, at + part.widths[field])
+                at += part.widths[field]
+        return where
+
+    def _make_action_space(self) -> Space:
+        if self.mode == "dict":
+            return dict_space({key: _bounded(part.low, part.high) for key, part in self._parts.items()})
+        parts = self._parts.values()
+        return _bounded(np.concatenate([part.low for part in parts]), np.concatenate([part.high for part in parts]))
+
+    def _make_observation_space(self) -> Space:
+        if self.mode == "flat":
+            return _unbounded(sum(part.widths[field] for part in self._parts.values() for field in self.fields))
+        return dict_space(
+            {
+                key: dict_space({field: _unbounded(part.widths[field]) for field in self.fields})
+                for key, part in self._parts.items()
+            }
+        )
+
+
+def _part(model: mujoco.MjModel, layout: ArticulationLayout) -> _Articulation:
+    address = layout.ctrl_adr
+    limited = model.actuator_ctrllimited[address].astype(bool)
+    low, high = model.actuator_ctrlrange[address].T
+    widths: dict[Field, int] = {
+        "qpos": len(layout.qpos_adr),
+        "qvel": len(layout.qvel_adr),
+        "ctrl": len(address),
+        "act": len(address),
+        "sensors": int(sum(model.sensor_dim[i] for i in layout.sensors.values())),
+    }
+    return _Articulation(layout, np.where(limited, low, -np.inf), np.where(limited, high, np.inf), widths)
+
+
+def _bounded(low: Floats, high: Floats) -> Space:
+    return spaces.Box(low.astype(np.float32), high.astype(np.float32))
+
+
+def _unbounded(n: int) -> Space:
+    return spaces.Box(-np.inf, np.inf, (n,), dtype=np.float64)
+
+
+def dict_space(entries: Mapping[str, Space]) -> Space:
+    """Return the `Dict` of some spaces, in their order."""
+    return spaces.Dict(dict(entries))

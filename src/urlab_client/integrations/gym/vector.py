@@ -1,0 +1,223 @@
+"""`URLabVectorEnv`: several sessions, each with a server of its own, driven concurrently from one event loop."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Coroutine, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, TypeVar
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import concatenate, create_empty_array, iterate
+from numpy.typing import NDArray
+
+from urlab_client.aio.client import URLabClient
+from urlab_client.aio.launch import SCHEME
+from urlab_client.integrations.gym.env import RewardFn, TerminationFn
+from urlab_client.integrations.gym.episode import Episode
+from urlab_client.integrations.gym.spaces import Observation, SpaceMode
+from urlab_client.integrations.gym.vectorized import Indices, Vectorized
+from urlab_client.protocol.errors import URLabError
+from urlab_client.sync._portal import Portal
+
+__all__ = ["URLabVectorEnv"]
+
+T = TypeVar("T")
+
+
+class _Session:
+    """One environment: its client, and what is needed to start it again."""
+
+    def __init__(self, address: str, client_options: Mapping[str, Any], episode_options: Mapping[str, Any]) -> None:
+        self.address = address
+        self.restarts = -1
+        self.episode: Episode | None = None
+        self._client_options = client_options
+        self._episode_options = episode_options
+
+    async def reset(self, rng: np.random.Generator, keyframe: str | None, timeout: float) -> Observation:
+        """Start an episode; start the session first where there is none, which the deadline does not cover."""
+        episode = self.episode or await self.open()
+        async with asyncio.timeout(timeout):
+            return await episode.reset(rng, keyframe)
+
+    async def step(self, action: Any, timeout: float) -> Observation:
+        """Act."""
+        if self.episode is None:
+            raise URLabError("The environment failed before.", hint="Reset it, which starts it afresh.")
+        async with asyncio.timeout(timeout):
+            return await self.episode.step(action)
+
+    async def close(self) -> None:
+        """Give the client up."""
+        episode, self.episode = self.episode, None
+        if episode is not None:
+            await episode.client.close()
+
+    async def open(self) -> Episode:
+        """Start the session."""
+        client = URLabClient(self.address, **self._client_options)
+        try:
+            await client.discover()
+            self.episode = Episode(client, **self._episode_options)
+        except BaseException:
+            await client.close()
+            raise
+        self.restarts += 1
+        return self.episode
+
+
+class URLabVectorEnv(Vectorized):
+    """Environments over several servers at once, in lockstep.
+
+    Every environment has a session, and with `sim://` a server process, of its own; requests of one step travel
+    concurrently from one event loop in a background thread. `infos` carries `step_count`, `sim_time` and `restarts`
+    as arrays, and `error` where something failed (see `Vectorized`). A failed or too slow environment loses its
+    client, and for `sim://` its server with it, and gets new ones at its next reset.
+    """
+
+    def __init__(
+        self,
+        addresses: str | Sequence[str],
+        num_envs: int | None = None,
+        *,
+        space_mode: SpaceMode = "flat",
+        observations: str | Sequence[str] = "standard",
+        reward_fn: RewardFn | None = None,
+        termination_fn: TerminationFn | None = None,
+        max_episode_steps: int | None = None,
+        cameras: Sequence[str] = (),
+        n_substeps: int = 1,
+        reset_noise: float = 0.0,
+        autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
+        step_timeout: float = 10.0,
+        client_options: Mapping[str, Any] = MappingProxyType({}),
+    ) -> None:
+        """Start the sessions.
+
+        Args:
+            addresses: One `sim://` address for all environments, or the address of each.
+            num_envs: Number of environments; needed with one address only.
+            space_mode: See `URLabEnv`, here and for the arguments down to `n_substeps`.
+            observations: See `URLabEnv`.
+            reward_fn: As for `URLabEnv`, with a leading axis of environments in all arguments and the result.
+            termination_fn: Likewise.
+            max_episode_steps: See `URLabEnv`.
+            cameras: See `URLabEnv`.
+            n_substeps: See `URLabEnv`.
+            reset_noise: See `URLabEnv`.
+            autoreset_mode: `NEXT_STEP`, `SAME_STEP` or `DISABLED`.
+            step_timeout: Seconds an environment may take for a step or reset.
+            client_options: Further options of the clients.
+
+        Raises:
+            URLabError: A session cannot be started; the message names its index.
+            ValueError: An option out of range, or environments whose spaces differ.
+        """
+        if isinstance(addresses, str):
+            if num_envs is None or not addresses.startswith(SCHEME):
+                raise ValueError(
+                    "one address needs num_envs, and to start servers with sim://; else list the addresses"
+                )
+            addresses = [addresses] * num_envs
+        if num_envs not in (None, len(addresses)) or not addresses:
+            raise ValueError(f"num_envs is {num_envs}, but there are {len(addresses)} addresses")
+        if step_timeout <= 0:
+            raise ValueError(f"step_timeout is above 0 seconds, not {step_timeout}")
+        episode_options = {
+            "space_mode": space_mode,
+            "observations": observations,
+            "cameras": tuple(cameras),
+            "rendered": (),
+            "n_substeps": n_substeps,
+            "reset_noise": reset_noise,
+        }
+        self._step_timeout = step_timeout
+        client_options = {"step_mode": "direct", **client_options}
+        self._sessions = [_Session(address, client_options, episode_options) for address in addresses]
+        self._portal = Portal()
+        try:
+            first = self._portal.call(self._open_all())
+        except BaseException:
+            self.close_extras()
+            raise
+        super().__init__(
+            num_envs=len(addresses),
+            mapping=first.mapping,
+            observation_space=first.observation_space,
+            reward_fn=reward_fn,
+            termination_fn=termination_fn,
+            max_episode_steps=max_episode_steps,
+            autoreset_mode=autoreset_mode,
+        )
+        self._sim_time = np.zeros(self.num_envs)
+        self._step_count = np.zeros(self.num_envs, dtype=np.int64)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the clients, and the servers they started."""
+        self._portal.close(self._close_all())
+
+    async def _open_all(self) -> Episode:
+        found = await asyncio.gather(*(session.open() for session in self._sessions), return_exceptions=True)
+        for i, episode in enumerate(found):
+            if isinstance(episode, BaseException):
+                raise URLabError(f"Environment {i} at {self._sessions[i].address}: {episode}") from episode
+        episodes = [session.episode for session in self._sessions if session.episode is not None]
+        spaces = [(e.mapping.action_space, e.observation_space) for e in episodes]
+        for i, pair in enumerate(spaces):
+            if pair != spaces[0]:
+                raise ValueError(f"environment {i} at {self._sessions[i].address} has other spaces than environment 0")
+        return episodes[0]
+
+    async def _close_all(self) -> None:
+        await asyncio.gather(*(session.close() for session in self._sessions), return_exceptions=True)
+
+    def _reset_some(self, indices: Indices, keyframe: str | None) -> tuple[Observation, Mapping[int, Exception]]:
+        timeout = self._step_timeout
+        return self._gather({i: self._sessions[i].reset(self._rngs[i], keyframe, timeout) for i in map(int, indices)})
+
+    def _step_some(self, indices: Indices, actions: Any) -> tuple[Observation, Mapping[int, Exception]]:
+        each = list(iterate(self.action_space, actions))
+        return self._gather({i: self._sessions[i].step(each[i], self._step_timeout) for i in map(int, indices)})
+
+    def _clocks(self) -> dict[str, NDArray[Any]]:
+        for i, session in enumerate(self._sessions):
+            if session.episode is not None:
+                client = session.episode.client
+                self._sim_time[i], self._step_count[i] = client.sim_time, client.step_count
+        restarts = np.array([session.restarts for session in self._sessions], dtype=np.int64)
+        return {"sim_time": self._sim_time.copy(), "step_count": self._step_count.copy(), "restarts": restarts}
+
+    def _gather(
+        self, calls: Mapping[int, Coroutine[Any, Any, Observation]]
+    ) -> tuple[Observation, Mapping[int, Exception]]:
+        results = self._portal.call(self._all(calls))
+        errors = {i: result for i, result in results.items() if isinstance(result, Exception)}
+        single = self.single_observation_space
+        rows = [
+            _row(single, self._observations, i) if isinstance(result, Exception) else result
+            for i, result in results.items()
+        ]
+        return concatenate(single, rows, create_empty_array(single, len(rows))), errors
+
+    async def _all(self, calls: Mapping[int, Coroutine[Any, Any, T]]) -> dict[int, T | Exception]:
+        found = await asyncio.gather(*calls.values(), return_exceptions=True)
+        results: dict[int, T | Exception] = {}
+        for i, result in zip(calls, found, strict=True):
+            if isinstance(result, TimeoutError) and not isinstance(result, URLabError):
+                results[i] = TimeoutError(f"environment {i} did not answer within {self._step_timeout:g} s")
+            elif isinstance(result, Exception):
+                results[i] = result
+            elif isinstance(result, BaseException):
+                raise result
+            else:
+                results[i] = result
+        await asyncio.gather(
+            *(self._sessions[i].close() for i, result in results.items() if isinstance(result, Exception))
+        )
+        return results
+
+
+def _row(space: Any, observations: Observation, index: int) -> Observation:
+    return next(row for i, row in enumerate(iterate(space, observations)) if i == index)

@@ -1,0 +1,223 @@
+"""What vector environments have in common: episodes that end one by one, rewards in one call, and autoreset."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any, cast
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space, create_empty_array
+from numpy.typing import NDArray
+
+from urlab_client.integrations.gym.env import RewardFn, TerminationFn, keyframe_option
+from urlab_client.integrations.gym.spaces import Observation, Space, SpaceMapping
+
+__all__ = ["Vectorized"]
+
+Bools = NDArray[np.bool_]
+Floats = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+
+class Vectorized(VectorEnv[Observation, Any, Any], ABC):
+    """Base of vector environments.
+
+    Rewards and terminations of all environments are computed in one call, with a leading axis: the same functions
+    serve `URLabEnv` when they index with `[..., i]` (see `SpaceMapping.field`).
+
+    An environment that fails is reported, not raised: `infos["error"]` holds the exception at its index, its
+    observation is the last one, it counts as truncated, and its next reset starts it afresh. The others go on.
+
+    Attributes:
+        mapping: The articulations as spaces.
+        reward_fn: The reward function, or None for rewards of 0.
+        termination_fn: The termination function, or None for episodes that never end by themselves.
+        autoreset_mode: What happens to environments whose episode ended.
+    """
+
+    mapping: SpaceMapping
+    observation_space: Space
+    action_space: Space
+    single_observation_space: Space
+    single_action_space: Space
+
+    def __init__(
+        self,
+        *,
+        num_envs: int,
+        mapping: SpaceMapping,
+        observation_space: Space,
+        reward_fn: RewardFn | None,
+        termination_fn: TerminationFn | None,
+        max_episode_steps: int | None,
+        autoreset_mode: AutoresetMode,
+    ) -> None:
+        self.mapping = mapping
+        self.num_envs = num_envs
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
+        self.single_observation_space = observation_space
+        self.single_action_space = mapping.action_space
+        self.observation_space = batch_space(observation_space, num_envs)
+        self.action_space = batch_space(mapping.action_space, num_envs)
+        self.reward_fn = reward_fn
+        self.termination_fn = termination_fn
+        self._max_episode_steps = max_episode_steps
+        self._observations: Observation = create_empty_array(observation_space, num_envs)
+        self._elapsed = np.zeros(num_envs, dtype=np.int64)
+        self._ended = np.ones(num_envs, dtype=bool)
+        self._started = False
+        self._keyframe: str | None = None
+        self._rngs = [np.random.default_rng() for _ in range(num_envs)]
+
+    @abstractmethod
+    def _reset_some(self, indices: Indices, keyframe: str | None) -> tuple[Observation, Mapping[int, Exception]]:
+        """Reset some environments; return their observations in a batch, and what failed by index."""
+
+    @abstractmethod
+    def _step_some(self, indices: Indices, actions: Any) -> tuple[Observation, Mapping[int, Exception]]:
+        """Step some environments, given the actions of all; return as `_reset_some` does."""
+
+    @abstractmethod
+    def _clocks(self) -> dict[str, NDArray[Any]]:
+        """Return what `infos` says of every environment, by name."""
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode in all environments, or in some.
+
+        Args:
+            seed: Environment i gets `seed + i`; a list names each one's; None goes on with the present generators.
+            options: `keyframe`: name of the keyframe to start from, also for later autoresets; `reset_mask`: boolean
+                array of the environments to reset.
+
+        Raises:
+            ValueError: An unknown option, or a mask or list of another length.
+        """
+        options = dict(options or {})
+        mask = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, dtype=bool)))
+        if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
+            raise ValueError(f"reset_mask needs {self.num_envs} booleans, one of them true")
+        self._keyframe = keyframe_option(options)
+        seeds = (
+            [None if seed is None else seed + i for i in range(self.num_envs)] if not isinstance(seed, list) else seed
+        )
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"{len(seeds)} seeds for {self.num_envs} environments")
+        super().reset(seed=None)
+        for i in np.flatnonzero(mask):
+            if seeds[i] is not None:
+                self._rngs[i] = np.random.default_rng(seeds[i])
+        errors = self._start(np.flatnonzero(mask))
+        self._started = True
+        return self._copied(), self._infos(errors)
+
+    def step(self, actions: Any) -> tuple[Observation, Floats, Bools, Bools, dict[str, Any]]:
+        """Act in all environments.
+
+        Those that ended in the step before are reset instead with `AutoresetMode.NEXT_STEP`: their reward is 0.
+
+        Raises:
+            gymnasium.error.ResetNeeded: There was no reset yet.
+            ValueError: The actions do not fit; nothing was sent.
+        """
+        if not self._started:
+            raise gymnasium.error.ResetNeeded("call reset() before step()")
+        self.mapping.set_points(actions)  # refuses before anything moves
+        next_step = self.autoreset_mode is AutoresetMode.NEXT_STEP
+        fresh = np.flatnonzero(self._ended) if next_step else np.zeros(0, dtype=np.intp)
+        acting = np.setdiff1d(np.arange(self.num_envs), fresh)
+        before = self._copied()
+        errors: Mapping[int, Exception] = self._start(fresh) if len(fresh) else {}
+        if len(acting):
+            found, failed = self._step_some(acting, actions)
+            _put(self._observations, acting, found)
+            errors = {**errors, **failed}
+        self._elapsed[acting] += 1
+        infos = self._infos(errors)
+        stepped = np.zeros(self.num_envs, dtype=bool)
+        stepped[acting] = True
+        stepped[list(errors)] = False
+        rewards, terminated = self._judge(before, actions, stepped, infos)
+        truncated = np.zeros(self.num_envs, dtype=bool)
+        if self._max_episode_steps is not None:
+            truncated[acting] = self._elapsed[acting] >= self._max_episode_steps
+        truncated[list(errors)] = True
+        self._ended = terminated | truncated
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and self._ended.any():
+            infos = self._same_step_reset(infos)
+        return self._copied(), rewards, terminated, truncated, infos
+
+    def _start(self, indices: Indices) -> Mapping[int, Exception]:
+        found, errors = self._reset_some(indices, self._keyframe)
+        _put(self._observations, indices, found)
+        self._elapsed[indices] = 0
+        self._ended[indices] = False
+        self._ended[list(errors)] = True
+        return errors
+
+    def _judge(self, before: Observation, actions: Any, stepped: Bools, infos: dict[str, Any]) -> tuple[Floats, Bools]:
+        rewards = np.zeros(self.num_envs)
+        terminated = np.zeros(self.num_envs, dtype=bool)
+        after = self._copied()
+        if self.reward_fn is not None:
+            rewards[:] = self.reward_fn(before, actions, after, infos)
+        if self.termination_fn is not None:
+            terminated[:] = self.termination_fn(after, infos)
+        rewards[~stepped] = 0.0
+        return rewards, terminated & stepped
+
+    def _same_step_reset(self, infos: dict[str, Any]) -> dict[str, Any]:
+        ended = self._ended.copy()
+        final = np.full(self.num_envs, None, dtype=object)
+        for i in np.flatnonzero(ended):
+            final[i] = _pick(self._observations, int(i))
+        errors = self._start(np.flatnonzero(ended))
+        after = self._infos({**_errors_in(infos), **errors})
+        return {**after, "final_obs": final, "_final_obs": ended, "final_info": infos, "_final_info": ended}
+
+    def _infos(self, errors: Mapping[int, Exception]) -> dict[str, Any]:
+        everywhere = np.ones(self.num_envs, dtype=bool)
+        infos: dict[str, Any] = {}
+        for name, values in self._clocks().items():
+            infos[name], infos[f"_{name}"] = values, everywhere.copy()
+        if errors:
+            infos["error"] = np.full(self.num_envs, None, dtype=object)
+            infos["_error"] = np.zeros(self.num_envs, dtype=bool)
+            for i, error in errors.items():
+                infos["error"][i], infos["_error"][i] = error, True
+        return infos
+
+    def _copied(self) -> Observation:
+        return _map(np.copy, self._observations)
+
+
+def _errors_in(infos: dict[str, Any]) -> dict[int, Exception]:
+    return {int(i): infos["error"][i] for i in np.flatnonzero(infos["_error"])} if "error" in infos else {}
+
+
+def _map(function: Any, observations: Observation) -> Observation:
+    if isinstance(observations, dict):
+        entries = cast("dict[str, Observation]", observations)
+        return {key: _map(function, entry) for key, entry in entries.items()}
+    return function(observations)
+
+
+def _put(observations: Observation, indices: Indices, found: Observation) -> None:
+    if isinstance(observations, dict):
+        entries = cast("dict[str, Observation]", observations)
+        for key, entry in entries.items():
+            _put(entry, indices, found[key])
+    else:
+        observations[indices] = found
+
+
+def _pick(observations: Observation, index: int) -> Observation:
+    def row(array: Floats) -> Floats:
+        return array[index].copy()
+
+    return _map(row, observations)

@@ -1,0 +1,237 @@
+"""Gymnasium environments against simulated servers: spaces, episodes, determinism, pictures, errors."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import urlab_client
+from urlab_client.integrations.gym import TASKS, SpaceMapping, URLabEnv
+from urlab_client.server import SimulatedServer
+
+MakeEnv = Callable[..., URLabEnv]
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[SimulatedServer]:
+    with SimulatedServer("quadruped", "arm", play=True, camera_size=(64, 48)) as server:
+        yield server
+
+
+@pytest.fixture
+def make_env(server: SimulatedServer) -> Iterator[MakeEnv]:
+    clients: list[urlab_client.URLabClient] = []
+
+    def make(**options: Any) -> URLabEnv:
+        client = urlab_client.URLabClient(**server.client_options(), step_mode=options.pop("step_mode", "direct"))
+        clients.append(client)
+        client.discover()
+        return URLabEnv(client, **options)
+
+    yield make
+    for client in clients:
+        client.close()
+
+
+@contextmanager
+def without_advice() -> Iterator[None]:
+    """The checker advises normalised spaces; ours are in the robots' own units."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*(infinity|symmetric and normalized|render modes).*")
+        yield
+
+
+@pytest.mark.parametrize("space_mode", ["flat", "dict"])
+def test_gymnasiums_checker_finds_nothing(make_env: MakeEnv, space_mode: str) -> None:
+    with without_advice():
+        check_env(make_env(space_mode=space_mode, n_substeps=2, reset_noise=0.05), skip_close_check=True)
+
+
+@pytest.mark.parametrize("task_id", TASKS)
+def test_a_registered_task_passes_the_checker_and_closes_its_server(task_id: str) -> None:
+    env = gymnasium.make(task_id, render_mode="rgb_array")
+    with without_advice():
+        check_env(env.unwrapped)
+    env.close()
+    with pytest.raises(urlab_client.ClientClosed):
+        env.reset()
+
+
+def test_flat_and_dict_hold_the_same_values_in_the_documented_order(make_env: MakeEnv) -> None:
+    flat = make_env()
+    a, _ = flat.reset(seed=0)
+    nested = make_env(space_mode="dict")
+    b, _ = nested.reset(seed=0)
+    in_order = [b[key][field] for key in flat.mapping.keys for field in flat.mapping.fields]
+    assert np.array_equal(a, np.concatenate(in_order))
+    for key in flat.mapping.keys:
+        for field in flat.mapping.fields:
+            assert np.array_equal(flat.mapping.field(a, key, field), nested.mapping.field(b, key, field))
+    client = nested.client
+    for key in client.articulations:
+        assert np.array_equal(b[key]["qpos"], client.articulations[key].qpos_array)
+        readings = client.articulations[key].get_sensors().values()
+        assert np.array_equal(b[key]["sensors"], np.concatenate(list(readings)))
+
+
+def test_the_bounds_of_actions_are_the_actuators_ctrlranges(make_env: MakeEnv) -> None:
+    env = make_env(space_mode="dict")
+    for key, articulation in env.client.articulations.items():
+        ranges = np.array([actuator.ctrlrange for actuator in articulation.actuators.values()], dtype=np.float32)
+        box = env.action_space[key]  # type: ignore[index]  # a Dict
+        assert np.array_equal(box.low, ranges[:, 0])
+        assert np.array_equal(box.high, ranges[:, 1])
+
+
+def test_the_same_seed_and_actions_give_the_same_rollout_bit_for_bit(make_env: MakeEnv) -> None:
+    env = make_env(n_substeps=3, reset_noise=0.1)
+
+    def rollout(seed: int) -> list[Any]:
+        rng = np.random.default_rng(0)
+        actions = rng.uniform(-1, 1, (20, *env.action_space.shape))
+        return [env.reset(seed=seed)[0], *(env.step(action)[0] for action in actions)]
+
+    first, again, other = rollout(7), rollout(7), rollout(8)
+    assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
+    assert not np.array_equal(first[0], other[0])
+
+
+def test_an_action_lasts_for_its_substeps_and_info_tells_the_clocks(make_env: MakeEnv) -> None:
+    env = make_env(n_substeps=5)
+    env.reset(seed=1)
+    *_, info = env.step(np.zeros(env.action_space.shape))
+    timestep = env.client.model.opt.timestep  # type: ignore[union-attr]
+    assert info["client"] is env.client
+    assert info["step_count"] == 5
+    assert info["sim_time"] == pytest.approx(5 * timestep)
+    assert set(info["articulations"]) == {"quadruped", "arm"}
+    assert set(info["articulations"]) <= set(info["entities"])
+
+
+def test_rewards_terminations_and_truncation_come_from_the_users_functions(make_env: MakeEnv) -> None:
+    seen: list[tuple[Any, ...]] = []
+
+    def reward(before: Any, action: Any, after: Any, info: dict[str, Any]) -> float:
+        seen.append((before, action, after))
+        return info["step_count"]
+
+    env = make_env(reward_fn=reward, termination_fn=lambda after, info: info["step_count"] >= 3, max_episode_steps=2)
+    start, _ = env.reset(seed=0)
+    action = np.zeros(env.action_space.shape)
+    first = env.step(action)
+    assert first[1:4] == (1.0, False, False)
+    assert seen[0][0] is start
+    assert seen[0][2] is first[0]
+    assert env.step(action)[1:4] == (2.0, False, True)
+    assert env.step(action)[1:4] == (3.0, True, True)
+
+
+def test_a_reset_can_start_from_a_keyframe(make_env: MakeEnv) -> None:
+    env = make_env(space_mode="dict")
+    observation, _ = env.reset(options={"keyframe": "quadruped_home"})
+    assert observation["quadruped"]["qpos"][2] == pytest.approx(0.3038)
+
+
+def test_pictures_show_the_state_and_leave_physics_alone(make_env: MakeEnv) -> None:
+    actions = [{"quadruped": np.zeros(12), "arm": np.full(7, 0.04)}] * 30
+
+    def rollout(env: URLabEnv) -> list[Any]:
+        return [env.reset(seed=2)[0], *(env.step(action)[0] for action in actions)]
+
+    plain = rollout(make_env(space_mode="dict"))
+    seeing = make_env(space_mode="dict", cameras=["quadruped/side"], render_mode="rgb_array", render_camera="arm/wrist")
+    start, _ = seeing.reset(seed=2)
+    assert start["cameras"]["quadruped/side"].shape == (48, 64, 4)
+    assert seeing.observation_space.contains(start)
+    first = seeing.render()
+    assert first is not None
+    assert first.shape == (48, 64, 3)
+    assert first.std() > 0
+    for ours, theirs in zip(rollout(seeing), plain, strict=True):
+        for key in ("quadruped", "arm"):
+            assert all(np.array_equal(ours[key][field], theirs[key][field]) for field in seeing.mapping.fields)
+    last = seeing.render()
+    assert last is not None
+    assert not np.array_equal(first, last)
+
+
+def test_each_observation_is_the_users_to_keep(make_env: MakeEnv) -> None:
+    env = make_env()
+    first, _ = env.reset(seed=0)
+    kept = first.copy()
+    env.step(np.ones(env.action_space.shape))
+    assert np.array_equal(first, kept)
+
+
+@pytest.mark.parametrize(
+    ("action", "reason"),
+    [
+        (np.zeros(3), "last axis must be 19 long"),
+        (np.full(19, np.nan), "NaN"),
+        (1.0, "last axis"),
+    ],
+)
+def test_an_action_that_does_not_fit_is_refused_before_anything_moves(
+    make_env: MakeEnv, action: Any, reason: str
+) -> None:
+    env = make_env()
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=reason):
+        env.step(action)
+    *_, info = env.step(np.zeros(19))
+    assert info["step_count"] == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "reason"),
+    [
+        ({"observations": "full"}, ValueError, "'minimal' or 'standard'"),
+        ({"observations": ["qpos", "heat"]}, ValueError, "qpos, qvel, ctrl"),
+        ({"observations": []}, ValueError, "one or more"),
+        ({"space_mode": "tree"}, ValueError, "'flat' or 'dict'"),
+        ({"n_substeps": 0}, ValueError, "at least 1"),
+        ({"reset_noise": -1.0}, ValueError, "0 or more"),
+        ({"max_episode_steps": 0}, ValueError, "at least 1"),
+        ({"render_mode": "human"}, ValueError, "rgb_array"),
+        ({"cameras": ["quadruped/side"]}, ValueError, "space_mode='dict'"),
+        ({"cameras": ["quadruped/tail"], "space_mode": "dict"}, KeyError, "tail"),
+        ({"step_mode": "live"}, urlab_client.URLabError, "step_mode='direct'"),
+    ],
+)
+def test_a_wrong_option_says_what_would_be_right(
+    make_env: MakeEnv, options: dict[str, Any], error: type[Exception], reason: str
+) -> None:
+    with pytest.raises(error, match=reason):
+        make_env(**options)
+
+
+def test_stepping_or_drawing_before_a_reset_says_so(make_env: MakeEnv) -> None:
+    env = make_env(render_mode="rgb_array")
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(np.zeros(19))
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.render()
+    with pytest.raises(ValueError, match="there is 'keyframe'"):
+        env.reset(options={"key": "home"})
+
+
+def test_a_client_before_discover_is_refused(server: SimulatedServer) -> None:
+    with (
+        urlab_client.URLabClient(**server.client_options()) as client,
+        pytest.raises(urlab_client.URLabError, match="discover"),
+    ):
+        URLabEnv(client)
+
+
+def test_a_mapping_takes_batches(make_env: MakeEnv) -> None:
+    mapping: SpaceMapping = make_env().mapping
+    found = mapping.set_points(np.arange(38.0).reshape(2, 19))
+    assert np.array_equal(found["quadruped"], [np.arange(12.0), np.arange(19.0, 31.0)])
+    assert found["arm"].shape == (2, 7)

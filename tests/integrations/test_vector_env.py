@@ -1,0 +1,194 @@
+"""Vector environments: many servers in lockstep, batches without a wire, and that the two agree."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+
+import urlab_client
+from urlab_client.integrations.gym import TASKS, URLabBatchEnv, URLabVectorEnv
+from urlab_client.server import Drop, Faults, SimulatedServer
+
+Make = Callable[..., Any]
+
+
+@pytest.fixture
+def made() -> Iterator[list[Any]]:
+    envs: list[Any] = []
+    yield envs
+    for env in envs:
+        env.close()
+
+
+@pytest.fixture(scope="module")
+def servers() -> Iterator[list[str]]:
+    """Addresses of two servers."""
+    with SimulatedServer("arm", play=True) as one, SimulatedServer("arm", play=True) as two:
+        yield [f"{server.address}:{server.step_port}" for server in (one, two)]
+
+
+def actions_of(env: Any, n: int) -> list[Any]:
+    rng = np.random.default_rng(3)
+    return [rng.uniform(-0.5, 0.5, env.action_space.shape).astype(np.float32) for _ in range(n)]
+
+
+def first_server(env: URLabVectorEnv) -> int:
+    """Process id of environment 0's server."""
+    client = env._sessions[0].episode.client
+    return client._transport._process.pid
+
+
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_servers_and_batch_agree_bit_for_bit(servers: list[str], made: list[Any], mode: AutoresetMode) -> None:
+    def reward(before: Any, action: Any, after: Any, info: Any) -> Any:
+        return after[..., 0] - before[..., 0]
+
+    options: Any = {
+        "n_substeps": 3,
+        "reset_noise": 0.1,
+        "max_episode_steps": 4,
+        "autoreset_mode": mode,
+        "reward_fn": reward,
+        "termination_fn": lambda after, info: after[..., 1] > 0.08,
+    }
+    wire, batch = URLabVectorEnv(servers, **options), URLabBatchEnv("sim://arm", 2, **options)
+    made += [wire, batch]
+    assert np.array_equal(wire.reset(seed=11)[0], batch.reset(seed=11)[0])
+    ends = 0
+    for action in actions_of(wire, 14):
+        ours, theirs = wire.step(action), batch.step(action)
+        for a, b in zip(ours[:4], theirs[:4], strict=True):
+            assert np.array_equal(a, b)
+        assert np.array_equal(ours[4]["sim_time"], theirs[4]["sim_time"])
+        ended = ours[2] | ours[3]
+        ends += int(ended.sum())
+        if mode is AutoresetMode.SAME_STEP and ended.any():
+            assert np.array_equal(ours[4]["_final_obs"], ended)
+            for i in np.flatnonzero(ended):
+                assert np.array_equal(ours[4]["final_obs"][i], theirs[4]["final_obs"][i])
+        if mode is AutoresetMode.DISABLED and ended.any():
+            for env in (wire, batch):
+                env.reset(options={"reset_mask": ended})
+    assert ends >= 2
+
+
+def test_environment_i_equals_a_single_one_with_its_seed(servers: list[str], made: list[Any]) -> None:
+    env = URLabVectorEnv(servers, reset_noise=0.1, n_substeps=2)
+    made.append(env)
+    observations, _ = env.reset(seed=4)
+    actions = actions_of(env, 5)
+    for action in actions:
+        observations, *_ = env.step(action)
+    single = gymnasium.make("urlab/Arm-v0", n_substeps=2, reset_noise=0.1)
+    made.append(single)
+    alone, _ = single.reset(seed=5)
+    for action in actions:
+        alone, *_ = single.step(action[1])
+    assert np.array_equal(observations[1], alone)
+
+
+def test_a_killed_server_is_reported_by_index_and_replaced_while_the_others_go_on(made: list[Any]) -> None:
+    env = URLabVectorEnv("sim://arm", 2, reset_noise=0.1)
+    made.append(env)
+    env.reset(seed=0)
+    action = np.zeros(env.action_space.shape, dtype=np.float32)
+    env.step(action)
+    os.kill(first_server(env), signal.SIGKILL)
+    observations, _, terminated, truncated, infos = env.step(action)
+    assert truncated.tolist() == [True, False]
+    assert not terminated.any()
+    assert isinstance(infos["error"][0], urlab_client.URLabConnectionError)
+    assert infos["_error"].tolist() == [True, False]
+    assert infos["step_count"][1] == 2
+    assert np.isfinite(observations).all()
+    *_, truncated, infos = env.step(action)
+    assert not truncated.any()
+    assert "error" not in infos
+    assert infos["restarts"].tolist() == [1, 0]
+    assert infos["step_count"].tolist() == [0, 3]
+    *_, infos = env.step(action)
+    assert infos["step_count"].tolist() == [1, 4]
+
+
+def test_a_slow_environment_counts_as_failed_and_holds_up_nobody_for_longer(made: list[Any]) -> None:
+    faults = Faults()
+    with (
+        SimulatedServer("arm", play=True, faults=faults) as slow,
+        SimulatedServer("arm", play=True) as quick,
+    ):
+        addresses = [f"{server.address}:{server.step_port}" for server in (quick, slow)]
+        env = URLabVectorEnv(addresses, step_timeout=0.3)
+        made.append(env)
+        env.reset(seed=0)
+        faults.add(Drop("step", times=1))
+        action = np.zeros(env.action_space.shape)
+        *_, truncated, infos = env.step(action)
+        assert truncated.tolist() == [False, True]
+        assert "environment 1 did not answer within 0.3 s" in str(infos["error"][1])
+        *_, truncated, infos = env.step(action)
+        assert not truncated.any()
+        assert infos["restarts"].tolist() == [0, 1]
+
+
+def test_a_session_that_cannot_start_is_named(servers: list[str]) -> None:
+    with pytest.raises(urlab_client.URLabError, match="Environment 1 at sim://no-such-robot"):
+        URLabVectorEnv([servers[0], "sim://no-such-robot"])
+
+
+def test_environments_with_other_spaces_are_refused(servers: list[str]) -> None:
+    with pytest.raises(ValueError, match=r"environment 1 .* has other spaces"):
+        URLabVectorEnv([servers[0], "sim://quadruped"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options", "reason"),
+    [
+        (("sim://arm",), {}, "needs num_envs"),
+        (("tcp://127.0.0.1", 2), {}, "list the addresses"),
+        ((["sim://arm"], 2), {}, "1 addresses"),
+        (([],), {}, "0 addresses"),
+        ((["sim://arm"],), {"step_timeout": 0.0}, "above 0"),
+    ],
+)
+def test_wrong_arguments_start_nothing(arguments: Any, options: Any, reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        URLabVectorEnv(*arguments, **options)
+
+
+def test_resets_refuse_masks_and_seeds_that_do_not_fit(made: list[Any]) -> None:
+    env = URLabBatchEnv("sim://arm", 3)
+    made.append(env)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(np.zeros((3, 7)))
+    for mask in ([True], np.zeros(3, dtype=bool), np.ones(3)):
+        with pytest.raises(ValueError, match="3 booleans"):
+            env.reset(options={"reset_mask": np.asarray(mask)})
+    with pytest.raises(ValueError, match="2 seeds for 3"):
+        env.reset(seed=[1, 2])
+    with pytest.raises(urlab_client.UnknownKeyframe, match="arm_home"):
+        env.reset(options={"keyframe": "away"})
+    observations, _ = env.reset(options={"keyframe": "home"})
+    assert observations[:, 7].tolist() == [0.04] * 3
+
+
+def test_a_batch_has_no_controllers(made: list[Any]) -> None:
+    with pytest.raises(urlab_client.URLabError, match="arm has a controller"):
+        URLabBatchEnv("sim://arm?controller=arm=pd", 2)
+
+
+@pytest.mark.parametrize("task_id", TASKS)
+def test_a_tasks_rewards_are_the_same_from_servers_and_batch(task_id: str, made: list[Any]) -> None:
+    wire = gymnasium.make_vec(task_id, num_envs=1)
+    batch = gymnasium.make_vec(task_id, num_envs=1, backend="batch")
+    made += [wire, batch]
+    wire.reset(seed=0)
+    batch.reset(seed=0)
+    for action in actions_of(wire, 3):
+        assert np.array_equal(wire.step(action)[1], batch.step(action)[1])
