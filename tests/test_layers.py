@@ -19,7 +19,8 @@ ALLOWED: dict[str, frozenset[str]] = {
     "server": frozenset({"keys", "protocol"}),
     "enums": frozenset({"protocol"}),
     "": frozenset({"sync", "enums", "protocol"}),
-    "cli": frozenset({"", "aio", "enums", "keys", "protocol", "server", "sync"}),
+    "integrations": frozenset({"", "aio", "enums", "keys", "protocol", "server", "sync"}),
+    "cli": frozenset({"", "aio", "enums", "integrations", "keys", "protocol", "server", "sync"}),
     "__main__": frozenset({"cli"}),
 }
 
