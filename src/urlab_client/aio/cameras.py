@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.publishers import Publishers
+from urlab_client.aio.publishers import Publishers, SharedFrame
 from urlab_client.aio.reception import Pictures
 from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS, Stream
 from urlab_client.protocol.enums import CameraMode, known
@@ -15,7 +15,7 @@ from urlab_client.protocol.messages.session import CameraInfo
 from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
 from urlab_client.protocol.rows import Pixels
 
-__all__ = ["URLabCameraView"]
+__all__ = ["SharedFrame", "URLabCameraView"]
 
 
 class URLabCameraView:
@@ -87,13 +87,21 @@ class URLabCameraView:
             ValueError: Unknown policy, or an empty buffer.
         """
         return Stream(
-            self._publishers.camera(self),
+            self._publishers.camera(self, policy),
             policy=policy,
             buffer=buffer,
             buffer_bytes=buffer_bytes,
             timeout=timeout,
             default_timeout=self._publishers.default_timeout,
         )
+
+    def shared_frame(self) -> SharedFrame | None:
+        """Return the newest picture without copying it, for `transport="shm"`: see `SharedFrame` for what that means.
+
+        None unless the camera's pictures are being received from shared memory, as in live mode, or in any mode while
+        a stream of `frames` is open.
+        """
+        return self._publishers.shared_frame(self)
 
     def __repr__(self) -> str:
         return f"<URLabCameraView {self.name!r} {self.mode} {self.resolution[0]}x{self.resolution[1]}>"

@@ -33,6 +33,7 @@ from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS, Stream
 from urlab_client.aio.transport.base import Transport as TransportProtocol
 from urlab_client.aio.transport.base import TransportStats
 from urlab_client.aio.transport.curve import ClientKeys, client_keys, is_local
+from urlab_client.aio.transport.shm import SharedMemory, ShmTransport
 from urlab_client.aio.transport.zmq import ZmqTransport
 from urlab_client.aio.watch import Watch
 from urlab_client.protocol.base import Reply, Request
@@ -143,18 +144,21 @@ class URLabClient:
         )
         if encoding not in {"msgpack", "json"}:
             raise ValueError(f"encoding is msgpack or json, not {encoding!r}")
-        if Transport(transport) is Transport.SHM or shm_dir is not None:
-            raise URLabError("Shared memory is not available in this version.", hint="Use transport='zmq'.")
+        if shm_dir is not None and Transport(transport) is not Transport.SHM:
+            raise ValueError("shm_dir is for transport='shm'")
         if rcv_timeout_ms <= 0:
             raise ValueError(f"rcv_timeout_ms must be above 0, got {rcv_timeout_ms}")
         keys = client_keys(address, self._config.server_key, self._config.client_key)
-        self._transport = _transport(address, step_port, keys)
+        memory = SharedMemory(shm_dir) if Transport(transport) is Transport.SHM else None
+        plain = _transport(address, step_port, keys, shm=memory is not None)
+        self._transport = plain if memory is None else ShmTransport(plain, memory)
         self._session = Session(self._transport, default_timeout=rcv_timeout_ms / 1000, json=encoding == "json")
         self._publishers = Publishers(
             lambda: self._transport.endpoint,
             lambda: self._transport.state_port or state_port,
             default_timeout=rcv_timeout_ms / 1000,
             keys=keys,
+            memory=memory,
         )
         self._state = SimState(
             self._session,
@@ -238,7 +242,7 @@ class URLabClient:
 
     @property
     def transport_stats(self) -> TransportStats:
-        """Counters of requests, replies and connections."""
+        """Counters of requests, replies and connections, and of what went which way with `transport="shm"`."""
         return self._transport.stats
 
     @property
@@ -356,6 +360,7 @@ class URLabClient:
         Raises:
             URLabVersionMismatch: Client and server MuJoCo builds differ.
             ServerUnreachable: Nothing answers at the address.
+            URLabConnectionError: With `transport="shm"`, the server's shared memory is not on this machine.
             AuthenticationFailed: Server and client do not accept each other's keys.
         """
         level = ObservationLevel(observations)
@@ -511,7 +516,7 @@ class URLabClient:
             ValueError: Unknown policy, or an empty buffer.
         """
         return Stream(
-            self._publishers.state(),
+            self._publishers.state(policy),
             policy=policy,
             buffer=buffer,
             buffer_bytes=buffer_bytes,
@@ -686,9 +691,9 @@ class URLabClient:
         raise UnknownKeyframe("unknown_keyframe", f"{problem}. Nothing was sent.", op="reset")
 
 
-def _transport(address: str, step_port: int, keys: ClientKeys | None) -> TransportProtocol:
+def _transport(address: str, step_port: int, keys: ClientKeys | None, *, shm: bool) -> TransportProtocol:
     if address.startswith(SCHEME):
-        return LaunchedTransport(address)
+        return LaunchedTransport(address, shm=shm)
     scheme, separator, rest = address.partition("://")
     if not separator or scheme not in {"tcp", "ipc"} or not rest:
         raise ValueError(f"{address!r} is no address; write tcp://HOST, ipc://PATH or sim://MODEL")

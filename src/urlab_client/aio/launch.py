@@ -19,6 +19,7 @@ from urlab_client.aio.transport.base import TransportStats
 from urlab_client.aio.transport.zmq import ZmqTransport
 from urlab_client.protocol.base import Op
 from urlab_client.protocol.errors import ClientClosed, ServerUnreachable
+from urlab_client.protocol.messages.session import HelloOk
 from urlab_client.protocol.messages.streams import ClientEvent
 
 __all__ = ["SCHEME", "LaunchedTransport", "serve_arguments"]
@@ -62,10 +63,12 @@ def serve_arguments(address: str) -> list[str]:
 class LaunchedTransport:
     """Transport to a simulated server of its own."""
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, *, shm: bool = False) -> None:
         self.stats = TransportStats()
         self._address = address
         self._arguments = serve_arguments(address)
+        if not shm:
+            self._arguments.append("--no-shm")
         self._process: asyncio.subprocess.Process | None = None
         self._drain: asyncio.Task[None] | None = None
         self._inner: ZmqTransport | None = None
@@ -98,6 +101,9 @@ class LaunchedTransport:
             deadline = None if deadline is None else deadline + took
             connect_by = None if connect_by is None else connect_by + took
         return await self._inner.request(frame, op, deadline=deadline, connect_by=connect_by)
+
+    async def follow(self, hello: HelloOk) -> None:
+        """See `Transport.follow`: there is no other way."""
 
     async def aclose(self) -> None:
         """See `Transport.aclose`. Waits a bounded time for the server to end."""
@@ -164,7 +170,7 @@ class LaunchedTransport:
 
 
 _DEFAULTS: Sequence[str] = (
-    "--json", "--until-eof", "--play", "--no-shm",
+    "--json", "--until-eof", "--play",
     "--step-port=0", "--state-port=0", "--ctrl-port=0", "--info-port=0", "--camera-port=0",
 )  # fmt: skip
 

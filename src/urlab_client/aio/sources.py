@@ -10,7 +10,9 @@ from typing import Protocol
 import msgspec
 
 from urlab_client.aio.streams import Stream
+from urlab_client.aio.transport.regions import Place, Regions, SharedPicture
 from urlab_client.aio.transport.subscriber import Sink, Subscription, Subscriptions, client_closed
+from urlab_client.protocol import doorbell
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.errors import ProtocolError
 from urlab_client.protocol.messages.session import CameraInfo
@@ -42,8 +44,17 @@ from urlab_client.protocol.rows import (
     resolve_endpoint,
     scene_filter,
 )
+from urlab_client.protocol.shm import STATE_FILE, camera_file
 
-__all__ = ["CameraSource", "EventBus", "HasCamera", "RowSource", "StateSource"]
+__all__ = [
+    "CameraSource",
+    "EventBus",
+    "HasCamera",
+    "RowSource",
+    "SharedCameraSource",
+    "SharedStateSource",
+    "StateSource",
+]
 
 _OF_COMPONENT = frozenset({TopicKind.JOINT, TopicKind.BASE_STATE, TopicKind.SENSOR})
 _OF_ARTICULATION = _OF_COMPONENT | {TopicKind.TWIST, TopicKind.ACTIONS}
@@ -263,18 +274,18 @@ class CameraSource(_SocketSource):
 
     def __init__(self, subscriptions: Subscriptions, view: HasCamera, host: Callable[[], str]) -> None:
         super().__init__(subscriptions)
-        self._view = view
+        self.view = view
         self._host = host
 
     def subscription(self) -> Subscription:
         """See the base class."""
-        info = self._view.info
+        info = self.view.info
         topic = camera_filter(info.zmq_topic)
         return Subscription(resolve_endpoint(info.zmq_endpoint, self._host()), (topic,), topic.__eq__, pictures=True)
 
     def decode(self, topic: bytes, payload: BytesLike) -> CameraSample:
         """Read a picture. Raises `ProtocolError`."""
-        view = self._view
+        view = self.view
         width, height = view.info.resolution
         frame = decode_camera(payload, view.mode, width, height, where=topic.decode(errors="replace"))
         return CameraSample(
@@ -285,6 +296,94 @@ class CameraSource(_SocketSource):
             sim_time=frame.sim_time,
             capture_time=frame.capture_time,
         )
+
+
+class _Shared(_SocketSource):
+    """A source whose publications are in shared memory, too, and come from there whenever they can."""
+
+    regions: Regions
+
+    @abstractmethod
+    def place(self) -> Place:
+        """Say which region. Raises `ProtocolError` where there can be none."""
+
+    def attach(self, sink: Sink) -> None:
+        """Begin to feed `sink`, from the event loop."""
+        self.regions.attach(sink, self)
+
+    def detach(self, sink: Sink) -> None:
+        """Stop feeding `sink`. Idempotent."""
+        self.regions.detach(sink)
+
+    def silence(self, sink: Sink, seconds: float) -> tuple[str, str]:
+        """Return why nothing came for so long, and what to do about it."""
+        path = self.regions.path(sink)
+        if path is None:
+            return super().silence(sink, seconds)
+        return f"nothing new in {path} within {seconds * 1000:.0f} ms.", self.silent
+
+
+class SharedStateSource(_Shared, StateSource):
+    """The snapshots of the state region, or of the state socket.
+
+    Args:
+        regions: The client's.
+        subscriptions: The client's.
+        endpoint: Tells where the state socket is.
+    """
+
+    def __init__(self, regions: Regions, subscriptions: Subscriptions, endpoint: Callable[[], str]) -> None:
+        super().__init__(subscriptions, endpoint)
+        self.regions = regions
+
+    def place(self) -> Place:
+        """See the base class."""
+        return Place(STATE_FILE, STATE_FULL, doorbell.STATE)
+
+
+class SharedCameraSource(_Shared, CameraSource):
+    """The pictures of one camera, from its region or from its socket.
+
+    A picture from the region is converted when somebody looks at it, straight into an array of the user's.
+
+    Args:
+        regions: The client's.
+        subscriptions: The client's.
+        view: The camera.
+        host: Tells under which name or address the server was reached.
+    """
+
+    def __init__(
+        self, regions: Regions, subscriptions: Subscriptions, view: HasCamera, host: Callable[[], str]
+    ) -> None:
+        super().__init__(subscriptions, view, host)
+        self.regions = regions
+        self._taken: SharedPicture | None = None
+
+    def place(self) -> Place:
+        """See the base class."""
+        topic = self.view.info.zmq_topic
+        articulation, _, camera = topic.strip().partition("/camera/")
+        return Place(camera_file(articulation, camera), camera_filter(topic), doorbell.CAMERA)
+
+    def wants(self, topic: bytes, payload: BytesLike) -> bool:
+        """Leave out a picture that was read already, in place of the one before it."""
+        taken = self._taken
+        return not (
+            isinstance(payload, SharedPicture)
+            and taken is not None
+            and payload.reader is taken.reader
+            and payload.sequence <= taken.sequence
+        )
+
+    def decode(self, topic: bytes, payload: BytesLike) -> CameraSample:
+        """Read a picture. Raises `ProtocolError`."""
+        if not isinstance(payload, SharedPicture):
+            return super().decode(topic, payload)
+        decode = super().decode
+        found = payload.read(lambda slot: decode(topic, slot))
+        self._taken = SharedPicture(payload.reader, found.sequence, len(payload))
+        return found.payload
 
 
 class EventBus:

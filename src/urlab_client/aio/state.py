@@ -216,6 +216,7 @@ class SimState:
 
     async def adopt(self, hello: HelloOk, *, timeout: Timeout = DEFAULT) -> None:
         """Take over a handshake: load its model, bind the wrappers, bring the server into the wanted step mode."""
+        await self.session.transport.follow(hello)
         loaded = None
         if self._local_model:
             if hello.mjb is not None and not self._trusted:
@@ -237,7 +238,7 @@ class SimState:
             )
             self.step_count = 0
         self._views()  # binds the cameras to what the handshake says of them
-        self.publishers.subscriptions.refresh()
+        self.publishers.refresh()
         if hello.manager_present and not played:
             self.publishers.events.publish(PlayStarted(articulations=list(self.articulations)))
         if not hello.manager_present:
@@ -418,6 +419,7 @@ class SimState:
         played = self.hello is not None and self.hello.manager_present
         if self.hello is not None:
             self.hello.manager_present = False
+        self.publishers.release_regions()
         self.mode = StepMode.LIVE
         self.promoted_from = None
         if played:

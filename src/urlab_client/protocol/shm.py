@@ -268,6 +268,21 @@ class Region:
                 return Publication(sequence, payload)
         return None
 
+    def view_latest(self) -> Publication[memoryview] | None:
+        """Return a live view of the newest publication, None if there is none or the writer gets in the way.
+
+        For readers that do without a copy: what they saw counts only if `holds` says so afterwards.
+
+        Raises:
+            ProtocolError: If slot number or payload size are outside the region.
+        """
+        # The view is the point here; whether it is whole, `holds` tells at the time that matters.
+        return self.read_latest(take=lambda view: view)
+
+    def holds(self, sequence: int) -> bool:
+        """Return whether what was read since publication `sequence` came out is whole."""
+        return not self._is_torn(sequence)
+
     def _payload(self, slot: int) -> memoryview:
         self._fence()
         if slot >= self.n_buffers:

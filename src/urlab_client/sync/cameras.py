@@ -10,6 +10,7 @@ import numpy as np
 
 from urlab_client.aio import cameras as aio
 from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.publishers import SharedFrame
 from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraInfo
@@ -18,7 +19,7 @@ from urlab_client.protocol.rows import Pixels
 from urlab_client.sync._portal import Facade
 from urlab_client.sync.streams import Stream
 
-__all__ = ["URLabCameraView"]
+__all__ = ["SharedFrame", "URLabCameraView"]
 
 
 class URLabCameraView(Facade, twin=aio.URLabCameraView):
@@ -95,3 +96,11 @@ class URLabCameraView(Facade, twin=aio.URLabCameraView):
         return self._portal.wrap(
             Stream[CameraSample], self._aio.frames(policy, buffer=buffer, buffer_bytes=buffer_bytes, timeout=timeout)
         )
+
+    def shared_frame(self) -> SharedFrame | None:
+        """Return the newest picture without copying it, for `transport="shm"`: see `SharedFrame` for what that means.
+
+        None unless the camera's pictures are being received from shared memory, as in live mode, or in any mode while
+        a stream of `frames` is open.
+        """
+        return self._aio.shared_frame()

@@ -176,7 +176,7 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
 
     @property
     def transport_stats(self) -> TransportStats:
-        """Counters of requests, replies and connections."""
+        """Counters of requests, replies and connections, and of what went which way with `transport="shm"`."""
         return self._aio.transport_stats
 
     @property
@@ -292,6 +292,7 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
         Raises:
             URLabVersionMismatch: Client and server MuJoCo builds differ.
             ServerUnreachable: Nothing answers at the address.
+            URLabConnectionError: With `transport="shm"`, the server's shared memory is not on this machine.
             AuthenticationFailed: Server and client do not accept each other's keys.
         """
         self._portal.call(self._aio.discover(observations, timeout=timeout))

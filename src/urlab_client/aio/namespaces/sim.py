@@ -99,6 +99,8 @@ class SimNamespace(Namespace):
         """
         loop = asyncio.get_running_loop()
         self._state.stopping = True
+        # On Windows, what we have mapped the server could neither remove nor make anew.
+        self._state.publishers.release_regions()
         try:
             await self._call(StopPie(), timeout)
             # The plugin answers when the end has been requested.

@@ -8,6 +8,7 @@ from typing import Protocol
 from msgspec import Struct
 
 from urlab_client.protocol.base import Op
+from urlab_client.protocol.messages.session import HelloOk
 from urlab_client.protocol.messages.streams import ClientEvent
 
 __all__ = ["Transport", "TransportStats"]
@@ -21,12 +22,16 @@ class TransportStats(Struct):
         received: Replies matched to a request.
         late: Replies that came after their request had given up; dropped.
         connects: Connections made; more than one means the server was lost and found again.
+        over_shm: Requests among those sent that went over shared memory.
+        over_zmq: With `transport="shm"`, how many requests that went over ZMQ all the same, by reason.
     """
 
     sent: int = 0
     received: int = 0
     late: int = 0
     connects: int = 0
+    over_shm: int = 0
+    over_zmq: dict[str, int] = {}
 
 
 class Transport(Protocol):
@@ -66,6 +71,14 @@ class Transport(Protocol):
             ConnectionLost: The connection broke after sending; the op changes nothing.
             OutcomeUnknown: The connection broke after sending; the op may have been executed.
             ClientClosed: The client was closed.
+        """
+        ...
+
+    async def follow(self, hello: HelloOk) -> None:
+        """Take over what a handshake says about other ways to the server.
+
+        Raises:
+            URLabConnectionError: The way that was asked for is not there.
         """
         ...
 

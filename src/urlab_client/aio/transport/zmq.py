@@ -31,6 +31,7 @@ from urlab_client.protocol.errors import (
     URLabError,
     URLabTimeoutError,
 )
+from urlab_client.protocol.messages.session import HelloOk
 from urlab_client.protocol.messages.streams import (
     ClientEvent,
     ServerAnswers,
@@ -127,6 +128,9 @@ class ZmqTransport:
             if timer is not None:
                 timer.cancel()
             self._sent.pop(key, None)
+
+    async def follow(self, hello: HelloOk) -> None:
+        """See `Transport.follow`: there is no other way."""
 
     async def aclose(self) -> None:
         """See `Transport.aclose`."""

@@ -1,0 +1,394 @@
+"""Streams out of shared memory: state and pictures, with the sockets beside them for while a region is not there.
+
+One reader per region serves all sinks. A region keeps the newest publication alone, so streams that want all of them
+receive from the sockets anyway.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import threading
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Protocol, TypeVar, cast
+
+from msgspec import Struct
+
+from urlab_client.aio.transport.mapping import Mapping
+from urlab_client.aio.transport.shm import SharedMemory
+from urlab_client.aio.transport.subscriber import Sink, Subscription, Subscriptions, client_closed
+from urlab_client.aio.transport.waiter import Stream
+from urlab_client.protocol import doorbell
+from urlab_client.protocol.errors import ProtocolError
+from urlab_client.protocol.rows import BytesLike
+from urlab_client.protocol.shm import Publication
+
+__all__ = ["Place", "RegionSource", "Regions", "SharedPicture"]
+
+log = logging.getLogger("urlab_client.streams")
+
+T = TypeVar("T")
+
+# How often to look whether regions came, went or were replaced.
+_SUPERVISE_S = 0.25
+_IDLE_S = 0.5
+_SILENT_S = 1.0
+_ATTEMPTS = 4
+
+_WANTS = {doorbell.STATE: doorbell.WANT_STATE, doorbell.CAMERA: doorbell.WANT_CAMERAS}
+
+
+class Place(Struct, frozen=True):
+    """Where a source's publications are in shared memory.
+
+    Attributes:
+        file: Name of the region's file.
+        topic: What the sinks are told as topic.
+        ring: Which ring of the doorbell tells of them.
+    """
+
+    file: str
+    topic: bytes
+    ring: bytes
+
+
+class RegionSource(Protocol):
+    """What can be received from a region and from a socket."""
+
+    def place(self) -> Place:
+        """Say which region. Raises `ProtocolError` where there can be none."""
+        ...
+
+    def subscription(self) -> Subscription:
+        """Say which socket, and what there."""
+        ...
+
+
+class SharedPicture:
+    """A publication that is still in its region, to be read when somebody looks at it.
+
+    Stands for the payload: as long as one, and its source knows how to read it.
+    """
+
+    def __init__(self, reader: _Reader, sequence: int, size: int) -> None:
+        self.reader = reader
+        self.sequence = sequence
+        self._size = size
+
+    def __len__(self) -> int:
+        return self._size
+
+    def read(self, take: Callable[[memoryview], T]) -> Publication[T]:
+        """Make something of this picture, or of a newer one that took its place. From any thread.
+
+        Raises:
+            ProtocolError: It is gone, or none could be read whole.
+        """
+        return self.reader.read(take)
+
+
+class _Reader:
+    """One mapped region and those it feeds."""
+
+    def __init__(self, path: Path, place: Place) -> None:
+        self.mapping = Mapping(path)
+        self.place = place
+        self.sinks: dict[Sink, None] = {}
+        self.watch: Stream | None = None
+        self.silent = False
+        self.seen = 0
+        self.changed_at = 0.0
+        # Pictures are read from whatever thread looks at them.
+        self._lock = threading.Lock()
+        self._closed = False
+
+    @property
+    def region_sequence(self) -> int:
+        return self.mapping.region.sequence
+
+    def news(self) -> bool:
+        """Whether there is something to do. From the thread that looks."""
+        return not self.mapping.intact() or self.mapping.region.sequence != self.seen
+
+    def message(self) -> BytesLike | None:
+        """Return what is there now, None if that is nothing. Raises `ProtocolError`."""
+        region = self.mapping.region
+        if self.place.ring == doorbell.CAMERA:
+            self.seen = region.sequence
+            # The sinks measure it and hand it back to their source, which knows what it is.
+            return cast("BytesLike", SharedPicture(self, self.seen, region.max_payload)) if self.seen else None
+        found = region.read_latest()
+        if found is None:
+            return None
+        self.seen = found.sequence
+        return found.payload
+
+    def read(self, take: Callable[[memoryview], T]) -> Publication[T]:
+        with self._lock:
+            if not self._closed and self.mapping.intact():
+                for _ in range(_ATTEMPTS):
+                    found = self.mapping.region.read_latest(take=take)
+                    if found is not None:
+                        return found
+                raise ProtocolError(f"{self.mapping.path}: pictures come faster than they can be read.")
+        raise ProtocolError(f"{self.mapping.path}: the picture is gone.")
+
+    def view(self) -> tuple[Publication[memoryview], Callable[[], bool]] | None:
+        """Return a live view of what is there now, and what tells whether it still is."""
+        with self._lock:
+            if self._closed or not self.mapping.intact():
+                return None
+            found = self.mapping.region.view_latest()
+            return None if found is None else (found, lambda: self._holds(found.sequence))
+
+    def _holds(self, sequence: int) -> bool:
+        with self._lock:
+            return not self._closed and self.mapping.intact() and self.mapping.region.holds(sequence)
+
+    def close(self) -> None:
+        with self._lock:
+            self._closed = True
+            self.mapping.close()
+
+
+class Regions:
+    """All that one client receives from shared memory. Used from one event loop, but for `view`.
+
+    Args:
+        memory: Where the regions are.
+        subscriptions: The sockets beside them.
+    """
+
+    def __init__(self, memory: SharedMemory, subscriptions: Subscriptions) -> None:
+        self._memory = memory
+        self._subscriptions = subscriptions
+        self._sources: dict[Sink, RegionSource] = {}
+        self._readers: dict[str, _Reader] = {}
+        self._refused: dict[str, str] = {}
+        self._timer: asyncio.TimerHandle | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._away = False
+        self._closed = False
+        for ring in _WANTS:
+            memory.rung[ring].append(self._look_at_all)
+
+    def attach(self, sink: Sink, source: RegionSource) -> None:
+        """Let `sink` have what `source` describes, from the region if it is there, else from the socket."""
+        if self._closed:
+            raise client_closed()
+        self._loop = asyncio.get_running_loop()
+        reader = self._reader(source)
+        if reader is None or reader.silent:
+            self._subscriptions.attach(sink, source.subscription)
+        else:
+            self._feed(reader, sink)
+        self._sources[sink] = source
+        if self._timer is None:
+            self._timer = self._loop.call_later(_SUPERVISE_S, self._supervise)
+
+    def detach(self, sink: Sink) -> None:
+        """Stop receiving for `sink`. Does nothing if it does not receive."""
+        if self._sources.pop(sink, None) is None:
+            return
+        self._subscriptions.detach(sink)
+        for reader in tuple(self._readers.values()):
+            reader.sinks.pop(sink, None)
+            if not reader.sinks and not reader.silent:
+                self._close_reader(reader)
+
+    def path(self, sink: Sink) -> Path | None:
+        """Return the file from which `sink` receives; None if that is a socket, or nothing."""
+        return next((r.mapping.path for r in self._readers.values() if sink in r.sinks), None)
+
+    def refresh(self) -> None:
+        """Follow a handshake: play may have begun, and the regions may be others."""
+        self._away = False
+        self._refused.clear()
+        for reader in tuple(self._readers.values()):
+            if not reader.mapping.intact() or reader.mapping.replaced() or self._moved(reader):
+                self._lose(reader)
+        self._settle_all()
+
+    def release(self) -> None:
+        """Let go of every region, until the next handshake: play ends, and the server removes the files."""
+        self._away = True
+        for reader in tuple(self._readers.values()):
+            self._lose(reader)
+
+    def view(self, source: RegionSource) -> tuple[Publication[memoryview], Callable[[], bool]] | None:
+        """Return a live view of the newest publication and what tells whether it still holds; None without a region."""
+        reader = self._readers.get(source.place().file)
+        return None if reader is None else reader.view()
+
+    def close(self) -> None:
+        """End every stream with `ClientClosed`. Idempotent."""
+        if self._closed:
+            return
+        self._closed = True
+        if self._timer is not None:
+            self._timer.cancel()
+        ended = [sink for reader in self._readers.values() for sink in reader.sinks]
+        for reader in tuple(self._readers.values()):
+            self._close_reader(reader)
+        self._sources.clear()
+        for sink in ended:
+            sink.on_end(client_closed)
+
+    # Readers
+
+    def _reader(self, source: RegionSource) -> _Reader | None:
+        """Return the reader of a source's region, opening it if there is one with something in it."""
+        if self._away:
+            return None
+        try:
+            place = source.place()
+            known = self._readers.get(place.file)
+            if known is not None:
+                return known
+            path = self._memory.find(place.file)
+            if path is None:
+                return None
+            reader = _Reader(path, place)
+        except (OSError, ProtocolError) as error:
+            log.debug("not from shared memory: %s", error)
+            return None
+        if reader.region_sequence == 0:
+            reader.close()
+            return None
+        reader.changed_at = self._now()
+        self._readers[place.file] = reader
+        self._memory.connect_bell()
+        self._memory.want(_WANTS[place.ring])
+        self._rouse(reader)
+        log.debug("receiving from %s", path)
+        return reader
+
+    def _feed(self, reader: _Reader, sink: Sink) -> None:
+        reader.sinks[sink] = None
+        if self._loop is not None:
+            # What is there already counts, too; a sink that attaches is not ready for it at this very moment.
+            self._loop.call_soon(self._welcome, reader, sink)
+
+    def _welcome(self, reader: _Reader, sink: Sink) -> None:
+        if self._readers.get(reader.place.file) is reader and reader.news():
+            self._look_at(reader)
+        else:
+            self._deliver(reader, (sink,))
+
+    def _rouse(self, reader: _Reader) -> None:
+        """See to it that news of a reader's region is noticed."""
+        if self._memory.bell is None and reader.watch is None:
+            reader.watch = Stream(reader.news, lambda: self._look_at(reader))
+            self._memory.waiter.add(reader.watch)
+        elif self._memory.bell is not None and reader.watch is not None:
+            self._memory.waiter.remove(reader.watch)
+            reader.watch = None
+
+    def _look_at_all(self) -> None:
+        for reader in tuple(self._readers.values()):
+            self._rouse(reader)
+            self._look_at(reader)
+
+    def _look_at(self, reader: _Reader) -> None:
+        """Hand out what is new in a region."""
+        if self._readers.get(reader.place.file) is not reader:
+            return
+        if not reader.mapping.intact():
+            self._lose(reader)
+            return
+        if reader.region_sequence != reader.seen:
+            reader.changed_at = self._now()
+            if reader.silent:
+                self._resume(reader)
+            self._deliver(reader, tuple(reader.sinks))
+        if reader.watch is not None:
+            reader.watch.resume()
+
+    def _deliver(self, reader: _Reader, sinks: Iterable[Sink]) -> None:
+        if self._readers.get(reader.place.file) is not reader or not reader.mapping.intact():
+            return
+        try:
+            payload = reader.message()
+        except ProtocolError as error:
+            reader.seen = reader.region_sequence
+            for sink in sinks:
+                sink.on_malformed(str(error.args[0]))
+            return
+        if payload is None:
+            return
+        for sink in sinks:
+            if sink in reader.sinks:
+                sink.on_message(reader.place.topic, payload)
+                sink.on_drained()
+
+    def _lose(self, reader: _Reader) -> None:
+        """Go on without a region."""
+        sinks = tuple(reader.sinks)
+        self._close_reader(reader)
+        for sink in sinks:
+            self._subscribe(sink)
+
+    def _close_reader(self, reader: _Reader) -> None:
+        self._readers.pop(reader.place.file, None)
+        if reader.watch is not None:
+            self._memory.waiter.remove(reader.watch)
+            reader.watch = None
+        reader.sinks.clear()
+        reader.close()
+
+    def _subscribe(self, sink: Sink) -> None:
+        source = self._sources.get(sink)
+        if source is not None:
+            with contextlib.suppress(ProtocolError, ValueError):  # an address that is none: as silent as a closed port
+                self._subscriptions.attach(sink, source.subscription)
+
+    def _resume(self, reader: _Reader) -> None:
+        """Take the sinks that had to do without back to a region that has come to life again."""
+        reader.silent = False
+        for sink, source in self._sources.items():
+            if source.place().file == reader.place.file:
+                self._subscriptions.detach(sink)
+                reader.sinks[sink] = None
+
+    # Supervision
+
+    def _supervise(self) -> None:
+        self._timer = None
+        now = self._now()
+        for reader in tuple(self._readers.values()):
+            self._rouse(reader)
+            self._look_at(reader)
+            idle = now - reader.changed_at
+            if idle > _IDLE_S and self._readers.get(reader.place.file) is reader:
+                if reader.mapping.replaced() or self._moved(reader):
+                    self._lose(reader)
+                elif idle > _SILENT_S and reader.place.ring == doorbell.STATE and not reader.silent:
+                    # While play runs there is always news; a snapshot that outgrew its slot comes by socket only.
+                    reader.silent = True
+                    sinks = tuple(reader.sinks)
+                    reader.sinks.clear()
+                    for sink in sinks:
+                        self._subscribe(sink)
+        self._settle_all()
+        if self._sources and self._loop is not None:
+            self._timer = self._loop.call_later(_SUPERVISE_S, self._supervise)
+        for reader in tuple(self._readers.values()):
+            if not self._sources:
+                self._close_reader(reader)
+
+    def _settle_all(self) -> None:
+        """Take sinks that receive from sockets to their regions, where these are there by now."""
+        for sink, source in tuple(self._sources.items()):
+            if self.path(sink) is None:
+                reader = self._reader(source)
+                if reader is not None and not reader.silent:
+                    self._subscriptions.detach(sink)
+                    self._feed(reader, sink)
+
+    def _moved(self, reader: _Reader) -> bool:
+        return self._memory.find(reader.place.file) != reader.mapping.path
+
+    def _now(self) -> float:
+        return 0.0 if self._loop is None else self._loop.time()

@@ -1,0 +1,82 @@
+"""Windows' named events and locks, with which the plugin's shared memory saves itself from polling.
+
+Only what the client needs, and nothing on other systems. Everything works without the events, only slower.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+from typing import Any
+
+__all__ = ["NamedEvent", "NamedLock"]
+
+_SYNCHRONIZE = 0x00100000
+_EVENT_MODIFY_STATE = 0x0002
+_ALREADY_EXISTS = 183
+
+
+def _kernel() -> Any:
+    if sys.platform != "win32":
+        return None
+    kernel = ctypes.WinDLL("kernel32", use_last_error=True)
+    kernel.OpenEventW.restype = kernel.CreateMutexW.restype = ctypes.c_void_p
+    for function in (kernel.SetEvent, kernel.CloseHandle):
+        function.argtypes = [ctypes.c_void_p]
+    kernel.WaitForSingleObject.argtypes = [ctypes.c_void_p, ctypes.c_uint32]
+    return kernel
+
+
+class NamedEvent:
+    """An auto-reset event of the server. Without one of that name, as on other systems, it does nothing.
+
+    Args:
+        name: Its name.
+
+    Attributes:
+        exists: Whether the server made it.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._handle: int | None = None
+        self._kernel = _kernel()
+        if sys.platform == "win32":
+            self._handle = self._kernel.OpenEventW(_SYNCHRONIZE | _EVENT_MODIFY_STATE, 0, name)
+        self.exists = bool(self._handle)
+
+    def set(self) -> None:
+        """Wake who waits for it."""
+        if self._handle:
+            self._kernel.SetEvent(self._handle)
+
+    def wait(self, seconds: float) -> None:
+        """Wait until it is set, at most so long; other threads go on."""
+        if self._handle:
+            self._kernel.WaitForSingleObject(self._handle, max(1, int(seconds * 1000)))
+
+    def close(self) -> None:
+        """Let go of it."""
+        if self._handle:
+            self._kernel.CloseHandle(self._handle)
+            self._handle = None
+
+
+class NamedLock:
+    """A lock among the processes of one machine, which the system releases when its owner dies.
+
+    It is held by whoever made the object of that name: a mutex proper would let one thread take it twice.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._handle: int | None = None
+        self.held = True
+        self._kernel = _kernel()
+        if sys.platform == "win32":
+            self._handle = self._kernel.CreateMutexW(None, 0, name)
+            self.held = ctypes.get_last_error() != _ALREADY_EXISTS
+
+    def close(self) -> None:
+        """Release it."""
+        if self._handle:
+            self._kernel.CloseHandle(self._handle)
+            self._handle = None

@@ -1,0 +1,301 @@
+"""Requests over shared memory, against a server that behaves like the plugin and whose every answer a test dictates."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from plugin_memory import PluginMemory
+
+from urlab_client.aio import URLabClient
+from urlab_client.protocol import shm
+from urlab_client.protocol.errors import ProtocolError, SessionTakenOver, URLabConnectionError, URLabTimeoutError
+from urlab_client.protocol.messages.runtime import SetQpos
+
+SESSION = "11111111-2222-3333-4444-555555555555"
+STEP = {"op": "step_ok", "time": 0.5, "step": 1.0, "per_articulation": {}}
+
+
+@pytest.fixture
+def directory(tmp_path: Path) -> Path:
+    return tmp_path / "live"
+
+
+@pytest.fixture
+def plugin(scripted: Any, directory: Path) -> Any:
+    hello = scripted.answers["hello"]({}) | {
+        "manager_present": True,
+        "shm_session_dir": str(directory.parent / SESSION),
+        "session_id": SESSION,
+    }
+    scripted.on("hello", hello)
+    scripted.on("step", STEP)
+    scripted.on("set_paused", lambda request: {"op": "set_paused_ok", "paused": request["paused"]})
+    memory = PluginMemory(directory, scripted.answers, session_id=SESSION)
+    yield memory
+    memory.close()
+
+
+@pytest.fixture
+async def connect(scripted: Any, plugin: PluginMemory) -> AsyncIterator[Callable[..., URLabClient]]:
+    made: list[URLabClient] = []
+
+    def connect(**options: Any) -> URLabClient:
+        defaults: dict[str, Any] = {"step_port": scripted.port, "rcv_timeout_ms": 500, "local_model": False}
+        made.append(URLabClient("tcp://127.0.0.1", transport="shm", **(defaults | options)))
+        return made[-1]
+
+    yield connect
+    for client in made:
+        await client.close()
+
+
+async def shared(client: URLabClient) -> URLabClient:
+    """Discover, and step once: the first reply's size is not known yet, so that goes over ZMQ."""
+    await client.discover()
+    await client.step()
+    return client
+
+
+async def test_a_step_goes_over_shared_memory_once_its_size_is_known(connect: Any, plugin: PluginMemory) -> None:
+    client = await shared(connect())
+    assert plugin.seen == []
+    for _ in range(3):
+        reply = await client.step()
+        assert reply.time == 0.5
+    assert plugin.seen == ["step"] * 3
+    stats = client.transport_stats
+    assert stats.over_shm == 3
+    assert stats.over_zmq == {"handshake": 2, "size of the reply not known yet": 1}
+    assert stats.sent == stats.received == 6
+
+
+async def test_editor_ops_pictures_and_open_ended_replies_stay_on_zmq(
+    connect: Any, plugin: PluginMemory, scripted: Any
+) -> None:
+    scripted.on("get_contacts", {"op": "get_contacts_ok", "n_contacts": 0, "truncated": False, "contacts": []})
+    scripted.on("clear_markers", {"op": "clear_markers_ok"})
+    scripted.on("set_mode", {"op": "set_mode_ok", "previous_mode": "direct", "current_mode": "direct"})
+    client = await shared(connect(step_mode="direct"))
+    await client.debug.clear_markers()
+    await client.runtime.get_contacts()
+    await client.step(include_cameras=True)
+    assert plugin.seen == ["set_mode"]
+    assert client.transport_stats.over_zmq == {
+        "handshake": 2,
+        "size of the reply not known yet": 1,
+        "editor op": 1,
+        "reply may be too large": 1,
+        "pictures": 1,
+    }
+
+
+async def test_a_large_state_stays_on_zmq_from_the_start(connect: Any, plugin: PluginMemory, scripted: Any) -> None:
+    many = {"op": "step_ok", "time": 0.5, "step": 1.0, "per_articulation": {}, "padding": "x" * 200_000}
+    scripted.on("step", many)
+    client = await shared(connect())
+    await client.step()
+    assert plugin.seen == []
+    assert client.transport_stats.over_zmq["reply may be too large"] == 1
+
+
+async def test_a_request_larger_than_the_slot_goes_over_zmq(scripted: Any, tmp_path: Path, connect: Any) -> None:
+    small = PluginMemory(tmp_path / "small", scripted.answers, session_id=SESSION, stride=200)
+    scripted.on(
+        "set_qpos",
+        {
+            "op": "set_qpos_ok",
+            "target": "a",
+            "actor_name": "a",
+            "actor_id": "",
+            "qpos": [0.0],
+            "free_base_shortcut": False,
+        },
+    )
+    client = connect(shm_dir=str(tmp_path / "small"))
+    await client.discover()
+    await client.call(SetQpos(target="a", qpos=np.zeros(100)))
+    assert client.transport_stats.over_zmq["request too large"] == 1
+    assert small.seen == []
+    small.close()
+
+
+async def test_wrong_transport_is_repeated_once_and_remembered(
+    connect: Any, plugin: PluginMemory, scripted: Any
+) -> None:
+    over_zmq = scripted.answers["set_paused"]
+    refusal = {"op": "error", "code": "wrong_transport", "message": "op 'set_paused' is not served here"}
+    plugin.answers = plugin.answers | {"set_paused": lambda _: refusal}
+    assert scripted.answers["set_paused"] is over_zmq
+    client = await shared(connect())
+    for paused in (True, False):
+        assert await client.runtime.set_paused(paused) is paused
+    assert plugin.seen == ["set_paused"]
+    assert client.transport_stats.over_zmq["refused by the server"] == 2
+
+
+async def test_a_late_reply_is_not_taken_for_the_next_one(connect: Any, plugin: PluginMemory, scripted: Any) -> None:
+    client = await shared(connect())
+    scripted.on("step", None)
+    with pytest.raises(URLabTimeoutError, match="may still be executed"):
+        await client.step(timeout=0.05)
+    plugin.reply(STEP | {"time": 99.0})  # at last
+    scripted.on("step", STEP | {"time": 0.75})
+    for _ in range(5):
+        assert (await client.step()).time == 0.75
+    assert client.transport_stats.over_zmq["waiting for an old reply"] >= 1
+    assert plugin.seen[-1] == "step"
+    assert plugin.held.qsize() == 1, "it was sent once"
+
+
+async def test_a_cancelled_step_leaves_no_reply_behind(connect: Any, plugin: PluginMemory, scripted: Any) -> None:
+    client = await shared(connect())
+    scripted.on("step", None)
+    task = asyncio.create_task(client.step(timeout=None))
+    await asyncio.to_thread(plugin.held.get)
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    scripted.on("step", STEP | {"time": 0.75})
+    plugin.reply(STEP | {"time": 99.0})
+    sent = client.transport_stats.over_shm
+    while client.transport_stats.over_shm == sent:
+        assert (await client.step()).time == 0.75
+
+
+async def test_a_reply_to_something_else_is_dropped(connect: Any, plugin: PluginMemory, scripted: Any) -> None:
+    client = await shared(connect())
+    scripted.on("step", None)
+    task = asyncio.create_task(client.step())
+    await asyncio.to_thread(plugin.held.get)
+    plugin.reply({"op": "set_paused_ok", "paused": True})
+    while client.transport_stats.late == 0:  # noqa: ASYNC110 - counters have no event
+        await asyncio.sleep(0)
+    plugin.reply(STEP | {"time": 0.25})
+    assert (await task).time == 0.25
+
+
+async def test_a_real_refusal_is_raised(connect: Any, plugin: PluginMemory) -> None:
+    client = await shared(connect())
+    plugin.session_id = "another"
+    with pytest.raises(SessionTakenOver):
+        await client.step()
+
+
+async def test_what_a_dead_client_left_behind_is_waited_out(
+    connect: Any, plugin: PluginMemory, scripted: Any, directory: Path
+) -> None:
+    # The worker is still busy with the dead client's step while the next client says hello.
+    scripted.on("step", None)
+    plugin.requests.region.publish(b"\x82\xa2op\xa4step\xaasession_id\xd9\x24" + SESSION.encode())
+    await asyncio.to_thread(plugin.held.get)
+    scripted.on("step", STEP)
+    client = await shared(connect())
+    plugin.reply(STEP | {"time": 99.0})
+    for _ in range(5):
+        assert (await client.step()).time == 0.5
+
+
+async def test_the_second_client_uses_zmq_until_the_first_has_gone(connect: Any, plugin: PluginMemory) -> None:
+    first = await shared(connect())
+    second = await shared(connect())
+    await second.step()
+    assert second.transport_stats.over_shm == 0
+    assert second.transport_stats.over_zmq["regions in use by another client"] >= 2
+    await first.step()
+    assert first.transport_stats.over_shm == 1
+    await first.close()
+    await second.discover()
+    await second.step()
+    await second.step()
+    assert second.transport_stats.over_shm >= 1
+
+
+@pytest.mark.parametrize("file", [shm.REQUEST_FILE, shm.REPLY_FILE])
+async def test_missing_regions_are_named(connect: Any, directory: Path, file: str) -> None:
+    (directory / file).unlink()
+    with pytest.raises(URLabConnectionError, match=f"live/{file}.*{SESSION}/{file}"):
+        await connect().discover()
+
+
+async def test_an_explicit_directory_wins(connect: Any, plugin: PluginMemory, tmp_path: Path, scripted: Any) -> None:
+    elsewhere = PluginMemory(tmp_path / "elsewhere", scripted.answers, session_id=SESSION)
+    client = await shared(connect(shm_dir=str(tmp_path / "elsewhere")))
+    await client.step()
+    assert (elsewhere.seen, plugin.seen) == (["step"], [])
+    elsewhere.close()
+
+
+HOSTILE = {
+    "empty": b"",
+    "short": b"URLB" + bytes(20),
+    "not written yet": bytes(4096),
+    "another magic": b"ELF\0" + bytes(4096),
+    "huge stride": shm._HEADER.pack(shm.MAGIC, 1, 0xFFFFFFFF, 2, 0, 0) + bytes(4096),
+    "no slots": shm._HEADER.pack(shm.MAGIC, 1, 64, 1, 0, 0) + bytes(4096),
+    "slot out of range": shm._HEADER.pack(shm.MAGIC, 1, 64, 2, 5, 7) + bytes(4096),
+}
+
+
+@pytest.mark.parametrize("content", HOSTILE.values(), ids=HOSTILE)
+async def test_a_file_that_is_no_region_is_refused(connect: Any, directory: Path, content: bytes) -> None:
+    (directory / shm.REPLY_FILE).unlink()
+    (directory / shm.REPLY_FILE).write_bytes(content)
+    client = connect()
+    with pytest.raises(URLabConnectionError, match=r"rep\.shm"):
+        await client.discover()
+    assert client.connected
+
+
+async def test_a_pipe_in_place_of_a_region_is_refused(connect: Any, directory: Path) -> None:
+    (directory / shm.REPLY_FILE).unlink()
+    os.mkfifo(directory / shm.REPLY_FILE)
+    with pytest.raises(URLabConnectionError, match="not a file"):
+        await connect().discover()
+
+
+async def test_a_region_cut_off_between_two_requests(connect: Any, plugin: PluginMemory, directory: Path) -> None:
+    client = await shared(connect())
+    await client.step()
+    os.truncate(directory / shm.REPLY_FILE, 100)
+    await client.step()
+    assert client.transport_stats.over_zmq["no usable regions"] == 1
+
+
+async def test_a_damaged_reply_region_is_an_error_and_then_left_alone(
+    connect: Any, plugin: PluginMemory, scripted: Any
+) -> None:
+    client = await shared(connect())
+    scripted.on("step", None)
+    task = asyncio.create_task(client.step())
+    await asyncio.to_thread(plugin.held.get)
+    region = plugin.replies.region
+    region._latest[0] = 9
+    region._sequence[0] += 1
+    with pytest.raises(ProtocolError, match="latest_idx is 9"):
+        await task
+    scripted.on("step", STEP)
+    assert (await client.step()).time == 0.5
+
+
+async def test_regions_made_anew_are_found(connect: Any, plugin: PluginMemory, directory: Path, scripted: Any) -> None:
+    client = await shared(connect())
+    await client.step()
+    for file in (shm.REQUEST_FILE, shm.REPLY_FILE):
+        (directory / file).unlink()
+    again = PluginMemory(directory, scripted.answers, session_id=SESSION)
+    await client.discover()
+    await client.step()
+    await client.step()
+    assert again.seen == ["step"]
+    again.close()
+
+
+async def test_a_directory_without_shm_is_a_mistake() -> None:
+    with pytest.raises(ValueError, match="shm_dir"):
+        URLabClient("tcp://127.0.0.1", shm_dir="/tmp")
