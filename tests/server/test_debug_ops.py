@@ -12,7 +12,8 @@ from wire import Wire
 
 from urlab_client.server import SimulatedServer
 from urlab_client.server.handlers.debug import _color
-from urlab_client.server.markers import MAX_PRIMITIVES, Drawings, Line, Sphere
+from urlab_client.server.limits import Limits
+from urlab_client.server.markers import Drawings, Line, Sphere
 
 COLOR = [1, 0, 0]
 VALID: dict[str, dict[str, Any]] = {
@@ -138,6 +139,6 @@ def test_the_oldest_gives_way(caplog: pytest.LogCaptureFixture) -> None:
     line = Line(start=(0.0, 0.0, 0.0), end=(1.0, 0.0, 0.0), color=(1.0, 1.0, 1.0))
     drawings.add([sphere(0)], ttl=-1.0, in_play=False)
     with caplog.at_level(logging.WARNING, logger="urlab_client.server"):
-        drawings.add([line] * MAX_PRIMITIVES, ttl=-1.0, in_play=False)
-    assert drawings.take_frame(in_play=False) == [line] * MAX_PRIMITIVES
+        drawings.add([line] * Limits.markers, ttl=-1.0, in_play=False)
+    assert drawings.take_frame(in_play=False) == [line] * Limits.markers
     assert "clear_markers" in caplog.text

@@ -19,10 +19,12 @@ from urlab_client.protocol.codec import MAX_REQUEST_BYTES, encode_request
 from urlab_client.protocol.messages import runtime, scene, session
 from urlab_client.protocol.messages.session import ArticulationCommand, Step
 from urlab_client.protocol.registry import OPS
+from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.requests import MAX_DEPTH, Incoming, RequestReader, need, usable
+from urlab_client.server.requests import Incoming, RequestReader, need, usable
 
 READER = RequestReader()
+DEPTH = Limits().request_depth
 pack = msgspec.msgpack.encode
 
 
@@ -123,9 +125,9 @@ def nested(depth: int) -> dict[str, Any]:
 
 
 def test_depth_limit() -> None:
-    assert read(nested(MAX_DEPTH - 1)).op is OPS["meta"]
-    assert "deeper" in refused(pack(nested(MAX_DEPTH)))
-    assert "deeper" in refused(msgspec.json.encode(nested(MAX_DEPTH)))
+    assert read(nested(DEPTH - 1)).op is OPS["meta"]
+    assert "deeper" in refused(pack(nested(DEPTH)))
+    assert "deeper" in refused(msgspec.json.encode(nested(DEPTH)))
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from urlab_client.server.controllers import ControllerConfig
 from urlab_client.server.endpoint import PortInUse
 from urlab_client.server.faults import ActiveFault, Corrupt, Cut, Delay, Drop, Fault, Faults, Refuse
 from urlab_client.server.guard import CurveServer, UnprotectedServer
+from urlab_client.server.limits import Limits
 from urlab_client.server.simulated import ModelError, SimulatedServer
 
 __all__ = [
@@ -21,6 +22,7 @@ __all__ = [
     "Drop",
     "Fault",
     "Faults",
+    "Limits",
     "ModelError",
     "PortInUse",
     "Refuse",

@@ -33,12 +33,15 @@ import msgspec
 import mujoco
 
 from urlab_client.server.bundled import BUNDLED_PREFIX, bundled_models, bundled_root
+from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
 
 __all__ = [
     "PARENT_CLASS",
     "Blueprint",
+    "Compiled",
     "ContentRoot",
+    "build_snapshot",
     "level_package",
     "mujoco_messages",
     "one_line",
@@ -54,8 +57,12 @@ PARENT_CLASS: Final = "MjArticulation"
 DEFAULT_MODEL_NAMES: Final = frozenset({"", "MuJoCo Model"})
 """What MuJoCo calls a model whose file gives no name."""
 
+_DEFAULT_LIMITS: Final = Limits()
 _LEVEL_SEGMENT: Final = re.compile(r"\w(?:[\w\- ]*[\w\-])?")
 _MAX_SEGMENT_BYTES: Final = 240
+_WINDOWS_DEVICES: Final = frozenset(
+    ("CON", "PRN", "AUX", "NUL", *(f"{kind}{number}" for kind in ("COM", "LPT") for number in range(1, 10)))
+)
 
 
 def sanitized(name: str) -> str:
@@ -77,7 +84,11 @@ def level_package(name: str) -> str:
     in_game = name[:6].casefold() == "/game/"
     parts = name[6:].split("/") if in_game else name.split("/")
     for part in parts:
-        if not _LEVEL_SEGMENT.fullmatch(part) or len(part.encode()) > _MAX_SEGMENT_BYTES:
+        if (
+            not _LEVEL_SEGMENT.fullmatch(part)
+            or len(part.encode()) > _MAX_SEGMENT_BYTES
+            or part.upper() in _WINDOWS_DEVICES
+        ):
             raise ValueError(
                 f"'{name}' is no level name: use letters, digits, spaces, '-' and '_', "
                 "or a path of such parts that begins with /Game/"
@@ -118,6 +129,27 @@ class _Record(msgspec.Struct, frozen=True, kw_only=True):
     actuator_types: dict[str, str]
     sensors: tuple[str, ...]
     cameras: tuple[str, ...]
+    n_bytes: int = 0
+
+
+class Compiled(msgspec.Struct, frozen=True, kw_only=True):
+    """What is learnt from compiling a model; see `Blueprint` for the fields it shares.
+
+    Attributes:
+        messages: MuJoCo's warnings.
+        n_bytes: Size of the compiled model.
+        largest_image: Largest width or height of its cameras, pixels.
+    """
+
+    model_name: str
+    joints: tuple[str, ...]
+    actuators: tuple[str, ...]
+    actuator_types: dict[str, str]
+    sensors: tuple[str, ...]
+    cameras: tuple[str, ...]
+    messages: tuple[str, ...]
+    n_bytes: int
+    largest_image: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,6 +169,7 @@ class Blueprint:
         actuator_types: Actuator name to MJCF element; `motor` for `<general>`.
         sensors: Sensor names in compiled order.
         cameras: Camera names in compiled order.
+        n_bytes: Memory of the compiled model; 0 where an older import did not note it.
     """
 
     stem: str
@@ -151,6 +184,7 @@ class Blueprint:
     actuator_types: Mapping[str, str]
     sensors: tuple[str, ...]
     cameras: tuple[str, ...]
+    n_bytes: int = 0
 
     @property
     def short_name(self) -> str:
@@ -198,14 +232,16 @@ class Blueprint:
 class ContentRoot:
     """The folder that stands for `/Game`, and the folders `import_xml` may read from."""
 
-    def __init__(self, saved_dir: Path, *, model_roots: Sequence[Path] = ()) -> None:
+    def __init__(self, saved_dir: Path, *, model_roots: Sequence[Path] = (), limits: Limits = _DEFAULT_LIMITS) -> None:
         """Open a content root; what was imported into it earlier is there at once.
 
         Args:
             saved_dir: Folder of the content root; made when something is first written.
             model_roots: Folders below which MJCF files may be imported. The models shipped with this package may
                 always be.
+            limits: For what clients name.
         """
+        self.limits = limits
         self.root = saved_dir.resolve()
         self.model_roots = tuple(root.resolve() for root in model_roots)
         self._blueprints: dict[str, Blueprint] = {}
@@ -252,6 +288,12 @@ class ContentRoot:
         file, source = self._locate(path, trusted=trusted)
         stem = sanitized(file.stem)
         try:
+            size = file.stat().st_size
+            if size > self.limits.model_file_bytes and not trusted:
+                raise Refusal(
+                    "import_failed",
+                    f"{file} has {size} bytes, more than the limit model_file_bytes, {self.limits.model_file_bytes}",
+                )
             text = file.read_bytes()
         except OSError as error:
             raise Refusal("import_failed", f"cannot read {file}: {error.strerror or error}") from None
@@ -260,7 +302,7 @@ class ContentRoot:
             _warn_if_stale(known, source, text)
             return known, False
         try:
-            blueprint = self._import(file, stem, source, hashlib.sha256(text).hexdigest())
+            blueprint = self._import(file, stem, source, hashlib.sha256(text).hexdigest(), trusted=trusted)
         except OSError as error:
             raise Refusal("import_failed", f"cannot store the snapshot of {file} in {self.root}: {error}") from None
         finally:
@@ -303,6 +345,10 @@ class ContentRoot:
         """
         del self._blueprints[stem]
         shutil.rmtree(self.root / IMPORTS / stem)
+
+    def open_to_clients(self, path: Path) -> bool:
+        """Whether a resolved path lies where clients may read: below the content root, a model root, or bundled."""
+        return any(path.is_relative_to(root) for root in (self.root, *self.model_roots, bundled_root()))
 
     def level_file(self, package: str) -> Path:
         """Return the file that stands for a level's package path, as `level_package` returns it."""
@@ -352,23 +398,13 @@ class ContentRoot:
     def _roots_text(self) -> str:
         return ", ".join(map(str, self.model_roots)) or "none but the bundled models"
 
-    def _import(self, file: Path, stem: str, source: str, source_digest: str) -> Blueprint:
+    def _import(self, file: Path, stem: str, source: str, source_digest: str, *, trusted: bool) -> Blueprint:
         home = self.root / IMPORTS / stem
         home.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=home, prefix=".import-") as scratch:
             snapshot = Path(scratch) / "snapshot"
-            with mujoco_messages() as messages:
-                try:
-                    spec = mujoco.MjSpec.from_file(str(file))
-                    # Compiles the file itself, so that an error names the source's own line.
-                    mujoco.MjModel.from_xml_path(str(file))
-                    prepared = _prepared(spec)
-                    kinds = {actuator.name: _actuator_kind(actuator) for actuator in prepared.actuators}
-                    _write_snapshot(prepared, snapshot, messages)
-                    model = mujoco.MjModel.from_xml_path(str(snapshot / "model.xml"))
-                except (ValueError, mujoco.FatalError) as error:
-                    raise Refusal("import_failed", f"MuJoCo rejects {file}: {one_line(error)}") from None
-            for message in dict.fromkeys(messages):
+            compiled = self._build(file, snapshot, trusted=trusted)
+            for message in compiled.messages:
                 logger.warning("%s: %s", file, one_line(message))
             digest = _digest(snapshot)
             folder = home / digest
@@ -380,14 +416,25 @@ class ContentRoot:
             source_digest=source_digest,
             imported_at=datetime.now(UTC),
             digest=digest,
-            model_name="" if spec.modelname in DEFAULT_MODEL_NAMES else spec.modelname,
-            joints=_names(model.njnt, model.joint),
-            actuators=_names(model.nactuator, model.actuator),
-            actuator_types=kinds,
-            sensors=_names(model.nsensor, model.sensor),
-            cameras=_names(model.ncam, model.camera),
+            model_name=compiled.model_name,
+            joints=compiled.joints,
+            actuators=compiled.actuators,
+            actuator_types=compiled.actuator_types,
+            sensors=compiled.sensors,
+            cameras=compiled.cameras,
+            n_bytes=compiled.n_bytes,
         )
         return self._register(home, folder, record)
+
+    def _build(self, file: Path, snapshot: Path, *, trusted: bool) -> Compiled:
+        if trusted or file.is_relative_to(bundled_root()):
+            try:
+                return build_snapshot(file, snapshot)
+            except (ValueError, mujoco.FatalError) as error:
+                raise Refusal("import_failed", f"MuJoCo rejects {file}: {one_line(error)}") from None
+        from urlab_client.server.sandbox import build_confined  # noqa: PLC0415 - it imports this module
+
+        return build_confined(file, snapshot, (*self.model_roots, bundled_root()), self.limits)
 
     def _register(self, home: Path, folder: Path, record: _Record) -> Blueprint:
         known = self._blueprints.get(record.stem)
@@ -400,6 +447,37 @@ class ContentRoot:
             if stale.is_dir() and stale not in keep and not stale.name.startswith("."):
                 shutil.rmtree(stale, ignore_errors=True)
         return blueprint
+
+
+def build_snapshot(file: Path, snapshot: Path) -> Compiled:
+    """Compile an MJCF file and write what is kept of it.
+
+    Args:
+        file: The file.
+        snapshot: Folder to write, which must not exist.
+
+    Raises:
+        ValueError, mujoco.FatalError: MuJoCo rejects it.
+    """
+    with mujoco_messages() as messages:
+        spec = mujoco.MjSpec.from_file(str(file))
+        # Compiles the file itself, so that an error names the source's own line.
+        mujoco.MjModel.from_xml_path(str(file))
+        prepared = _prepared(spec)
+        kinds = {actuator.name: _actuator_kind(actuator) for actuator in prepared.actuators}
+        _write_snapshot(prepared, snapshot, messages)
+        model = mujoco.MjModel.from_xml_path(str(snapshot / "model.xml"))
+    return Compiled(
+        model_name="" if spec.modelname in DEFAULT_MODEL_NAMES else spec.modelname,
+        joints=_names(model.njnt, model.joint),
+        actuators=_names(model.nactuator, model.actuator),
+        actuator_types=kinds,
+        sensors=_names(model.nsensor, model.sensor),
+        cameras=_names(model.ncam, model.camera),
+        messages=tuple(dict.fromkeys(messages)),
+        n_bytes=mujoco.mj_sizeModel(model),
+        largest_image=int(model.cam_resolution.max(initial=0)),
+    )
 
 
 _hook_lock = threading.Lock()
@@ -454,6 +532,7 @@ def _blueprint(folder: Path, record: _Record) -> Blueprint:
         actuator_types=MappingProxyType(record.actuator_types),
         sensors=record.sensors,
         cameras=record.cameras,
+        n_bytes=record.n_bytes,
     )
 
 
@@ -470,6 +549,7 @@ def _record(blueprint: Blueprint) -> _Record:
         actuator_types=dict(blueprint.actuator_types),
         sensors=blueprint.sensors,
         cameras=blueprint.cameras,
+        n_bytes=blueprint.n_bytes,
     )
 
 

@@ -19,6 +19,7 @@ from urlab_client.protocol.messages.session import ErrorReply
 from urlab_client.server.actors import Actor
 from urlab_client.server.controllers import ControllerConfig
 from urlab_client.server.engine import Engine
+from urlab_client.server.limits import Limits
 from urlab_client.server.markers import Drawings
 from urlab_client.server.observe import Observer
 from urlab_client.server.play import Play, Running
@@ -90,12 +91,20 @@ class ServerCore:
     session: Session = field(default_factory=Session)
     play: Play = field(default_factory=Play)
     viewport: Viewport = field(default_factory=Viewport)
-    drawings: Drawings = field(default_factory=Drawings)
+    drawings: Drawings = field(init=False)
     compiled: _Compiled | None = None
 
     def refuse(self, code: str, message: str) -> bytes:
         """Return the frame of an error reply."""
         return encode_reply(ErrorReply(code=code, message=message), json=self.session.json)
+
+    def __post_init__(self) -> None:
+        self.drawings = Drawings(limit=self.limits.markers)
+
+    @property
+    def limits(self) -> Limits:
+        """How much is done for clients."""
+        return self.world.content.limits
 
     def begin_play(self) -> None:
         """Start play with the level as it is now; `play.wait` says how it ends."""
@@ -154,6 +163,7 @@ class ServerCore:
             Observer(scene, engine.controls),
             CameraStudio(scene, modes, {actor.name: _kind(actor) for actor in actors}),
             files,
+            self.limits,
         )
 
     def stop_play(self) -> None:

@@ -92,7 +92,7 @@ class Dispatcher:
         """
         self._core = core
         self._handlers: Mapping[str, Handler] = table.handlers
-        self._reader = RequestReader(structs=table.structs)
+        self._reader = RequestReader(structs=table.structs, limits=core.world.content.limits)
         self._lock = threading.Lock()
 
     def answer(self, frame: bytes, transport: Transport = Transport.ZMQ) -> bytes:

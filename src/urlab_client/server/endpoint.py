@@ -16,8 +16,8 @@ from typing import ClassVar, Final
 
 import zmq
 
-from urlab_client.protocol.codec import MAX_REQUEST_BYTES
 from urlab_client.server.guard import Door, Guard
+from urlab_client.server.limits import Limits
 
 __all__ = ["PortInUse", "RpcEndpoint", "bind_tcp", "bound_peers", "connect_host", "numeric_host", "tcp"]
 
@@ -149,7 +149,13 @@ class RpcEndpoint:
     port: int
 
     def __init__(
-        self, answer: Callable[[bytes], bytes], *, host: str = "127.0.0.1", port: int = 0, door: Door | None = None
+        self,
+        answer: Callable[[bytes], bytes],
+        *,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        door: Door | None = None,
+        request_bytes: int = Limits.request_bytes,
     ) -> None:
         """Bind the socket; `start` begins to serve.
 
@@ -158,6 +164,7 @@ class RpcEndpoint:
             host: IP address of the interface.
             port: TCP port; 0 picks a free one.
             door: Who may connect; None for anybody who reaches the interface.
+            request_bytes: Largest request that is answered with anything but its size.
 
         Raises:
             PortInUse: Somebody has the port.
@@ -171,7 +178,7 @@ class RpcEndpoint:
         self._guard.protect(self._socket)
         bound_peers(self._socket)
         # A frame between the two limits is answered with the reason, one beyond both costs the sender its connection.
-        self._socket.maxmsgsize = 2 * MAX_REQUEST_BYTES
+        self._socket.maxmsgsize = 2 * request_bytes
         self._socket.rcvhwm = QUEUED_REQUESTS
         try:
             self.port = bind_tcp(self._socket, host, port, "step_port")

@@ -155,7 +155,7 @@ def read_level(path: Path, content: ContentRoot, *, trusted: bool = False) -> di
         if entry.name in actors:
             raise LevelError(f"{path}: two actors are called '{entry.name}'")
         try:
-            actors[entry.name] = _actor(entry, folder, blueprints)
+            actors[entry.name] = _actor(entry, folder, blueprints, None if trusted else content)
         except ValueError as error:
             raise LevelError(f"{path}: actor {index} ('{entry.name}'): {error}") from None
     for actor in actors.values():
@@ -180,6 +180,8 @@ def _resolve(stem: str, entry: _Blueprint | None, folder: Path, content: Content
             raise LevelError(f"blueprint '{stem}' is not imported, and the level does not say where it comes from")
         return known
     record = (folder / entry.record).resolve()
+    if entry.record and not trusted and not content.open_to_clients(record):
+        raise LevelError(f"blueprint '{stem}': {record} lies outside the folders that clients may read")
     if known is not None and (not trusted or known.digest == entry.digest or record == content.snapshot_record(known)):
         return known
     try:
@@ -214,8 +216,14 @@ def _from_source(source: str, folder: Path, content: ContentRoot, *, trusted: bo
     return content.import_xml(path, force_reimport=True, trusted=trusted)[0]
 
 
-def _actor(entry: _Actor, folder: Path, blueprints: Mapping[str, Blueprint]) -> Actor:
+def _actor(entry: _Actor, folder: Path, blueprints: Mapping[str, Blueprint], confined_to: ContentRoot | None) -> Actor:
     """Check an entry and return its actor.
+
+    Args:
+        entry: The entry.
+        folder: Folder of the level.
+        blueprints: The blueprints of the level.
+        confined_to: Says where files may lie; None for anywhere.
 
     Raises:
         ValueError: What is wrong with it.
@@ -229,7 +237,10 @@ def _actor(entry: _Actor, folder: Path, blueprints: Mapping[str, Blueprint]) -> 
     if mesh is not None:
         _check_mesh(mesh, entry.quick_convert)
         if mesh.file:
-            mesh = msgspec.structs.replace(mesh, file=str((folder / mesh.file).resolve()))
+            file = (folder / mesh.file).resolve()
+            if confined_to is not None and not confined_to.open_to_clients(file):
+                raise ValueError(f"mesh {file} lies outside the folders that clients may read")
+            mesh = msgspec.structs.replace(mesh, file=str(file))
     return Actor(
         name=entry.name,
         label=entry.label or entry.name,

@@ -16,16 +16,14 @@ from dataclasses import dataclass
 from typing import Final, TypeAlias
 
 from urlab_client.protocol.base import Quat, Vec3
+from urlab_client.server.limits import Limits
 
-__all__ = ["MARKER_RADIUS_M", "MAX_PRIMITIVES", "Arrow", "Box", "Drawings", "Line", "Primitive", "Sphere", "Text"]
+__all__ = ["MARKER_RADIUS_M", "Arrow", "Box", "Drawings", "Line", "Primitive", "Sphere", "Text"]
 
 logger = logging.getLogger("urlab_client.server")
 
 MARKER_RADIUS_M: Final = 0.05
 OVERLAY_S: Final = 10.0
-
-MAX_PRIMITIVES: Final = 4096
-"""Primitives kept per world; the oldest give way."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,16 +119,18 @@ class _Entry:
 class Drawings:
     """What was drawn into the edited world and into the play world. Safe to use from several threads."""
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, clock: Callable[[], float] = time.monotonic, *, limit: int = Limits.markers) -> None:
         """Start with nothing.
 
         Args:
             clock: Seconds since any moment; never goes back.
+            limit: Primitives kept per world; the oldest give way.
         """
         self._clock = clock
         self._lock = threading.Lock()
         self._worlds: dict[bool, deque[_Entry]] = {False: deque(), True: deque()}
         self._overlay = ("", -math.inf)
+        self._limit = limit
 
     def add(self, primitives: Sequence[Primitive], *, ttl: float, in_play: bool) -> None:
         """Draw.
@@ -145,11 +145,13 @@ class Drawings:
         with self._lock:
             entries = self._alive(in_play, now)
             entries.extend(_Entry(primitive, expires) for primitive in primitives)
-            surplus = len(entries) - MAX_PRIMITIVES
+            surplus = len(entries) - self._limit
             for _ in range(surplus):
                 entries.popleft()
         if surplus > 0:
-            logger.warning("more than %d debug primitives: the oldest are dropped; use clear_markers", MAX_PRIMITIVES)
+            logger.warning(
+                "more than %d debug primitives (limit markers): the oldest are dropped; use clear_markers", self._limit
+            )
 
     def clear(self, *, in_play: bool) -> None:
         """Remove everything drawn into a world."""

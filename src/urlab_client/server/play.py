@@ -17,6 +17,7 @@ from typing import Final
 
 from urlab_client.protocol.enums import PIEState
 from urlab_client.server.engine import Engine
+from urlab_client.server.limits import Limits
 from urlab_client.server.observe import Observer
 from urlab_client.server.options import OptionOverrides
 from urlab_client.server.refusal import Refusal
@@ -29,6 +30,7 @@ __all__ = ["Play", "Running"]
 logger = logging.getLogger("urlab_client.server")
 
 MAX_WAIT_S: Final = 86400.0
+_DEFAULT_LIMITS: Final = Limits()
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,7 @@ class Running:
         observer: What reads its state.
         cameras: What draws its cameras.
         recordings: Files in the folder of recordings at the start.
+        limits: How much is done for clients.
     """
 
     scene: Scene
@@ -48,6 +51,7 @@ class Running:
     observer: Observer
     cameras: CameraStudio
     recordings: Sequence[Path] = ()
+    limits: Limits = _DEFAULT_LIMITS
 
     @cached_property
     def options(self) -> OptionOverrides:
@@ -57,7 +61,7 @@ class Running:
     @cached_property
     def sessions(self) -> ReplaySessions:
         """The recorded sessions."""
-        return ReplaySessions(self.scene, self.recordings)
+        return ReplaySessions(self.scene, self.recordings, self.limits)
 
     def close(self, timeout: float = 1.0) -> bool:
         """End it within about `timeout` seconds; return False when something was still busy then."""

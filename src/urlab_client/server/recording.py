@@ -39,9 +39,6 @@ Floats = NDArray[np.float64]
 
 LIVE_SESSION: Final = "Live Recording"
 
-MAX_LIVE_BYTES: Final = 256 * 2**20
-"""Memory of a live recording; beyond it the oldest frames go, as if the window were shorter."""
-
 FRAME_OVERHEAD: Final = 500
 """About the bytes a frame takes besides its numbers."""
 
@@ -99,7 +96,14 @@ class LiveRecording:
         max_duration_s: Length of the rolling window, seconds of simulation time; 0 or less is unlimited.
     """
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, most_bytes: int) -> None:
+        """Prepare for a scene.
+
+        Args:
+            scene: The scene.
+            most_bytes: Memory for frames; beyond it the oldest go, as if the window were shorter.
+        """
+        self._most_bytes = most_bytes
         self.frames: deque[Frame] = deque()
         self.max_duration_s = 0.0
         self._data = scene.data
@@ -109,7 +113,7 @@ class LiveRecording:
         self._layout = Layout.of(
             (joint_name(model, joint), int(coordinates[joint]), int(velocities[joint])) for joint in range(model.njnt)
         )
-        self._max_frames = MAX_LIVE_BYTES // (8 * (model.nq + model.nv) + FRAME_OVERHEAD)
+        self._max_frames = most_bytes // (8 * (model.nq + model.nv) + FRAME_OVERHEAD)
         self._trimmed = False
 
     def start(self, max_duration_s: float) -> None:
@@ -135,8 +139,8 @@ class LiveRecording:
             if not self._trimmed:
                 self._trimmed = True
                 logger.warning(
-                    "the recording has reached %d MB (%d frames): the oldest frames are dropped from now on",
-                    MAX_LIVE_BYTES // 2**20,
+                    "the recording has reached the limit recording_bytes, %d (%d frames): the oldest are dropped",
+                    self._most_bytes,
                     self._max_frames,
                 )
 

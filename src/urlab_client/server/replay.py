@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client.server.limits import Limits
 from urlab_client.server.recording import (
     LIVE_SESSION,
     Frame,
@@ -30,10 +31,9 @@ __all__ = ["Player", "ReplaySessions", "recordings", "replay_folder"]
 
 logger = logging.getLogger("urlab_client.server")
 
-Floats = NDArray[np.float64]
+_DEFAULT_LIMITS: Final = Limits()
 
-MAX_FILE_BYTES: Final = 256 * 2**20
-"""Largest recording file that is read."""
+Floats = NDArray[np.float64]
 
 
 class Player:
@@ -192,14 +192,16 @@ class ReplaySessions:
         active: Name of the session that is saved and played.
     """
 
-    def __init__(self, scene: Scene, files: Sequence[Path] = ()) -> None:
+    def __init__(self, scene: Scene, files: Sequence[Path] = (), limits: Limits = _DEFAULT_LIMITS) -> None:
         """Start with an empty recording.
 
         Args:
             scene: What is recorded.
             files: The recordings that were there when play started; `scan` loads them.
+            limits: Sizes of recordings.
         """
-        self.live = LiveRecording(scene)
+        self.live = LiveRecording(scene, limits.recording_bytes)
+        self._most = limits.recording_file_bytes
         self.active = LIVE_SESSION
         self._loaded: dict[str, list[Frame]] = {}
         self._unread = files
@@ -219,7 +221,7 @@ class ReplaySessions:
         unread, self._unread = self._unread, ()
         for file in unread:
             try:
-                self._loaded[file.stem] = read_frames(file)
+                self._loaded[file.stem] = read_frames(file, self._most)
             except (OSError, ValueError) as error:
                 logger.warning("%s is no recording and left out: %s", file, error)
 
@@ -230,7 +232,7 @@ class ReplaySessions:
             OSError, ValueError: It cannot be read, or is no recording.
         """
         name = file.stem
-        frames = read_frames(file)
+        frames = read_frames(file, self._most)
         if name.casefold() == LIVE_SESSION.casefold():
             raise ValueError(f"a session cannot be called '{name}': rename the file")
         self._loaded[name] = frames
@@ -255,8 +257,8 @@ def recordings(folder: Path) -> list[Path]:
     return sorted(file for file in folder.glob("*") if file.suffix.casefold() in (".json", ".csv"))
 
 
-def read_frames(file: Path) -> list[Frame]:
-    """Read a recording.
+def read_frames(file: Path, most: int) -> list[Frame]:
+    """Read a recording of at most `most` bytes.
 
     Raises:
         OSError, ValueError: It cannot be read, or is no recording.
@@ -264,7 +266,7 @@ def read_frames(file: Path) -> list[Frame]:
     if file.exists() and not file.is_file():
         raise ValueError("it is no regular file")
     size = file.stat().st_size
-    if size > MAX_FILE_BYTES:
-        raise ValueError(f"{size} bytes exceed the limit {MAX_FILE_BYTES}")
+    if size > most:
+        raise ValueError(f"{size} bytes are more than the limit recording_file_bytes, {most}")
     content = file.read_bytes()
     return decode_csv(content) if file.suffix.casefold() == ".csv" else decode_json(content)

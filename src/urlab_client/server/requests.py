@@ -21,14 +21,13 @@ import numpy as np
 from msgspec import NODEFAULT, UNSET, Struct, inspect
 
 from urlab_client.protocol.base import Op, Request
-from urlab_client.protocol.codec import MAX_REQUEST_BYTES
 from urlab_client.protocol.registry import OPS
+from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
 
-__all__ = ["MAX_DEPTH", "Incoming", "RequestReader", "need", "usable"]
+__all__ = ["Incoming", "RequestReader", "need", "usable"]
 
-MAX_DEPTH: Final = 64
-"""Levels of nesting a request may have; no op needs more than five."""
+_DEFAULT_LIMITS: Final = Limits()
 
 INT32_MIN: Final = -(2**31)
 INT32_MAX: Final = 2**31 - 1
@@ -83,12 +82,19 @@ def need(request: Request[Any], value: T, field: str) -> T:
 class RequestReader:
     """Reads frames into requests. Has no state of its own, so any thread may use it."""
 
-    def __init__(self, *, structs: Mapping[str, type[Request[Any]]] = types.MappingProxyType({})) -> None:
+    def __init__(
+        self,
+        *,
+        structs: Mapping[str, type[Request[Any]]] = types.MappingProxyType({}),
+        limits: Limits = _DEFAULT_LIMITS,
+    ) -> None:
         """Prepare the decoders.
 
         Args:
             structs: By op name, a struct that reads more than the declared one, which it must derive from.
+            limits: What a request may be.
         """
+        self._limits = limits
         self._exact: dict[type, Op] = {}
         self._loose: dict[str, _LooseOp] = {}
         strict: list[type[Request[Any]]] = []
@@ -119,15 +125,31 @@ class RequestReader:
             return self._read_loosely(frame)
         kind = type(request)
         collides = self._collides[kind]
-        if len(frame) > MAX_REQUEST_BYTES or (collides is not None and collides(request)):
+        if len(frame) > self._limits.request_bytes or (collides is not None and collides(request)):
             return self._read_loosely(frame)
         op = self._exact[kind]
+        self._check_strings(op, request, frame)
         return Incoming(op.name, op, request.session_id, request)
 
+    def _check_strings(self, op: Op, request: Request[Any], frame: bytes) -> None:
+        most = self._limits.string_chars
+        if len(frame) <= most:  # which spares nearly every request the search
+            return
+        for field in msgspec.structs.fields(request):
+            longest = _longest(getattr(request, field.name))
+            if longest > most:
+                raise _bad_request(
+                    f"{op.name}: field '{field.encode_name}' holds a string of {longest} characters, more than the "
+                    f"limit string_chars, {most}"
+                )
+
     def _read_loosely(self, frame: bytes) -> Incoming:
-        if len(frame) > MAX_REQUEST_BYTES:
-            raise _bad_request(f"a request of {len(frame)} bytes exceeds the limit {MAX_REQUEST_BYTES}")
-        fields = _fold(_decode(frame))
+        limits = self._limits
+        if len(frame) > limits.request_bytes:
+            raise _bad_request(
+                f"a request of {len(frame)} bytes exceeds the limit request_bytes, {limits.request_bytes}"
+            )
+        fields = _fold(_decode(frame, limits.request_depth))
         name = _text(fields.get("op"))
         if name is _ABSENT:
             return Incoming(None)
@@ -135,7 +157,25 @@ class RequestReader:
         if loose is None or (loose.exact and name != loose.op.name):
             return Incoming(name, session_id=_session_id(fields))
         missing = tuple(field for field in loose.declared if field.lower() not in fields)
-        return Incoming(name, loose.op, _session_id(fields), loose.convert(fields), missing)
+        request = loose.convert(fields)
+        self._check_strings(loose.op, request, frame)
+        return Incoming(name, loose.op, _session_id(fields), request, missing)
+
+
+def _longest(value: object) -> int:
+    """Return the length of the longest string in a value of a request."""
+    match value:
+        case str():
+            return len(value)
+        case dict():
+            items = cast("dict[object, object]", value)
+            return max((max(_longest(key), _longest(item)) for key, item in items.items()), default=0)
+        case list() | tuple():
+            return max(map(_longest, cast("list[object]", value)), default=0)
+        case Struct():
+            return max((_longest(getattr(value, name)) for name in value.__struct_fields__), default=0)
+        case _:
+            return 0
 
 
 def _session_id(fields: Mapping[str, Plain]) -> str:
@@ -160,7 +200,7 @@ class _LooseOp:
 _JSON_FIRST = frozenset(b"{ \t\r\n")
 
 
-def _decode(frame: bytes) -> dict[str, Plain]:
+def _decode(frame: bytes, depth: int) -> dict[str, Plain]:
     data: Plain = None
     if frame[:1] and frame[0] not in _JSON_FIRST:
         data = _decode_msgpack(frame)
@@ -168,7 +208,7 @@ def _decode(frame: bytes) -> dict[str, Plain]:
         data = _decode_json(frame)
     if not isinstance(data, dict):
         raise _bad_request("the request is neither a msgpack map nor a JSON object")
-    return _tidy(cast("Plain", data), MAX_DEPTH)
+    return _tidy(cast("Plain", data), depth, depth)
 
 
 def _decode_msgpack(frame: bytes) -> Plain:
@@ -186,15 +226,15 @@ def _decode_json(frame: bytes) -> Plain:
         return None
 
 
-def _tidy(value: Plain, depth: int) -> Plain:
+def _tidy(value: Plain, depth: int, most: int) -> Plain:
     """Replace what the plugin's decoder would not deliver, all the way down."""
     if depth < 0:
-        raise _bad_request(f"the request is nested deeper than {MAX_DEPTH} levels")
+        raise _bad_request(f"the request is nested deeper than {most} levels (limit request_depth)")
     match value:
         case dict():
-            return _tidy_map(cast("dict[object, Plain]", value), depth)
+            return _tidy_map(cast("dict[object, Plain]", value), depth, most)
         case list() | tuple():
-            return [_tidy(item, depth - 1) for item in cast("list[Plain]", value)]
+            return [_tidy(item, depth - 1, most) for item in cast("list[Plain]", value)]
         case bytes():
             return base64.b64encode(value).decode("ascii")
         case None | bool() | int() | float() | str():
@@ -203,7 +243,7 @@ def _tidy(value: Plain, depth: int) -> Plain:
             return None  # extension types and timestamps
 
 
-def _tidy_map(value: dict[object, Plain], depth: int) -> dict[str, Plain]:
+def _tidy_map(value: dict[object, Plain], depth: int, most: int) -> dict[str, Plain]:
     tidy: dict[str, Plain] = {}
     seen: dict[str, str] = {}
     for key, item in value.items():
@@ -214,7 +254,7 @@ def _tidy_map(value: dict[object, Plain], depth: int) -> dict[str, Plain]:
             if folded in seen:
                 del tidy[seen[folded]]
             seen[folded] = name
-            tidy[name] = _tidy(item, depth - 1)
+            tidy[name] = _tidy(item, depth - 1, most)
     return tidy
 
 

@@ -33,6 +33,7 @@ from urlab_client.server.endpoint import RpcEndpoint, connect_host, numeric_host
 from urlab_client.server.faults import Faults, FaultyEndpoint, Injector
 from urlab_client.server.guard import CurveServer, Door, UnprotectedServer, is_loopback
 from urlab_client.server.handlers import HANDLERS
+from urlab_client.server.limits import Limits
 from urlab_client.server.markers import Drawings
 from urlab_client.server.publishing import StreamServer
 from urlab_client.server.refusal import Refusal
@@ -51,6 +52,7 @@ GAP_M: Final = 1.0
 """Free space between the models placed side by side, metres."""
 
 _NO_LIMIT: Final = float("inf")
+_DEFAULT_LIMITS: Final = Limits()
 _INTERFACES: Final = {"0.0.0.0": "every network of this machine", "::": "every network of this machine"}  # noqa: S104
 
 
@@ -76,6 +78,7 @@ class _Config:
     host: str
     curve: CurveServer | None
     insecure_no_auth: bool
+    limits: Limits
     ports: _Ports
     saved_dir: Path | None
     model_roots: tuple[Path, ...] | None
@@ -111,6 +114,7 @@ class SimulatedServer:
         host: str = "127.0.0.1",
         curve: CurveServer | None = None,
         insecure_no_auth: bool = False,
+        limits: Limits = _DEFAULT_LIMITS,
         step_port: int = 0,
         state_port: int = 0,
         ctrl_port: int = 0,
@@ -136,6 +140,7 @@ class SimulatedServer:
             host: Interface to bind, an address or a name. Other than loopback needs `curve` or `insecure_no_auth`.
             curve: Encrypt all traffic and let in only clients with the right keys.
             insecure_no_auth: Serve whoever reaches the interface: they can do all that a client can.
+            limits: How much is done for clients.
             step_port: Port of requests; 0 picks a free one, here and below.
             state_port: Port of the state stream. Like the next two it is bound while the server is open, and silent
                 outside play.
@@ -176,6 +181,7 @@ class SimulatedServer:
             host=host,
             curve=curve,
             insecure_no_auth=insecure_no_auth,
+            limits=limits,
             ports=ports,
             saved_dir=None if saved_dir is None else Path(saved_dir),
             model_roots=None if model_roots is None else tuple(map(Path, model_roots)),
@@ -449,10 +455,10 @@ class _Opened:
         # Bound before the models are read, which takes longer, and answering after: requests wait in the socket.
         self._dispatcher = Dispatcher(core, HANDLERS)
         answer = self._dispatcher.answer
+        where: dict[str, Any] = {"host": self.host, "port": ports.step, "door": self.door}
+        where["request_bytes"] = config.limits.request_bytes
         self._endpoint = (
-            RpcEndpoint(answer, host=self.host, port=ports.step, door=self.door)
-            if self._injector is None
-            else FaultyEndpoint(self._injector, answer, host=self.host, port=ports.step, door=self.door)
+            RpcEndpoint(answer, **where) if self._injector is None else FaultyEndpoint(self._injector, answer, **where)
         )
         try:
             _populate(core.world, config.models)
@@ -477,7 +483,7 @@ class _Opened:
         if roots is None:
             files = [Path(model).resolve() for model in config.models if Path(model).is_file()]
             roots = tuple(dict.fromkeys(file.parent for file in files)) or (Path.cwd(),)
-        return ContentRoot(folder, model_roots=roots)
+        return ContentRoot(folder, model_roots=roots, limits=config.limits)
 
     def restore(self) -> bool:
         """Return to the state after the start, or return False if that takes another start."""
@@ -491,7 +497,7 @@ class _Opened:
         with dispatcher.standstill(CLOSE_S) as idle:
             if not idle or self._mark(core) != self._authored:
                 return False
-            core.session, core.viewport, core.drawings = Session(), Viewport(), Drawings()
+            core.session, core.viewport, core.drawings = Session(), Viewport(), Drawings(limit=core.limits.markers)
             core.world.selected = ""
             if self._plays:
                 return core.begin_play_again(CLOSE_S)

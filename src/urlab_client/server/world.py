@@ -45,7 +45,6 @@ logger = logging.getLogger("urlab_client.server")
 
 ActorNames = Literal["model", "plugin"]
 
-MAX_CELLS: Final = 1024
 UNTITLED: Final = "/Temp/Untitled_1"
 
 
@@ -412,6 +411,7 @@ class World:
         understood = _rotation(rotation_quat, rotation_euler, code)
         pose = _pose(location, understood if understood is not None else IDENTITY, code)
         existing = self._of_class(actor_id, found.class_name, code)
+        self._make_room(existing is None, found.n_bytes, code)
         return self._place(found, actor_id, existing, location=location, understood=understood or IDENTITY, pose=pose)
 
     def spawn_grid(
@@ -447,8 +447,9 @@ class World:
         _require(base_actor_id, "base_actor_id")
         if count_x <= 0 or count_y <= 0:
             raise Refusal("invalid_count", f"count_x and count_y must be above zero, not {count_x} and {count_y}")
-        if count_x * count_y > MAX_CELLS:
-            raise Refusal("too_many_cells", f"{count_x} x {count_y} cells are more than {MAX_CELLS}")
+        most = self.content.limits.grid_cells
+        if count_x * count_y > most:
+            raise Refusal("too_many_cells", f"{count_x} x {count_y} cells are more than the limit grid_cells, {most}")
         code = "spawn_failed"
         found = self._blueprint(blueprint, code)
         _refuse_scale(scale, code)
@@ -460,6 +461,7 @@ class World:
                 location = (origin[0] + i * spacing[0], origin[1] + j * spacing[1], origin[2])
                 existing = self._of_class(actor_id, found.class_name, code)
                 cells.append((actor_id, existing, location, _pose(location, understood, code)))
+        self._make_room(sum(existing is None for _, existing, _, _ in cells), found.n_bytes, code)
         return [
             self._place(found, actor_id, existing, location=location, understood=understood, pose=pose)
             for actor_id, existing, location, pose in cells
@@ -494,6 +496,7 @@ class World:
             raise Refusal(code, f"no kind of light is called '{kind}': use directional, point or spot")
         _refuse_infinite((*rotation_euler, intensity, *color), "rotation_euler, intensity and color", code)
         at, rotation = _pose(location, swap_frame(euler_to_quat(rotation_euler)), code)
+        self._make_room(1, 0, code)
         red, green, blue = (_float32(channel) for channel in color)
         light = Light(kind=name, intensity=_float32(intensity), color=(red, green, blue))
         draft = Actor(name="", label="", kind=ActorKind.LIGHT, actor_id=actor_id, light=light)
@@ -571,6 +574,7 @@ class World:
         x, y, z = source.location
         at, rotation = _pose(location if location is not None else (x + 1.0, y, z), source.rotation, code)
         existing = self._of_class(new_actor_id, source.class_name, code)
+        self._make_room(existing is None, 0 if source.blueprint is None else source.blueprint.n_bytes, code)
         if existing is not None:
             copy = self._put(replace(existing, location=at, rotation=rotation, scale=source.scale))
         else:
@@ -753,6 +757,17 @@ class World:
         return actors
 
     # Internal
+
+    def _make_room(self, count: int, n_bytes: int, code: str) -> None:
+        """Refuse with `code` when `count` more actors, each with a model of `n_bytes`, would be too many."""
+        limits = self.content.limits
+        if count and len(self._actors) + count > limits.actors:
+            raise Refusal(code, f"a level has at most {limits.actors} actors (limit actors)")
+        held = sum(actor.blueprint.n_bytes for actor in self._actors.values() if actor.blueprint is not None)
+        if count and held + count * n_bytes > limits.scene_bytes:
+            raise Refusal(
+                code, f"the models of a level take at most {limits.scene_bytes} bytes together (limit scene_bytes)"
+            )
 
     def _shown(self) -> Iterable[Actor]:
         return self._frozen if self.pie_running else self._actors.values()

@@ -36,6 +36,7 @@ from urlab_client.server.core import ServerCore
 from urlab_client.server.dispatch import handles
 from urlab_client.server.observe import sim_clock, wall_clock
 from urlab_client.server.play import Running
+from urlab_client.server.refusal import Refusal
 from urlab_client.server.rendering import Exposure
 from urlab_client.server.scene import EntityIndex
 
@@ -160,6 +161,9 @@ def meta(server: ServerCore, request: Meta) -> MetaOk:
 @handles(Step)
 def step(server: ServerCore, request: Step) -> StepOk:
     running = server.play.running()
+    most = server.limits.n_steps
+    if request.n_steps > most:
+        raise Refusal("bad_request", f"step: {request.n_steps} steps are more than the limit n_steps, {most}")
     if running.engine.mode in (StepMode.DIRECT, StepMode.PUPPET):
         server.session.adopt_level(request.observations)
     level = server.session.level

@@ -1,0 +1,60 @@
+"""How much a server does for its clients: every limit in one place.
+
+A request beyond a limit is refused with an error that names the limit by its name here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+__all__ = ["Limits"]
+
+_MIB = 2**20
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """What a `SimulatedServer` accepts.
+
+    Attributes:
+        request_bytes: Size of a request; one twice as large costs its sender the connection.
+        request_depth: Levels of nesting in a request.
+        string_chars: Length of a string in a request: names, ids, paths, labels.
+        n_steps: Physics steps of one request. They run in slices, between which the server can be stopped.
+        grid_cells: Cells of one `spawn_grid`.
+        actors: Actors of a level.
+        scene_bytes: Memory of all the models of a level together, as MuJoCo compiles each.
+        markers: Debug primitives kept per world; the oldest give way.
+        recording_bytes: Memory of a live recording; the oldest frames give way.
+        recording_file_bytes: Size of a recording that is loaded.
+        model_file_bytes: Size of an XML file that a client names, and of each that it includes.
+        model_files: Files that a model may consist of.
+        model_bytes: Memory of a model that a client names, once compiled.
+        model_memory_bytes: Memory its compilation may take besides.
+        model_cpu_s: Processor time its compilation may take, seconds.
+        model_wall_s: Seconds it may take altogether.
+        camera_side: Width and height of a camera's pictures, pixels.
+    """
+
+    request_bytes: int = 64 * _MIB
+    request_depth: int = 64
+    string_chars: int = 4096
+    n_steps: int = 1_000_000
+    grid_cells: int = 1024
+    actors: int = 4096
+    scene_bytes: int = 1024 * _MIB
+    markers: int = 4096
+    recording_bytes: int = 256 * _MIB
+    recording_file_bytes: int = 256 * _MIB
+    model_file_bytes: int = 64 * _MIB
+    model_files: int = 4096
+    model_bytes: int = 256 * _MIB
+    model_memory_bytes: int = 1024 * _MIB
+    model_cpu_s: int = 10
+    model_wall_s: int = 20
+    camera_side: int = 8192
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            if getattr(self, field.name) < 1:
+                raise ValueError(f"limit {field.name} must be at least 1, not {getattr(self, field.name)}")

@@ -1,0 +1,198 @@
+"""What a server refuses before it works on it: each limit, named in its error."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import struct
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import zmq
+from wire import Wire, pack
+
+from urlab_client.protocol.registry import OPS
+from urlab_client.server import Limits, SimulatedServer
+
+Serve = Callable[..., Wire]
+SMALL = Limits(
+    request_bytes=100_000, string_chars=100, n_steps=50, grid_cells=6, actors=12, markers=3, recording_file_bytes=200
+)
+
+
+@pytest.fixture
+def small(serve: Serve) -> Wire:
+    return serve("bot", limits=SMALL)
+
+
+def test_the_docs_list_every_limit() -> None:
+    page = (Path(__file__).parents[2] / "docs/security.md").read_text("utf-8")
+    listed = dict(re.findall(r"^\| `(\w+)` \| ([\d ]+(?:MiB)?)", page, flags=re.MULTILINE))
+    sizes = {
+        name: int(text.replace(" ", "").removesuffix("MiB")) * (2**20 if "MiB" in text else 1)
+        for name, text in listed.items()
+    }
+    assert sizes == dataclasses.asdict(Limits())
+
+
+def test_a_limit_below_one_is_none() -> None:
+    with pytest.raises(ValueError, match="n_steps"):
+        Limits(n_steps=0)
+
+
+def test_requests_name_the_limit_they_exceed(small: Wire) -> None:
+    long = "x" * 101
+    deep: object = 1
+    for _ in range(80):
+        deep = [deep]
+    spawn = {"blueprint": "/Game/MuJoCoImports/bot"}
+    for op, fields, code, name in (
+        ("set_overlay_text", {"text": "x" * 100_001}, "bad_request", "request_bytes"),
+        ("configure_controller", {"articulation": "bot", "params": {"a": deep}}, "bad_request", "request_depth"),
+        ("spawn_actor", spawn | {"actor_id": long}, "bad_request", "string_chars"),
+        ("import_xml", {"path": long}, "bad_request", "string_chars"),
+        ("reset", {"per_articulation_qpos": {"bot": {long: 1.0}}}, "bad_request", "string_chars"),
+        ("spawn_grid", spawn | {"base_actor_id": "g", "count_x": 7, "count_y": 1}, "too_many_cells", "grid_cells"),
+    ):
+        answer = small.refusal(op, **fields)
+        assert answer[0] == code, (op, answer)
+        assert name in answer[1], (op, answer)
+
+
+def test_a_level_takes_no_more_actors_than_the_limit(small: Wire) -> None:
+    spawn = {"blueprint": "/Game/MuJoCoImports/bot", "spacing": [1, 1, 0], "origin": [5, 0, 0]}
+    present = len(small.ask("list_actors")["actors"])
+    small.ask("spawn_grid", **spawn, base_actor_id="a", count_x=3, count_y=2)
+    room = SMALL.actors - present - 6
+    small.ask("spawn_grid", **spawn, base_actor_id="b", count_x=room, count_y=1)
+    small.ask("spawn_grid", **spawn, base_actor_id="b", count_x=room, count_y=1)  # they exist: none is added
+    for op, fields in (
+        ("spawn_actor", {"blueprint": spawn["blueprint"], "actor_id": "one"}),
+        ("spawn_light", {"kind": "point"}),
+        ("duplicate_actor", {"target": "a_0_0", "new_actor_id": "more"}),
+    ):
+        assert "limit actors" in small.refusal(op, **fields)[1]
+    assert len(small.ask("list_actors")["actors"]) == SMALL.actors
+
+
+def test_the_models_of_a_level_together(serve: Serve, models: Path) -> None:
+    wire = serve(limits=Limits(scene_bytes=1))
+    wire.ask("create_level", name="fresh")
+    blueprint = wire.ask("import_xml", path=str(models / "bot.xml"))["blueprint_class_path"]
+    assert "scene_bytes" in wire.refusal("spawn_actor", blueprint=blueprint, actor_id="x")[1]
+
+
+def test_steps_beyond_the_limit_are_refused_and_the_rest_can_be_broken_off(serve: Serve) -> None:
+    wire = serve("bot", play=True, unpaused=True, step_mode="direct", limits=SMALL)
+    assert wire.refusal("step", n_steps=10**9) == (
+        "bad_request",
+        "step: 1000000000 steps are more than the limit n_steps, 50",
+    )
+    assert wire.ask("step", n_steps=50)["step"] == 50
+
+
+def test_a_server_closes_in_the_middle_of_a_million_steps(models: Path, connect: Callable[..., Wire]) -> None:
+    with SimulatedServer(models / "bot.xml", play=True, unpaused=True, step_mode="direct") as server:
+        wire = connect(server)
+        wire.hello()
+        core = server._running._core
+        assert core is not None
+        engine = core.play.running().engine
+        wire._socket.send(pack({"op": "step", "session_id": wire.session_id, "n_steps": 1_000_000}))
+        deadline = time.monotonic() + 30
+        while engine.time == 0.0:  # it is under way
+            assert time.monotonic() < deadline
+        server.close()
+        assert engine.time < 1_000_000 * 0.002
+    assert b"shutting_down" in wire._socket.recv()
+
+
+def test_a_recording_too_large_to_load(serve: Serve, tmp_path: Path) -> None:
+    (tmp_path / "long.json").write_text('{"Frames": [' + "{}," * 100 + "{}]}")
+    wire = serve("bot", play=True, model_roots=[tmp_path], limits=SMALL)
+    code, message = wire.refusal("replay_load", path=str(tmp_path / "long.json"))
+    assert (code, "recording_file_bytes" in message) == ("path_not_readable", True)
+
+
+def test_drawings_give_way(small: Wire) -> None:
+    for _ in range(10):
+        small.ask("draw_marker", location=[0, 0, 0], color=[1, 0, 0], ttl=-1)
+
+
+def test_a_frame_beyond_all_limits_costs_its_sender_the_connection(small: Wire) -> None:
+    monitor = small._socket.get_monitor_socket(zmq.Event.DISCONNECTED)
+    small._socket.send(b"x" * 300_000)
+    assert monitor.poll(10_000)
+    small._socket.disable_monitor()
+    monitor.close(0)
+
+
+# What goes wrong inside
+
+
+def test_no_reply_tells_of_the_program(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+    from urlab_client.server.dispatch import Dispatcher
+
+    wire = serve("bot", play=True)
+
+    def broken(*_: object) -> None:
+        raise RuntimeError("secret /home/ada/token")
+
+    monkeypatch.setattr(Dispatcher, "_serve", broken)
+    for name in OPS:
+        reply = wire.raw({"op": name, "session_id": wire.session_id})
+        assert reply == {
+            "op": "error",
+            "code": "internal_error",
+            "message": f"{name}: the server failed with RuntimeError; its log has the details",
+        }
+
+
+# Slow, silent and many peers
+
+
+def test_a_subscriber_that_never_reads_slows_nobody(connect: Callable[..., Wire], models: Path) -> None:
+    with (
+        SimulatedServer(models / "bot.xml", play=True, unpaused=True, step_mode="direct") as server,
+        zmq.Context() as context,
+        context.socket(zmq.SUB) as lazy,
+        context.socket(zmq.SUB) as eager,
+    ):
+        for socket, limit in ((lazy, 1), (eager, 0)):
+            socket.rcvhwm = limit
+            socket.linger = 0
+            socket.rcvtimeo = 10_000
+            socket.subscribe(b"")
+            socket.connect(f"{server.address}:{server.state_port}")
+        wire = connect(server)
+        wire.hello()
+        eager.recv_multipart()
+        for count in range(1, 2001):
+            assert wire.ask("step", n_steps=1)["step"] == count
+        while struct.pack(">d", 2000.0) not in eager.recv_multipart()[1]:  # whoever reads gets the newest
+            pass
+
+
+def test_connections_that_say_nothing_do_not_keep_others_out() -> None:
+    import socket as sockets
+
+    with SimulatedServer() as server:
+        silent = [sockets.create_connection(("127.0.0.1", server.step_port)) for _ in range(200)]
+        try:
+            with Wire(server) as wire:
+                assert wire.hello()["session_id"]
+        finally:
+            for connection in silent:
+                connection.close()
+
+
+def test_a_client_with_several_requests_waiting_gets_every_answer() -> None:
+    with SimulatedServer() as server, zmq.Context() as context, context.socket(zmq.DEALER) as socket:
+        socket.linger = 0
+        socket.rcvtimeo = 10_000
+        socket.connect(f"{server.address}:{server.step_port}")
+        for number in range(300):
+            socket.send_multipart([str(number).encode(), b"", pack({"op": "meta"})])
+        assert [socket.recv_multipart()[0] for _ in range(300)] == [str(number).encode() for number in range(300)]

@@ -1,0 +1,219 @@
+"""Models and files that clients name: what they may reach, and what becomes of those that ask for too much."""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from wire import Wire
+
+from urlab_client.server import Limits, SimulatedServer
+
+Serve = Callable[..., Wire]
+
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
+FIGURE = (
+    '<mujoco><asset><mesh name="m" file="{file}"/></asset>'
+    '<worldbody><body><geom type="mesh" mesh="m"/></body></worldbody></mujoco>'
+)
+HUNGRY = {
+    "replicate": '<worldbody><replicate count="1000000" offset="1 0 0"><body><geom size=".1"/></body></replicate>'
+    "</worldbody>",
+    "nested": '<worldbody><replicate count="1000"><replicate count="1000"><replicate count="1000"><geom size=".1"/>'
+    "</replicate></replicate></replicate></worldbody>",
+    "texture": '<asset><texture name="t" type="2d" builtin="flat" width="100000" height="100000"/></asset>',
+    "heightfield": '<asset><hfield name="h" nrow="100000" ncol="100000" size="1 1 1 1"/></asset>',
+    "deep": "<worldbody>" + "<body>" * 100_000 + "</body>" * 100_000 + "</worldbody>",
+}
+LIMITS = Limits(model_cpu_s=1, model_wall_s=6, model_memory_bytes=512 * 2**20)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A model root `root`, and beside it what clients are not to read."""
+    folder = tmp_path_factory.mktemp("files")
+    (folder / "root" / "meshes").mkdir(parents=True)
+    (folder / "root" / "meshes" / "figure.obj").write_text(TRIANGLE)
+    (folder / "secret.obj").write_text(TRIANGLE)
+    (folder / "secret.xml").write_text('<mujoco><worldbody><geom size=".1"/></worldbody></mujoco>')
+    return folder
+
+
+@pytest.fixture(scope="module")
+def wire(folder: Path) -> Iterator[Wire]:
+    with SimulatedServer(model_roots=[folder / "root"], limits=LIMITS) as server, Wire(server) as wire:
+        wire.hello()
+        wire.ask("create_level", name="lab")
+        yield wire
+
+
+def refusal(wire: Wire, path: Any) -> str:
+    code, message = wire.refusal("import_xml", path=str(path))
+    assert code == "import_failed"
+    return message
+
+
+@pytest.mark.parametrize("name", HUNGRY)
+def test_a_model_that_asks_for_too_much_is_refused_and_the_server_lives(name: str, wire: Wire, folder: Path) -> None:
+    bomb = folder / "root" / f"{name}.xml"
+    bomb.write_text(f"<mujoco>{HUNGRY[name]}</mujoco>")
+    assert str(bomb) in refusal(wire, bomb)
+    assert wire.ask("import_xml", path="ball")["blueprint_class_path"]
+
+
+def test_the_limit_that_a_model_exceeds_is_named(folder: Path) -> None:
+    model = folder / "root" / "plain.xml"
+    model.write_text('<mujoco><worldbody><camera name="c" resolution="64 64"/></worldbody></mujoco>')
+    bomb = folder / "root" / "replicate.xml"
+    bomb.write_text(f"<mujoco>{HUNGRY['replicate']}</mujoco>")
+    for path, limits, name in (
+        (model, {"model_bytes": 1}, "model_bytes"),
+        (model, {"model_file_bytes": 1}, "model_file_bytes"),
+        (model, {"camera_side": 63}, "camera_side"),
+        (bomb, {"model_cpu_s": 1}, "model_cpu_s"),
+        (bomb, {"model_wall_s": 1}, "model_wall_s"),
+    ):
+        with SimulatedServer(model_roots=[folder / "root"], limits=Limits(**limits)) as server, Wire(server) as wire:
+            wire.hello()
+            assert name in refusal(wire, path)
+
+
+def test_entities_are_not_expanded(wire: Wire, folder: Path) -> None:
+    laughs = "".join(f'<!ENTITY l{i + 1} "{f"&l{i};" * 10}">' for i in range(9))
+    bomb = folder / "root" / "laughs.xml"
+    bomb.write_text(f'<!DOCTYPE mujoco [<!ENTITY l0 "ha">{laughs}]><mujoco><custom>&l9;</custom></mujoco>')
+    assert "document type" in refusal(wire, bomb)
+
+
+def test_what_a_model_names_may_lie_below_the_roots(wire: Wire, folder: Path) -> None:
+    inside = folder / "root" / "inside.xml"
+    inside.write_text(FIGURE.format(file="meshes/../meshes/figure.obj"))
+    assert wire.ask("import_xml", path=str(inside))["imported_now"] is True
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        FIGURE.format(file="../secret.obj"),
+        FIGURE.format(file="meshes/../../secret.obj"),
+        FIGURE.format(file="&#x2e;./secret.obj"),
+        FIGURE.format(file="..\\secret.obj"),
+        FIGURE.format(file="{folder}/secret.obj"),
+        FIGURE.format(file="link.obj"),
+        FIGURE.format(file="linked/secret.obj"),
+        FIGURE.format(file="secret.obj").replace("<asset>", '<compiler meshdir=".."/><asset>'),
+        FIGURE.format(file="secret.obj").replace("<asset>", "<compiler\nassetdir = '{folder}'/><asset>"),
+        '<mujoco><include file="../secret.xml"/></mujoco>',
+        '<mujoco><include file="middle.xml"/></mujoco>',
+        '<mujoco><asset><model name="m" file="../secret.xml"/></asset></mujoco>',
+        '<mujoco><asset><texture name="t" type="cube" fileright="../secret.obj"/></asset></mujoco>',
+    ],
+)
+def test_what_a_model_names_elsewhere_is_refused(text: str, wire: Wire, folder: Path) -> None:
+    root = folder / "root"
+    for link, target in ((root / "link.obj", folder / "secret.obj"), (root / "linked", folder)):
+        if not link.is_symlink():
+            link.symlink_to(target)
+    (root / "middle.xml").write_text('<mujoco><include file="../secret.xml"/></mujoco>')
+    thief = root / "thief.xml"
+    thief.write_text(text.replace("{folder}", str(folder)))
+    message = refusal(wire, thief)
+    assert "outside the folders" in message
+    assert "secret" in message or "link" in message
+
+
+PATHS = [
+    "../secret.xml", "{root}/../secret.xml", "{folder}/secret.xml", "linked.xml", "{root}/linked.xml", "", ".", "..",
+    "secret.xml\0", "\0", "C:\\Windows\\win.ini", "C:secret.xml", "\\\\host\\share\\x.xml", "//host/share/x.xml",
+    "file:///etc/passwd", "~/x.xml", "/dev/zero", "/proc/self/mem", "CON", "x" * 4000, "a/" * 2000, "root/../../x.xml",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_paths_that_lead_out(path: str, wire: Wire, folder: Path) -> None:
+    link = folder / "root" / "linked.xml"
+    if not link.is_symlink():
+        link.symlink_to(folder / "secret.xml")
+    before = {file: file.stat().st_mtime_ns for file in folder.rglob("*") if file.is_file()}
+    text = path.replace("{root}", str(folder / "root")).replace("{folder}", str(folder))
+    assert wire.refusal("import_xml", path=text)[0] in ("import_failed", "missing_field")
+    assert wire.refused("load_level", level_path=text) in ("load_level_failed", "missing_field")
+    assert wire.refused("create_level", name=text) in ("create_level_failed", "missing_field")
+    assert before == {file: file.stat().st_mtime_ns for file in folder.rglob("*") if file.is_file()}
+
+
+def test_recordings_stay_where_they_belong(folder: Path) -> None:
+    with (
+        SimulatedServer("ball", model_roots=[folder / "root"], play=True, unpaused=True, step_mode="direct") as server,
+        Wire(server) as wire,
+    ):
+        wire.hello()
+        wire.ask("recording_start")
+        wire.ask("step", n_steps=3)
+        wire.ask("recording_stop")
+        door = folder / "root" / "door"
+        door.symlink_to(folder)
+        outside = sorted(folder.iterdir())
+        for path in (*PATHS, str(door / "out.json"), str(folder / "out.json")):
+            text = path.replace("{root}", str(folder / "root")).replace("{folder}", str(folder))
+            if text:
+                reply = wire.raw({"op": "recording_save", "session_id": wire.session_id, "path": text})
+                if reply["op"] != "error":  # an odd name, but in the folder of recordings
+                    assert Path(reply["absolute_path"]).resolve().is_relative_to(server.saved_dir), text
+                reply = wire.raw({"op": "replay_load", "session_id": wire.session_id, "path": text})
+                assert reply["op"] == "replay_load_ok" or reply["code"] == "path_not_readable", text
+        assert sorted(folder.iterdir()) == outside
+        assert os.path.lexists(door)
+
+
+def test_a_level_that_a_client_opens_names_no_files_elsewhere(folder: Path, tmp_path: Path) -> None:
+    levels = tmp_path / "Levels"
+    levels.mkdir()
+    crate = '{"name": "Crate_0", "kind": "static_mesh", "mesh": {"shape": "file", "file": "%s"}}'
+    (levels / "thief.json").write_text(
+        '{"format": "urlab-level", "version": 1, "blueprints": {}, "actors": [%s]}' % (crate % (folder / "secret.obj"))
+    )
+    (levels / "other.json").write_text(
+        '{"format": "urlab-level", "version": 1, "blueprints": {"b": {"source": "x.xml", "record": "%s"}}, "actors": '
+        '[{"name": "b", "kind": "articulation", "blueprint": "b"}]}' % (folder / "blueprint.json")
+    )
+    with SimulatedServer(saved_dir=tmp_path, model_roots=[folder / "root"]) as server, Wire(server) as wire:
+        wire.hello()
+        for name in ("thief", "other"):
+            code, message = wire.refusal("load_level", level_path=name)
+            assert code == "load_level_failed"
+            assert "outside the folders" in message
+
+
+def test_whoever_runs_the_server_may_name_any_file(folder: Path) -> None:
+    with SimulatedServer(folder / "secret.xml", model_roots=[folder / "root"]) as server, Wire(server) as wire:
+        wire.hello()
+        assert len(wire.ask("list_actors")["actors"]) == 2
+
+
+def test_a_child_that_was_killed_is_replaced(wire: Wire, folder: Path) -> None:
+    from urlab_client.server import sandbox
+
+    model = folder / "root" / "again.xml"
+    model.write_text('<mujoco><worldbody><geom size=".1"/></worldbody></mujoco>')
+    wire.ask("import_xml", path=str(model))
+    child = sandbox._child._process
+    assert child is not None
+    child.kill()
+    child.wait(30)
+    assert wire.ask("import_xml", path=str(model), force_reimport=True)["imported_now"] is True
+
+
+@pytest.mark.parametrize("count", [0, 3])
+def test_pictures_of_a_model_that_lie_about_their_size(count: int, wire: Wire, folder: Path) -> None:
+    bomb = folder / "root" / "lies.png"
+    bomb.write_bytes(
+        b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sIIBBBBB", 13, b"IHDR", 2**31 - 1, 2**31 - 1, 8, 6, 0, 0, 0) * count
+    )
+    model = folder / "root" / "lies.xml"
+    model.write_text('<mujoco><asset><texture name="t" type="2d" file="lies.png"/></asset></mujoco>')
+    assert "lies" in refusal(wire, model)
