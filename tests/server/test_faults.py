@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from urlab_client import (
-    ConnectionLost,
     OutcomeUnknown,
     ProtocolError,
+    SessionTakenOver,
     StepTimeout,
     URLabClient,
     URLabTimeoutError,
@@ -69,8 +69,9 @@ def test_a_lost_step(client: URLabClient, faults: Faults, executed: bool) -> Non
 def test_a_cut_connection(client: URLabClient, faults: Faults, executed: bool) -> None:
     with faults.add(Cut("step", executed=executed, times=1)), pytest.raises(OutcomeUnknown):
         client.step()
-    with faults.add(Cut("list_keyframes", times=1)), pytest.raises(ConnectionLost):
-        client.runtime.list_keyframes()
+    with faults.add(Cut("list_keyframes", times=1)) as cut:
+        client.runtime.list_keyframes()  # reads are asked again
+    assert cut.seen == 2
     assert client.step().step == (2 if executed else 1)
     assert client.transport_stats.connects == 3
 
@@ -78,8 +79,10 @@ def test_a_cut_connection(client: URLabClient, faults: Faults, executed: bool) -
 def test_others_keep_their_connection(server: SimulatedServer, client: URLabClient, faults: Faults) -> None:
     with URLabClient(**server.client_options(), step_mode="direct") as other:
         other.discover()
-        with faults.add(Cut(times=1)), pytest.raises(ConnectionLost):
+        with faults.add(Cut("list_keyframes", times=1)) as cut, pytest.raises(SessionTakenOver):
             client.runtime.list_keyframes()
+        assert cut.seen == 2
+        assert client.transport_stats.connects == 2
         other.step()
         assert other.transport_stats.connects == 1
 
