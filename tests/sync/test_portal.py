@@ -38,8 +38,15 @@ async def fail(error: BaseException) -> None:
     raise error
 
 
-async def io_thread() -> threading.Thread:
+async def running_thread() -> threading.Thread:
     return threading.current_thread()
+
+
+def io_thread(portal: Portal) -> threading.Thread:
+    """Return the thread that runs the portal's loop between calls."""
+    portal.call(answer())
+    (thread,) = [t for t in threading.enumerate() if t.name == "urlab-io" and portal._io and t is portal._io._thread]
+    return thread
 
 
 @pytest.fixture
@@ -59,12 +66,54 @@ class TestCall:
         assert threading.active_count() == before
         assert not portal.is_open
 
-    def test_one_daemon_thread_serves_all_callers(self, portal: Portal) -> None:
-        with ThreadPoolExecutor(8) as pool:
-            threads = set(pool.map(lambda _: portal.call(io_thread()), range(64)))
-        (thread,) = threads
+    def test_runs_on_the_calling_thread(self, portal: Portal) -> None:
+        assert portal.call(running_thread()) is threading.current_thread()
+        with ThreadPoolExecutor(1) as pool:
+            assert pool.submit(lambda: portal.call(running_thread()) is threading.current_thread()).result()
+
+    async def test_runs_on_the_daemon_thread_for_a_caller_with_a_loop(self, portal: Portal) -> None:
+        thread = portal.call(running_thread())
         assert thread.name == "urlab-io"
         assert thread.daemon
+
+    def test_one_daemon_thread_serves_all_callers(self, portal: Portal) -> None:
+        def call(_: int) -> None:
+            portal.call(answer())
+
+        with ThreadPoolExecutor(8) as pool:
+            list(pool.map(call, range(64)))
+            threads = [thread for thread in threading.enumerate() if thread.name == "urlab-io"]
+        assert [thread.daemon for thread in threads] == [True]
+
+    def test_the_loop_goes_on_between_calls(self, portal: Portal) -> None:
+        ticked = threading.Event()
+
+        async def tick_after_a_while() -> None:
+            asyncio.get_running_loop().call_later(0.02, ticked.set)
+
+        portal.call(tick_after_a_while())
+        assert ticked.wait(10)
+
+    def test_other_calls_go_on_when_the_one_that_ran_the_loop_is_done(self, portal: Portal) -> None:
+        first_is_in = threading.Event()
+
+        async def first() -> None:
+            second_is_in.append(asyncio.Event())
+            first_is_in.set()
+            await second_is_in[0].wait()
+
+        async def second() -> threading.Thread:
+            second_is_in[0].set()
+            await asyncio.sleep(0.02)
+            return threading.current_thread()
+
+        second_is_in: list[asyncio.Event] = []
+        with ThreadPoolExecutor(2) as pool:
+            one = pool.submit(portal.call, first())
+            first_is_in.wait()
+            two = pool.submit(portal.call, second())
+            assert one.result(10) is None
+            assert two.result(10).name == "urlab-io"
 
     def test_calls_of_several_threads_overlap(self, portal: Portal) -> None:
         everyone_is_in: list[asyncio.Barrier] = []
@@ -194,7 +243,7 @@ class TestTracebacks:
         try:
             with contextlib.suppress(ValueError):
                 portal.call(err())
-            thread = portal.call(io_thread())
+            thread = io_thread(portal)
             del portal
             assert not thread.is_alive()
         finally:
@@ -204,14 +253,14 @@ class TestTracebacks:
 class TestClose:
     def test_runs_the_last_coroutine_then_ends_the_thread(self) -> None:
         portal = Portal()
-        thread = portal.call(io_thread())
-        seen: list[threading.Thread] = []
+        thread = io_thread(portal)
+        seen: list[bool] = []
 
         async def last() -> None:
-            seen.append(await io_thread())
+            seen.append(True)
 
         portal.close(last())
-        assert seen == [thread]
+        assert seen == [True]
         assert not thread.is_alive()
 
     def test_again_does_nothing(self) -> None:
@@ -232,7 +281,7 @@ class TestClose:
 
     def test_a_thread_that_inherits_the_ended_ones_number_is_not_mistaken_for_it(self) -> None:
         portal = Portal()
-        number = portal.call(io_thread()).ident
+        number = io_thread(portal).ident
         portal.close()
         refusals: dict[int, type[BaseException]] = {}
 
@@ -260,7 +309,7 @@ class TestClose:
 
     def test_ends_the_thread_though_the_last_coroutine_fails(self) -> None:
         portal = Portal()
-        thread = portal.call(io_thread())
+        thread = io_thread(portal)
         with pytest.raises(OSError, match="gone"):
             portal.close(fail(OSError("gone")))
         assert not thread.is_alive()
@@ -368,7 +417,7 @@ class TestGarbageCollection:
 
         portal = Portal(say_goodbye)
         task = portal.call(begin())
-        thread = portal.call(io_thread())
+        thread = io_thread(portal)
         del portal
         assert not thread.is_alive()
         assert log == ["at_stop", "task cancelled", "generator closed"]
@@ -376,7 +425,7 @@ class TestGarbageCollection:
 
     def test_is_silent_about_a_failing_at_stop(self, caplog: pytest.LogCaptureFixture) -> None:
         portal = Portal(lambda: fail(ConnectionResetError("server gone")))
-        thread = portal.call(io_thread())
+        thread = io_thread(portal)
         del portal
         assert not thread.is_alive()
         assert [record for record in caplog.records if record.levelname != "DEBUG"] == []
@@ -386,7 +435,7 @@ class TestGarbageCollection:
             return asyncio.get_running_loop()
 
         box = [Portal()]
-        thread = box[0].call(io_thread())
+        thread = io_thread(box[0])
         box[0].call(loop()).call_soon_threadsafe(box.clear)
         thread.join(10)
         assert not thread.is_alive()
@@ -480,7 +529,7 @@ class TestInterrupt:
         assert out == []
         assert err.rstrip().endswith("KeyboardInterrupt")
         frames = [line for line in err.splitlines() if line.startswith("  File ")]
-        assert [frame.rpartition(" in ")[2] for frame in frames] == ["<module>", "call", "wait"]
+        assert [frame.rpartition(" in ")[2] for frame in frames] == ["<module>", "call", "run"]
 
     def test_does_not_wait_for_a_coroutine_that_ignores_it(self) -> None:
         process = child("""

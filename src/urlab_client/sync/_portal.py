@@ -1,6 +1,22 @@
-"""What the generated façade stands on: a background event loop per client, and the base of its classes.
+"""What the generated façade stands on: an event loop per client, and the base of its classes.
 
 Everything blocking-only lives here; the other modules of `urlab_client.sync` are generated and hold no behaviour.
+
+**Who runs the loop.** Handing a call to another thread costs more than a round trip to the server, so the thread that
+makes a blocking call runs the loop itself until its call is done; a daemon thread `urlab-io` runs it the rest of the
+time, for streams and heartbeats. The rules:
+
+1. Only the holder of `_turn` runs the loop, steps its tasks or closes it.
+2. A call that finds no other one under way takes the turn. If the thread has it, the thread is asked to yield, and
+   does between two callbacks. Any other call is queued in the loop, and whoever runs that completes it.
+3. Who leaves gives the turn back first and then looks for calls still under way; who queues a call does that first
+   and then looks whether anybody has the turn. Either of them rings the thread's bell if nobody would run the loop.
+4. The thread takes the turn when the bell rings, or when no call has left for `_IDLE`: consecutive calls of a script
+   cost no hand-over. It alone sees the loop to its end.
+5. An exception that a signal handler raises amid the loop's own code would lose callbacks. While the main thread runs
+   the loop, handlers are therefore kept back; a signal makes it leave the loop, and the handler runs then.
+
+A thread with a running loop of its own, as in a notebook, cannot run a second one: its calls are always queued.
 """
 
 from __future__ import annotations
@@ -10,12 +26,14 @@ import contextlib
 import inspect
 import logging
 import os
+import signal
 import sys
 import threading
+import time
 import warnings
 import weakref
 from collections.abc import Callable, Coroutine
-from types import TracebackType
+from types import FrameType, TracebackType
 from typing import Any, Generic, Protocol, TypeVar, cast, overload
 
 from urlab_client.protocol.errors import ClientClosed, ForkedError, URLabError, URLabRPCError
@@ -34,36 +52,88 @@ GRACE = 1.0
 # A lock wait on Windows does not see Ctrl-C, so there it is taken in slices.
 _WAIT_SLICE = 0.1 if sys.platform == "win32" else threading.TIMEOUT_MAX
 
+# Nor does select() see it there: the main thread must not run the loop.
+_MAIN_THREAD_DRIVES = sys.platform != "win32"
+
+# Seconds after a call until the thread runs the loop again. A hand-over then costs a hundredth of the pause.
+_IDLE = 0.005
+
+# Seconds after which the thread is asked again for the turn, and a caller that waits for it looks for signals.
+_CLAIM_SLICE = 0.05
+
+_SIGNALS = sorted(int(number) for number in signal.valid_signals())
+# What the module wraps: it makes enumerations of everything, which takes ten times as long.
+_get_handler: Callable[[int], Any] = inspect.unwrap(signal.getsignal)
+_set_handler: Callable[[int, Any], Any] = inspect.unwrap(signal.signal)
+
 _log = logging.getLogger("urlab_client.sync")
 
 
 class _Job(Generic[T]):
-    """A coroutine on its way through the loop: made and awaited by the calling thread, finished by the I/O thread."""
+    """A coroutine on its way through the loop: made by the calling thread, finished by who runs the loop."""
 
-    __slots__ = ("_finished", "_waiter", "coro", "error", "task", "value")
+    __slots__ = ("_waiter", "coro", "error", "finished", "task", "value")
 
     value: T
 
     def __init__(self, coro: Coroutine[Any, Any, T]) -> None:
         self.coro = coro
-        self.task: asyncio.Task[T] | None = None
+        self.task: asyncio.Task[None] | None = None
         self.error: BaseException | None = None
-        self._finished = False
+        self.finished = False
         self._waiter = threading.Lock()
         self._waiter.acquire()
 
     def wait(self, timeout: float = threading.TIMEOUT_MAX) -> bool:
         """Block until the job is finished, at most `timeout` seconds; return whether it is."""
-        while not self._finished and timeout > 0:
+        while not self.finished and timeout > 0:
             piece = min(timeout, _WAIT_SLICE)
             self._waiter.acquire(timeout=piece)
             timeout -= piece
-        return self._finished
+        return self.finished
 
     def finish(self) -> None:
         """Let the caller go on. `value` or `error` is set by now."""
-        self._finished = True
+        self.finished = True
         self._waiter.release()
+
+
+class _SignalGate:
+    """Keeps Python's signal handlers from running while the main thread runs a loop. Does nothing in other threads.
+
+    Args:
+        leave: Makes the thread leave the loop; called when a signal comes.
+    """
+
+    __slots__ = ("_leave", "_replaced", "pending")
+
+    def __init__(self, leave: Callable[[], object]) -> None:
+        self.pending: list[tuple[int, FrameType | None]] = []
+        self._leave = leave
+        self._replaced: list[tuple[int, Any]] = []
+
+    def shut(self) -> None:
+        """Put handlers aside. What strikes meanwhile leaves some of them to `open`."""
+        if threading.current_thread() is threading.main_thread():
+            for number in _SIGNALS:
+                handler = _get_handler(number)
+                if callable(handler):
+                    self._replaced.append((number, handler))
+                    _set_handler(number, self._keep)
+
+    def open(self) -> None:
+        """Put the handlers back. One that runs and raises as soon as it is back does not keep the others out."""
+        try:
+            while self._replaced:
+                _set_handler(*self._replaced[-1])
+                self._replaced.pop()
+        finally:
+            if self._replaced:
+                self.open()
+
+    def _keep(self, number: int, frame: FrameType | None) -> None:
+        self.pending.append((number, frame))
+        self._leave()
 
 
 class _Stream(Protocol[A_co]):
@@ -74,8 +144,8 @@ class _Stream(Protocol[A_co]):
     def __anext__(self) -> Coroutine[Any, Any, A_co]: ...
 
 
-class _IOThread:
-    """A daemon thread and the event loop it runs.
+class _LoopHost:
+    """The loop, the daemon thread that runs it when nobody else does, and the right to run it.
 
     Refers to no portal and no façade object, so that dropping these ends the thread.
     """
@@ -87,11 +157,20 @@ class _IOThread:
         self._pid = os.getpid()
         self._at_stop = at_stop
         self._stop_requested = asyncio.Event()
+        self._turn = threading.Lock()
+        self._turn.acquire()  # The thread starts with it.
+        self._thread_drives = True
+        self._driven: _Job[Any] | None = None
+        self._left = 0.0
+        # A lock and not an event, which a signal handler or a finalizer could find half set.
+        self._bell = threading.Lock()
+        self._bell.acquire()
         self._jobs: set[_Job[Any]] = set()
         # Guards `_stopping`, `_jobs` and the loop's end: a job is either refused or finished, never left waiting.
         # Reentrant, because a signal handler may close the client in the middle of `submit`.
         self._lock = threading.RLock()
         self._stopping = False
+        self._ended = False
 
     def start(self) -> None:
         """Start the thread. If that is interrupted, the thread, should there be one, ends by itself."""
@@ -106,31 +185,36 @@ class _IOThread:
 
     @property
     def is_current(self) -> bool:
-        """Whether the caller runs on this thread."""
-        # A thread's number is given to another one once it has ended.
-        return threading.get_ident() == self._thread.ident and self._thread.is_alive()
+        """Whether the caller runs inside the loop."""
+        return asyncio._get_running_loop() is self._loop  # noqa: SLF001  # unlike get_running_loop, never raises
 
     @property
     def stopping(self) -> bool:
         """Whether `stop` was called."""
         return self._stopping
 
-    def submit(self, job: _Job[Any]) -> None:
-        """Start `job` on the loop. Raises `ClientClosed` if the loop is on its way out."""
-        with self._lock:
-            if self._stopping:
-                raise _closed()
-            self._jobs.add(job)
-            self._loop.call_soon_threadsafe(self._start_job, job)
+    def run(self, job: _Job[Any]) -> None:
+        """Run `job` until it is finished. Raises `ClientClosed` if the loop is on its way out."""
+        if not (self._may_drive() and self._enlist(job)):
+            self._submit(job)
+            job.wait()
+        while not job.finished:
+            for number, frame in self._drive(job):
+                # As if it came now: the handler may raise, or use the client.
+                handler = _get_handler(number)
+                if callable(handler):
+                    handler(number, frame)
 
     def abandon(self, job: _Job[Any]) -> None:
-        """Cancel `job`, whose caller was interrupted anywhere in `submit` or while waiting; wait for its clean-up."""
+        """Cancel `job`, whose caller was interrupted anywhere in `run`; wait for its clean-up."""
         with self._lock:
             if under_way := job in self._jobs:
                 self._loop.call_soon_threadsafe(self._cancel_job, job)
         if not under_way:
             job.coro.close()
-        elif not job.wait(GRACE):
+            return
+        self._see_to_driver()
+        if not job.wait(GRACE):
             _log.warning("%s goes on %g s after it was interrupted", getattr(job.coro, "__qualname__", job.coro), GRACE)
 
     def stop(self) -> None:
@@ -138,53 +222,187 @@ class _IOThread:
         if os.getpid() != self._pid:
             return  # A forked child shares the parent's epoll set: closing the loop would deafen the parent's.
         self._request_stop()
-        if not self.is_current:  # The garbage collector may call from any thread.
+        # The garbage collector may call from any thread, also from inside the loop.
+        if not self.is_current and threading.current_thread() is not self._thread:
             self._thread.join(4 * GRACE)
+
+    # Calls
+
+    def _may_drive(self) -> bool:
+        if asyncio._get_running_loop() is not None:  # noqa: SLF001  # unlike get_running_loop, never raises
+            return False
+        return _MAIN_THREAD_DRIVES or threading.current_thread() is not threading.main_thread()
+
+    def _enlist(self, job: _Job[Any]) -> bool:
+        """Register `job` unless others are under way; return whether it was registered."""
+        with self._lock:
+            if self._stopping:
+                raise _closed()
+            if self._jobs:
+                return False
+            self._jobs.add(job)
+            return True
+
+    def _submit(self, job: _Job[Any]) -> None:
+        with self._lock:
+            if self._stopping:
+                raise _closed()
+            self._jobs.add(job)
+            self._loop.call_soon_threadsafe(self._start_job, job)
+        self._see_to_driver()
+
+    def _drive(self, job: _Job[Any]) -> list[tuple[int, FrameType | None]]:
+        """Run the loop on this thread until `job` is finished or signals come; return these."""
+        if self._ended:
+            job.wait(_CLAIM_SLICE)
+            return []
+        gate = _SignalGate(self._leave)
+        try:
+            gate.shut()
+            if self._claim(job, gate):
+                try:
+                    self._run_until_finished(job, gate)
+                finally:
+                    self._give_back()
+        finally:
+            gate.open()
+        return gate.pending
+
+    def _claim(self, job: _Job[Any], gate: _SignalGate) -> bool:
+        """Get the turn; return False if `job` was finished or a signal came before."""
+        while not self._turn.acquire(blocking=False):
+            if job.finished or gate.pending:
+                return False
+            self._poke(self._yield)
+            if self._turn.acquire(timeout=_CLAIM_SLICE):
+                break
+        return True
+
+    def _run_until_finished(self, job: _Job[Any], gate: _SignalGate) -> None:
+        if self._ended:
+            return
+        if job.task is None:
+            job.task = self._loop.create_task(self._perform(job))
+        self._driven = job
+        try:
+            while not (job.finished or gate.pending or self._ended):
+                self._run_loop()
+        finally:
+            self._driven = None
+
+    def _run_loop(self) -> None:
+        # A task that raises one of these breaks out of the loop. If it is a job, its caller gets it through that.
+        try:
+            self._loop.run_forever()
+        except (KeyboardInterrupt, SystemExit) as error:
+            _log.debug("a task on the loop raised %r", error)
+
+    def _give_back(self) -> None:
+        self._left = time.monotonic()
+        self._turn.release()
+        if self._jobs or self._stopping:
+            self._see_to_driver()
+
+    def _see_to_driver(self) -> None:
+        """Wake the thread if nobody runs the loop."""
+        if not self._turn.locked():
+            self._ring()
+
+    def _ring(self) -> None:
+        with contextlib.suppress(RuntimeError):  # It has been rung already.
+            self._bell.release()
+
+    def _leave(self) -> None:
+        """Make whoever runs the loop leave it soon."""
+        self._poke(self._loop.stop)
+
+    def _poke(self, callback: Callable[[], object]) -> None:
+        with contextlib.suppress(RuntimeError):  # The loop has just been closed.
+            self._loop.call_soon_threadsafe(callback)
 
     def _request_stop(self) -> None:
         with self._lock:
             if not self._stopping:
                 self._stopping = True
                 self._loop.call_soon_threadsafe(self._stop_requested.set)
+        self._ring()
+
+    # In the loop
+
+    def _yield(self) -> None:
+        if self._thread_drives:
+            self._loop.stop()
 
     def _start_job(self, job: _Job[Any]) -> None:
         if job in self._jobs:
-            job.task = self._loop.create_task(job.coro)
-            job.task.add_done_callback(lambda _: self._finish_job(job))
+            job.task = self._loop.create_task(self._perform(job))
 
     def _cancel_job(self, job: _Job[Any]) -> None:
         if job.task is not None:
             job.task.cancel()
         elif job in self._jobs:  # The interrupt came before the start was scheduled.
-            self._finish_job(job)
+            self._break_off(job)
+
+    async def _perform(self, job: _Job[Any]) -> None:
+        # Rather than a callback of the task: that would take one more turn of the loop.
+        try:
+            job.value = await job.coro
+        except GeneratorExit:
+            raise  # The loop ended first, and the job with it.
+        except asyncio.CancelledError as error:
+            job.error = _closed("during this call") if self._stopping else error.with_traceback(None)
+        except BaseException as error:  # noqa: BLE001  # what it is, is the caller's business
+            trace = error.__traceback__
+            job.error = error.with_traceback(None if trace is None else trace.tb_next)  # without this frame
+            del trace
+        self._finish_job(job)
+
+    def _break_off(self, job: _Job[Any]) -> None:
+        job.error = _closed("during this call")
+        if job.task is None:
+            job.coro.close()
+        self._finish_job(job)
 
     def _finish_job(self, job: _Job[Any]) -> None:
         self._jobs.discard(job)
-        task = job.task
-        if task is None or not task.done():
-            job.error = _closed("during this call")
-            if task is None:
-                job.coro.close()
-        elif task.cancelled():
-            job.error = _closed("during this call") if self._stopping else asyncio.CancelledError()
-        elif (error := task.exception()) is not None:
-            job.error = error
-        else:
-            job.value = task.result()
         # Not left to the caller to drop: a signal handler that raises amid weak reference callbacks gets printed.
         job.task = None
         job.finish()
+        if self._driven is job:
+            self._loop.stop()
+
+    # The thread
 
     def _run(self) -> None:
         main = self._loop.create_task(self._main())
-        while not main.done():
-            # A coroutine that raises one of these breaks out of the loop. Its caller gets it through its job.
-            with contextlib.suppress(KeyboardInterrupt, SystemExit):
-                self._loop.run_until_complete(main)
+        main.add_done_callback(self._note_end)
+        while not self._ended:
+            self._run_loop()
+            if not self._ended and not self._stopping:
+                self._thread_drives = False
+                self._turn.release()
+                self._await_turn()
+                self._thread_drives = True
         with self._lock:
             for job in tuple(self._jobs):
-                self._finish_job(job)
+                self._break_off(job)
             self._loop.close()
+        self._turn.release()
+
+    def _await_turn(self) -> None:
+        """Sleep until the turn is the thread's again."""
+        while True:
+            if self._bell.acquire(timeout=_IDLE):
+                self._turn.acquire()
+                break
+            if time.monotonic() - self._left >= _IDLE and self._turn.acquire(blocking=False):
+                break
+        # Whatever it rang for until now is in the loop. Left ringing, it would take the turn from the next caller.
+        self._bell.acquire(blocking=False)
+
+    def _note_end(self, main: asyncio.Task[None]) -> None:
+        self._ended = True
+        self._loop.stop()
 
     async def _main(self) -> None:
         await self._stop_requested.wait()
@@ -211,9 +429,9 @@ async def _in_bounded_time(*tasks: asyncio.Task[Any]) -> None:
 class Portal:
     """The way from blocking code into one client's event loop.
 
-    Cheap to make: the loop and its daemon thread start with the first `call`. They end with `close`, when the portal
-    is garbage collected, or at interpreter exit; then `at_stop` runs, remaining tasks are cancelled and awaited,
-    asynchronous generators are closed and the thread is joined, each in bounded time.
+    Cheap to make: the loop and the daemon thread that runs it between calls start with the first `call`. They end
+    with `close`, when the portal is garbage collected, or at interpreter exit; then `at_stop` runs, remaining tasks are
+    cancelled and awaited, asynchronous generators are closed and the thread is joined, each in bounded time.
 
     Args:
         at_stop: Makes the coroutine that releases what lives on the loop. It must not refer to the portal.
@@ -225,7 +443,7 @@ class Portal:
         self._at_stop = at_stop
         self._pid = os.getpid()
         self._lock = threading.RLock()
-        self._io: _IOThread | None = None
+        self._io: _LoopHost | None = None
         self._finalizer: weakref.finalize[[], Portal] | None = None
         self._closed = False
         # Weak: twins refer to the portal, so a strong reference back would leave closing to the cycle collector.
@@ -237,7 +455,7 @@ class Portal:
         return self._io is not None and not self._io.stopping and self._pid == os.getpid()
 
     def call(self, coro: Coroutine[Any, Any, T]) -> T:
-        """Run `coro` on the loop and return its result; block until then.
+        """Run `coro` on the loop and return its result; block until then. Where possible this thread runs the loop.
 
         An exception that strikes the calling thread meanwhile, such as `KeyboardInterrupt`, cancels the coroutine,
         gives its `finally` blocks up to `GRACE` seconds, and goes on. The portal stays usable.
@@ -245,14 +463,13 @@ class Portal:
         Raises:
             ForkedError: If this process is a fork of the one that made the portal.
             ClientClosed: If the portal is closed, before or during the call.
-            URLabError: If called on the loop's own thread, where waiting would never end.
+            URLabError: If called from inside the loop, where waiting would never end.
         """
-        io: _IOThread | None = None
+        io: _LoopHost | None = None
         job = _Job(coro)
         try:
             io = self._ready()
-            io.submit(job)
-            job.wait()
+            io.run(job)
         except BaseException:
             if io is None:
                 coro.close()
@@ -340,8 +557,8 @@ class Portal:
         Facade.__init__(twin, aio, self)
         self._twins[id(aio)] = twin
 
-    def _ready(self) -> _IOThread:
-        """Return the running thread, or raise the reason why there cannot be one."""
+    def _ready(self) -> _LoopHost:
+        """Return the running loop, or raise the reason why there cannot be one."""
         if os.getpid() != self._pid:
             raise _forked()
         if self._io is None:
@@ -349,7 +566,7 @@ class Portal:
                 if self._closed:
                     raise _closed()
                 if self._io is None:
-                    io = _IOThread(self._at_stop)
+                    io = _LoopHost(self._at_stop)
                     io.start()
                     self._finalizer = weakref.finalize(self, io.stop)
                     self._io = io
