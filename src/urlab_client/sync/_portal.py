@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import importlib
 import inspect
 import logging
 import os
@@ -62,9 +63,10 @@ _IDLE = 0.005
 _CLAIM_SLICE = 0.05
 
 _SIGNALS = sorted(int(number) for number in signal.valid_signals())
-# What the module wraps: it makes enumerations of everything, which takes ten times as long.
-_get_handler: Callable[[int], Any] = inspect.unwrap(signal.getsignal)
-_set_handler: Callable[[int, Any], Any] = inspect.unwrap(signal.signal)
+# What `signal` wraps: its own functions make enumerations of everything, which takes ten times as long.
+_signal: Any = importlib.import_module("_signal")
+_get_handler: Callable[[int], Any] = _signal.getsignal
+_set_handler: Callable[[int, Any], Any] = _signal.signal
 
 _log = logging.getLogger("urlab_client.sync")
 
@@ -114,7 +116,7 @@ class _SignalGate:
 
     def shut(self) -> None:
         """Put handlers aside. What strikes meanwhile leaves some of them to `open`."""
-        if threading.current_thread() is threading.main_thread():
+        if threading.get_ident() == threading.main_thread().ident:
             for number in _SIGNALS:
                 handler = _get_handler(number)
                 if callable(handler):
