@@ -17,6 +17,7 @@ Burst = Callable[[int], list[float]]
 
 _BURST_S = 0.03
 _MIN_ROUNDS = 4
+_MIN_ROUNDS_QUICK = 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,7 +142,8 @@ def measure(row: Row, seconds: float) -> Result:
         floor: list[list[float]] = []
         gc.collect()
         end = time.perf_counter() + seconds
-        while len(ours) < _MIN_ROUNDS or time.perf_counter() < end:
+        least = _MIN_ROUNDS if seconds > 2 else _MIN_ROUNDS_QUICK
+        while len(ours) < least or time.perf_counter() < end:
             turns = [(pair.ours, ours), (pair.floor, floor)]
             # The order changes, so that neither always has the other's aftermath to bear.
             for burst, taken in turns if len(ours) % 2 else reversed(turns):
