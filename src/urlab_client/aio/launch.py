@@ -19,7 +19,7 @@ from urlab_client.aio.transport.base import TransportStats
 from urlab_client.aio.transport.zmq import ZmqTransport
 from urlab_client.protocol.base import Op
 from urlab_client.protocol.errors import ClientClosed, ServerUnreachable
-from urlab_client.protocol.messages.session import HelloOk
+from urlab_client.protocol.messages.session import Hello, HelloOk
 from urlab_client.protocol.messages.streams import ClientEvent
 
 __all__ = ["SCHEME", "LaunchedTransport", "serve_arguments"]
@@ -73,6 +73,7 @@ class LaunchedTransport:
         self._drain: asyncio.Task[None] | None = None
         self._inner: ZmqTransport | None = None
         self._state_port: int | None = None
+        self._lost_at = 0.0
         self._closed = False
         self.on_event: Callable[[ClientEvent], None] | None = None
 
@@ -92,7 +93,21 @@ class LaunchedTransport:
         return self._inner is not None and self._inner.connected
 
     async def request(self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None) -> bytes:
-        """See `Transport.request`. The first request also starts the server, which its deadline does not cover."""
+        """See `Transport.request`. The first request also starts the server, which its deadline does not cover.
+
+        When the server has died, a handshake starts another one; anything else would be refused by it anyway.
+        """
+        process = self._process
+        if self._inner is not None and process is not None and process.returncode is not None:
+            if op.request is not Hello:
+                raise ServerUnreachable(
+                    f"{op.name}: the simulated server of {self._address} has ended with code {process.returncode}. "
+                    "Nothing was sent.",
+                    op=op.name,
+                    hint="discover() starts another one.",
+                )
+            self._lost_at = self._inner.lost_at
+            await self._bury()
         if self._inner is None:
             loop = asyncio.get_running_loop()
             before = loop.time()
@@ -110,9 +125,15 @@ class LaunchedTransport:
         if self._closed:
             return
         self._closed = True
-        if self._inner is not None:
-            await self._inner.aclose()
-        process = self._process
+        await self._bury()
+
+    async def _bury(self) -> None:
+        """Release what belongs to the server that was started last, and wait a bounded time for its end."""
+        inner, self._inner = self._inner, None
+        process, self._process = self._process, None
+        drain, self._drain = self._drain, None
+        if inner is not None:
+            await inner.aclose()
         if process is None:
             return
         if process.stdin is not None:
@@ -124,8 +145,8 @@ class LaunchedTransport:
             log.warning("%s: the server did not end within %g s and was killed", self._address, _STOP_S)
             process.kill()
             await process.wait()
-        if self._drain is not None:
-            await self._drain
+        if drain is not None:
+            await drain
 
     async def _launch(self, op: Op) -> ZmqTransport:
         if self._closed:
@@ -147,6 +168,7 @@ class LaunchedTransport:
         transport = ZmqTransport(f"{ready.address}:{ready.step_port}")
         transport.stats = self.stats
         transport.on_event = self.on_event
+        transport.lost_at = self._lost_at
         self._state_port = ready.state_port
         return transport
 
@@ -177,5 +199,11 @@ _DEFAULTS: Sequence[str] = (
 
 async def _log_lines(stream: asyncio.StreamReader) -> None:
     """Keep the pipe empty, or the server would block on it."""
-    while line := await stream.readline():
+    while True:
+        try:
+            line = await stream.readline()
+        except ValueError:  # longer than the stream's limit, and dropped
+            continue
+        if not line:
+            return
         log.info("server: %s", line.decode(errors="replace").rstrip())

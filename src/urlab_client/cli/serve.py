@@ -9,7 +9,6 @@ import os
 import queue
 import signal
 import sys
-import tempfile
 import threading
 from enum import Enum
 from pathlib import Path
@@ -212,8 +211,10 @@ def run(arguments: ServeArguments) -> int:
         threading.Thread(target=_watch_input, args=[events], name="urlab-stdin", daemon=True).start()
     import_mujoco()
     _check_paths(arguments)
-    with tempfile.TemporaryDirectory(prefix="urlab-", ignore_cleanup_errors=True) as scratch:
-        server = _server(arguments, arguments.saved_dir or Path(scratch))
+    from urlab_client.server.scratch import Scratch  # noqa: PLC0415
+
+    with Scratch() as scratch:
+        server = _server(arguments, arguments.saved_dir or scratch.path)
         starter = _Starter(server, events)
         starter.start()
         if _next(events) is _Event.STARTED:

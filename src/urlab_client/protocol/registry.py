@@ -100,6 +100,8 @@ OPS: Mapping[str, Op] = registry(
         request=session.Forward,
         ns="runtime",
         needs=_MANAGER,
+        # Computes what follows from the state, which it leaves as it is: the same the second time.
+        effect=_READ,
         errors=("not_ready",),
         declares=("op:string", "time:float", "step:int", "per_articulation:object"),
     ),

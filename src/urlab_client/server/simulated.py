@@ -5,8 +5,6 @@ from __future__ import annotations
 import inspect
 import logging
 import os
-import shutil
-import tempfile
 import threading
 import time
 import warnings
@@ -37,6 +35,7 @@ from urlab_client.server.limits import Limits
 from urlab_client.server.markers import Drawings
 from urlab_client.server.publishing import StreamServer
 from urlab_client.server.refusal import Refusal
+from urlab_client.server.scratch import Scratch
 from urlab_client.server.session import Session
 from urlab_client.server.viewport import Viewport
 from urlab_client.server.world import World
@@ -375,7 +374,7 @@ class _Opened:
             )
         self._cameras: CameraStreams | None = None
         self._streams: StreamServer | None = None
-        self._scratch: Path | None = None
+        self._scratch: Scratch | None = None
         self._injector: Injector | None = None
         self._dispatcher: Dispatcher | None = None
         self._plays = config.play
@@ -477,8 +476,8 @@ class _Opened:
     def _content(self, config: _Config) -> ContentRoot:
         folder = config.saved_dir
         if folder is None:
-            # Not a TemporaryDirectory, which a forked child would remove.
-            folder = self._scratch = Path(tempfile.mkdtemp(prefix="urlab-"))
+            self._scratch = Scratch()
+            folder = self._scratch.path
         roots = config.model_roots
         if roots is None:
             files = [Path(model).resolve() for model in config.models if Path(model).is_file()]
@@ -508,7 +507,7 @@ class _Opened:
         """Return something that compares equal for as long as nothing was authored or written."""
         files: set[tuple[Path, int, int]] = set()
         if self._scratch is not None:
-            for file in self._scratch.rglob("*"):
+            for file in self._scratch.path.rglob("*"):
                 status = file.lstat()
                 files.add((file, status.st_mtime_ns, status.st_size))
         return core.world.authored(), files
@@ -539,7 +538,7 @@ class _Opened:
         if not idle:
             logger.warning("a request was still under way when the server closed; its thread ends after it")
         if self._scratch is not None:
-            shutil.rmtree(self._scratch, ignore_errors=True)
+            self._scratch.close()
 
 
 def _is_level(model: str) -> bool:

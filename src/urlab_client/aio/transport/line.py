@@ -7,11 +7,12 @@ the peer's I/O thread, also while its worker is busy for minutes: they tell a de
 
 from __future__ import annotations
 
+import contextlib
 from typing import Final
 
 import zmq
 
-__all__ = ["FAILED_HANDSHAKES", "NOTICED_S", "OBSTACLES", "WATCHED", "configure"]
+__all__ = ["FAILED_HANDSHAKES", "NOTICED_S", "OBSTACLES", "RETRYING", "REVIVE_S", "WATCHED", "configure", "reconnect"]
 
 HEARTBEAT_MS = 1000
 SILENCE_MS = 3000
@@ -46,6 +47,21 @@ OBSTACLES: Final = {
     **dict.fromkeys(FAILED_HANDSHAKES, "the ZeroMQ handshake failed"),
 }
 """What an event says about why there is no connection."""
+
+
+RETRYING: Final = (zmq.Event.CONNECT_RETRIED, zmq.Event.CONNECTED, zmq.Event.HANDSHAKE_SUCCEEDED)
+"""Events that show that ZeroMQ goes on by itself."""
+
+REVIVE_S: Final = 0.1
+"""Seconds after a loss by which one of those has come, or never will: ZeroMQ gives up a connection over which garbage
+came."""
+
+
+def reconnect(socket: zmq.Socket[bytes], endpoint: str) -> None:
+    """Connect afresh."""
+    with contextlib.suppress(zmq.ZMQError):  # which says that ZeroMQ has forgotten the endpoint
+        socket.disconnect(endpoint)
+    socket.connect(endpoint)
 
 
 def configure(socket: zmq.Socket[bytes]) -> None:

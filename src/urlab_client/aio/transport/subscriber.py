@@ -12,7 +12,6 @@ fast they are read, and a subscriber that is not read cannot fill the server's q
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -127,6 +126,7 @@ class _Subscriber:
         self._sinks: dict[Sink, Subscription] = {}
         self._routes: dict[bytes, tuple[Sink, ...]] = {}
         self._down_since: float | None = None
+        self._retrying = False
         self._closed = False
         socket = self._socket = context.socket(zmq.SUB)
         line.configure(socket)
@@ -241,6 +241,7 @@ class _Subscriber:
             self._note(zmq.Event(message["event"]))
 
     def _note(self, event: zmq.Event) -> None:
+        self._retrying = self._retrying or event in line.RETRYING
         if event is zmq.Event.HANDSHAKE_SUCCEEDED:
             self.connected = True
             self.connects += 1
@@ -257,6 +258,8 @@ class _Subscriber:
                 log.info("lost %s; reconnecting", self.endpoint)
                 self.connected = False
                 self._down_since = self._loop.time()
+                self._retrying = False
+                self._loop.call_later(line.REVIVE_S, self._revive)
                 self._tell_line()
         elif event in _OBSTACLES and self.connects == 0:
             self.obstacle = _OBSTACLES[event]
@@ -266,9 +269,12 @@ class _Subscriber:
 
     def _reconnect(self) -> None:
         if not self._closed:
-            with contextlib.suppress(zmq.ZMQError):
-                self._socket.disconnect(self.endpoint)
-            self._socket.connect(self.endpoint)
+            line.reconnect(self._socket, self.endpoint)
+
+    def _revive(self) -> None:
+        self._on_event()
+        if not self._retrying:
+            self._reconnect()
 
     def _tell_line(self) -> None:
         for sink in tuple(self._sinks):

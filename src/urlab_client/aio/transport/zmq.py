@@ -8,7 +8,6 @@ ever cancels a receive, which could lose a frame.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import errno
 import logging
 from collections.abc import Callable
@@ -65,7 +64,11 @@ class _Sent:
 
 
 class ZmqTransport:
-    """Transport over one DEALER socket; connects when first used and reconnects by itself."""
+    """Transport over one DEALER socket; connects when first used and reconnects by itself.
+
+    Attributes:
+        lost_at: Loop time at which the connection broke last.
+    """
 
     stats: TransportStats
 
@@ -85,8 +88,9 @@ class ZmqTransport:
         self._connected = False
         self._closed = False
         self._obstacle = "the host does not answer"
-        self._down_since = 0.0
+        self.lost_at = 0.0
         self._silent_since: float | None = None
+        self._retrying = False
         self.on_event: Callable[[ClientEvent], None] | None = None
 
     @property
@@ -207,9 +211,7 @@ class ZmqTransport:
         if self._given_up and self._socket is not None:
             # Told why, ZeroMQ does not try again by itself; by now the server may have learnt the key.
             self._given_up = False
-            with contextlib.suppress(zmq.ZMQError):
-                self._socket.disconnect(self._endpoint)
-            self._socket.connect(self._endpoint)
+            line.reconnect(self._socket, self._endpoint)
 
         def give_up() -> None:
             if not waiter.done():
@@ -280,6 +282,7 @@ class ZmqTransport:
             self._note(zmq.Event(message["event"]), message["value"])
 
     def _note(self, event: zmq.Event, value: int) -> None:
+        self._retrying = self._retrying or event in line.RETRYING
         if event is zmq.Event.HANDSHAKE_SUCCEEDED:
             self._connected = True
             self._rejections = 0
@@ -321,18 +324,25 @@ class ZmqTransport:
         if self._connected:
             log.info("lost %s; reconnecting", self._endpoint)
             if self._loop is not None:
-                self._down_since = self._loop.time()
+                self.lost_at = self._loop.time()
+                self._retrying = False
+                self._loop.call_later(line.REVIVE_S, self._revive)
             self._tell(ServerLost(endpoint=self._endpoint))
         self._connected = False
         self._silent_since = None
         self._obstacle = "the connection was lost and not restored"
         self._fail_sent(self._lost)
 
+    def _revive(self) -> None:
+        self._on_event()
+        if not self._retrying and not self._closed and self._socket is not None:
+            line.reconnect(self._socket, self._endpoint)
+
     def _tell_connected(self) -> None:
         if self.stats.connects == 1 or self._loop is None:
             self._tell(ServerConnected(endpoint=self._endpoint))
         else:
-            self._tell(ServerReconnected(endpoint=self._endpoint, down_s=self._loop.time() - self._down_since))
+            self._tell(ServerReconnected(endpoint=self._endpoint, down_s=self._loop.time() - self.lost_at))
 
     def _tell(self, event: ClientEvent) -> None:
         if self.on_event is not None:
