@@ -36,8 +36,8 @@ LEGEND = """\
   docstring.
 - **Needs**: *nothing*; an *editor* (a packaged build answers `unknown_op`); a running *play* session (else
   `no_active_manager`).
-- **Lost reply**: when the connection breaks after the request was sent, *read* ops raise `ConnectionLost` and may be
-  called again; *write* ops raise `OutcomeUnknown`. No op is sent twice by itself.
+- **Lost reply**: when the connection breaks after the request was sent, *read* ops are sent again within the same
+  deadline; *write* ops raise `OutcomeUnknown` and are never sent twice. See [reliability](../reliability.md).
 - **Timeout**: what a call waits for at least. Where there is none, the client's default holds: `rcv_timeout_ms`,
   5 seconds.
 - **Simulated**: whether the simulated server executes it; otherwise it answers `unsupported`.

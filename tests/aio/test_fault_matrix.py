@@ -1,0 +1,205 @@
+"""Every op against every fault: the call ends in time with an error of its kind, and the next call works.
+
+CI takes one fault for each op, so that each op and each fault has its turn; `URLAB_LONG_TESTS=1` takes them all.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import os
+import signal
+import threading
+from collections.abc import AsyncIterator, Awaitable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import pytest
+from samples import filled
+
+from urlab_client.aio import URLabClient
+from urlab_client.protocol.base import Timing
+from urlab_client.protocol.codec import encode_reply
+from urlab_client.protocol.errors import (
+    ClientClosed,
+    OutcomeUnknown,
+    ProtocolError,
+    ServerUnreachable,
+    SessionTakenOver,
+    URLabConnectionError,
+    URLabTimeoutError,
+)
+from urlab_client.protocol.registry import OPS
+
+T = TypeVar("T")
+LONG = bool(os.environ.get("URLAB_LONG_TESTS"))
+SOME = list(OPS) if LONG else ["hello", "step", "reset", "spawn_actor", "recording_start", "list_keyframes"]
+SLACK_S = 1.0
+FAULTS = ["cancelled", "timed out", "truncated", "garbage"]
+PAIRS = [(fault, name) for i, name in enumerate(OPS) for j, fault in enumerate(FAULTS) if LONG or (i + j) % 4 == 0]
+DEATHS = [
+    (moment, death)
+    for i, moment in enumerate(["idle", "connecting", "stepping", "streaming"])
+    for j, death in enumerate([signal.SIGKILL, signal.SIGSTOP])
+    if LONG or (i + j) % 2 == 0
+]
+
+
+async def in_time(deadline: float, call: Awaitable[T]) -> T:
+    """Fail when a call outlives its deadline by more than a second."""
+    async with asyncio.timeout(deadline + SLACK_S):
+        return await call
+
+
+async def arrived(scripted: Any, op: str) -> None:
+    while (await asyncio.to_thread(scripted.request))["op"] != op:
+        pass
+
+
+@pytest.mark.parametrize(("fault", "name"), PAIRS)
+async def test_the_call_after_a_fault_works(client: Any, scripted: Any, fault: str, name: str) -> None:
+    op, answer = OPS[name], encode_reply(filled(OPS[name].reply))
+    await client.discover()
+    scripted.on(name, {"truncated": answer[:-1], "garbage": b"\xc1" * 40}.get(fault))
+    call = asyncio.create_task(client.call(filled(op.request), timeout=0.02 if fault == "timed out" else 5))
+    if fault == "cancelled":
+        await arrived(scripted, name)
+        call.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await call
+    else:
+        with pytest.raises(URLabTimeoutError if fault == "timed out" else ProtocolError):
+            await in_time(5, call)
+    scripted.on(name, answer)
+    assert type(await client.call(filled(op.request))) is op.reply
+
+
+@pytest.mark.parametrize("name", SOME)
+async def test_a_server_that_dies_with_the_request_and_comes_back(client: Any, scripted: Any, name: str) -> None:
+    op, answer = OPS[name], encode_reply(filled(OPS[name].reply))
+    await client.discover()
+    scripted.on(name, None)
+    call = asyncio.create_task(client.call(filled(op.request), timeout=5))
+    await arrived(scripted, name)
+    await asyncio.to_thread(scripted.close)
+    reborn = type(scripted)(scripted.port)
+    reborn.on(name, answer)
+    try:
+        if op.effect is Timing.READ:
+            assert type(await in_time(5, call)) is op.reply
+        else:
+            with pytest.raises(OutcomeUnknown):
+                await in_time(5, call)
+            assert type(await client.call(filled(op.request))) is op.reply
+    finally:
+        await asyncio.to_thread(reborn.close)
+
+
+@pytest.fixture
+async def launched() -> AsyncIterator[tuple[URLabClient, int]]:
+    async with URLabClient("sim://arm", step_mode="direct") as client:
+        await client.discover()
+        process = client._transport._process  # type: ignore[attr-defined]
+        yield client, process.pid
+        if process.returncode is None:
+            os.kill(process.pid, signal.SIGCONT)
+
+
+@pytest.mark.parametrize(("moment", "death"), DEATHS)
+async def test_no_call_outlives_its_server_by_long(
+    launched: tuple[URLabClient, int], death: signal.Signals, moment: str
+) -> None:
+    client, pid = launched
+    lost = (URLabTimeoutError, URLabConnectionError)
+    if moment == "connecting":
+        os.kill(pid, death)
+        async with URLabClient(client._transport.endpoint, local_model=False) as other:
+            with pytest.raises(lost):
+                await in_time(0.3, other.discover(timeout=0.3))
+    elif moment == "streaming":
+        async with client.state_stream("latest") as states:
+            await states.receive()
+            os.kill(pid, death)
+            with pytest.raises(URLabTimeoutError):
+                await in_time(0.3, nothing_more(states))
+    elif moment == "stepping":
+        pending = asyncio.create_task(client.step(300_000, timeout=0.3))
+        await asyncio.sleep(0)
+        os.kill(pid, death)
+        with pytest.raises(lost):
+            await in_time(0.3, pending)
+    else:
+        os.kill(pid, death)
+    with pytest.raises(lost):
+        await in_time(0.3, client.scene.current_level(timeout=0.3))
+    if death is signal.SIGSTOP:
+        os.kill(pid, signal.SIGCONT)
+        assert (await in_time(10, client.resync(timeout=10))).settled
+    else:
+        await in_time(10, died(client))
+        with pytest.raises(ServerUnreachable, match=r"ended with code -9.*discover\(\)"):
+            await client.step()
+        await client.discover()
+    await client.step()
+    assert client.articulations["arm"].qpos_array.size
+
+
+async def nothing_more(states: Any) -> None:
+    while True:
+        await states.receive(timeout=0.3)
+
+
+async def died(client: URLabClient) -> None:
+    """Wait until the event loop knows that the server's process has ended."""
+    await client._transport._process.wait()  # type: ignore[attr-defined]
+
+
+async def test_closing_while_the_server_is_stopped() -> None:
+    client = URLabClient("sim://arm", step_mode="direct")
+    await client.discover()
+    pid = client._transport._process.pid  # type: ignore[attr-defined]
+    pending = asyncio.create_task(client.step(timeout=None))
+    reading = asyncio.create_task(client.state_stream("all").receive(timeout=None))
+    os.kill(pid, signal.SIGSTOP)
+    await in_time(4, client.close())
+    with pytest.raises(ClientClosed):
+        await reading
+    with pytest.raises(ClientClosed):
+        await pending
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
+
+
+async def test_nothing_is_left_of_many_clients(scripted: Any) -> None:
+    def left() -> tuple[int, int]:
+        gc.collect()
+        return threading.active_count(), len(list(Path("/proc/self/fd").iterdir()))
+
+    async def use() -> None:
+        async with URLabClient(f"tcp://127.0.0.1:{scripted.port}", local_model=False) as client:
+            await client.discover()
+            client.events()
+            with pytest.raises(URLabTimeoutError):
+                await client.state_stream().receive(timeout=0.01)
+        await client.close()
+
+    await use()
+    before = left()
+    for _ in range(10):
+        await use()
+    assert left() == before
+
+
+async def test_taking_over_is_not_an_answer(client: Any, scripted: Any) -> None:
+    """The refusal of a request sent before the latest hello says nothing about the session after it."""
+    await client.discover()
+    events = client.events()
+    scripted.on("current_level", {"op": "error", "code": "session_expired", "message": ""})
+    scripted.on("hello", scripted.answers["hello"]({}) | {"session_id": "second"})
+    with pytest.raises(SessionTakenOver):
+        await client.scene.current_level()
+    await client.discover()
+    told: list[str] = []
+    while (event := events.receive_nowait()) is not None:
+        told.append(type(event).__name__)
+    assert told == ["SessionLost", "SessionOpened"]
