@@ -723,9 +723,13 @@ def decode_camera(
     if header is None and len(payload) != size:
         problem = f"{len(payload)} bytes, expected {size} ({width}x{height} pixels of 4 bytes)"
         raise _error("camera frame", where, problem, payload)
-    pixels = _target(mode, width, height, out)
-    if size:
-        _convert(np.frombuffer(payload, np.uint8, size, header.size if header else 0), mode, pixels)
+    start = header.size if header else 0
+    if out is None and mode == CameraMode.REAL and size:
+        pixels: Pixels = _rgba(np.frombuffer(payload, np.uint8, size, start), width, height)
+    else:
+        pixels = _target(mode, width, height, out)
+        if size:
+            _convert(np.frombuffer(payload, np.uint8, size, start), mode, pixels)
     if header is None:
         return CameraFrame(pixels)
     _, _, frame_id, sim_time, _, _, *capture_time = header.unpack_from(payload)
@@ -755,6 +759,15 @@ def _frame_header(payload: BytesLike, width: int, height: int, where: object) ->
             raise _error("camera frame", where, problem, payload)
         return layout
     return None
+
+
+def _rgba(source: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+    # BGRA read big-endian is ARGB written little-endian; beginning one byte later, RGB and the next pixel's alpha. At
+    # the speed of two copies, against four for shifting each pixel into its place.
+    words = np.empty(width * height + 1, "<u4")
+    words[:-1] = source.view(">u4")
+    words |= np.uint32(0xFF)
+    return words.view(np.uint8)[1:-3].reshape(height, width, 4)
 
 
 def _convert(source: NDArray[np.uint8], mode: CameraMode | str, out: Pixels) -> None:

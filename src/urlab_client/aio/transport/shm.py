@@ -487,8 +487,8 @@ class ShmTransport:
             self._ring()
             if deadline is not None:
                 timer = loop.call_at(deadline, self._expire, pending, deadline - started)
+            await self._spin(channel, pending)
             if self._memory.bell is None:
-                await self._spin(channel, pending)
                 self._watch()
             answer = await pending.future
         finally:

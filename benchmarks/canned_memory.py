@@ -1,0 +1,149 @@
+"""A server that answers at once over shared memory, and over ZeroMQ what is not for shared memory, in a child process.
+
+With a doorbell it sleeps until it is rung; without one it is like the plugin and looks every 100 microseconds. It can
+also write pictures into a camera region as fast as it can. The child is this very file run as a script; it ends when
+its standard input closes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import mmap
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import msgspec
+import zmq
+
+from urlab_client.protocol import doorbell, shm
+
+__all__ = ["memory_server"]
+
+_POLL_S = 100e-6
+_PR_SET_TIMERSLACK = 29
+
+
+@contextlib.contextmanager
+def memory_server(
+    answers: Mapping[str, bytes], directory: Path, *, bell: bool, camera: tuple[str, int, int] | None = None
+) -> Iterator[int]:
+    """Run the server; yield its port.
+
+    Args:
+        answers: Reply by op; `hello` is made to point at `directory`.
+        directory: Where the regions go.
+        bell: Whether to have a doorbell.
+        camera: File name, width and height of a camera whose pictures are written all the time.
+    """
+    hello = msgspec.msgpack.decode(answers["hello"]) | {"shm_session_dir": str(directory), "manager_present": True}
+    material = dict(answers) | {"hello": msgspec.msgpack.encode(hello)}
+    command = [sys.executable, __file__]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        stdin, stdout = process.stdin, process.stdout
+        assert stdin is not None and stdout is not None  # noqa: S101, PT018
+        encoded = msgspec.msgpack.encode((material, str(directory), bell, camera))
+        stdin.write(len(encoded).to_bytes(8, "big") + encoded)
+        stdin.flush()
+        try:
+            yield int(stdout.readline())
+        finally:
+            stdin.close()
+
+
+# In the child
+
+
+def _region(path: Path, stride: int) -> shm.Region:
+    with path.open("w+b") as file:
+        file.truncate(shm.region_size(stride))
+        return shm.create(mmap.mmap(file.fileno(), shm.region_size(stride)), stride, fence=shm.no_fence)
+
+
+def _answer_zmq(answers: Mapping[bytes, bytes], rep: zmq.Socket[bytes]) -> None:
+    while True:
+        rep.send(answers[_name(rep.recv())])
+
+
+def _name(request: bytes) -> bytes:
+    return request[5 : 5 + (request[4] & 31)]  # a map whose first entry is `op` and a short string
+
+
+class _Memory:
+    def __init__(self, answers: Mapping[bytes, bytes], directory: Path) -> None:
+        self._answers = answers
+        self._requests = _region(directory / shm.REQUEST_FILE, shm.RPC_STRIDE)
+        self._replies = _region(directory / shm.REPLY_FILE, shm.RPC_STRIDE)
+        self._last = 0
+
+    def serve(self) -> bool:
+        found = self._requests.read_latest(self._last)
+        if found is None:
+            return False
+        self._last = found.sequence
+        token = found.payload.find(b"sync-")
+        if token >= 0:
+            error = {"op": "error", "code": "session_expired", "message": found.payload[token : token + 21].decode()}
+            self._replies.publish(msgspec.msgpack.encode(error))
+        else:
+            self._replies.publish(self._answers[_name(found.payload)])
+        return True
+
+
+def _write_pictures(directory: Path, camera: tuple[str, int, int]) -> None:
+    file, width, height = camera
+    region = _region(directory / file, shm.camera_stride(width, height))
+    pictures = [bytes([i]) * (width * height * 4) for i in range(4)]
+    due = time.perf_counter()
+    while True:
+        for picture in pictures:
+            region.publish(picture)
+            due += 1 / 2000
+            time.sleep(max(0.0, due - time.perf_counter()))
+
+
+def _main() -> None:
+    stdin = sys.stdin.buffer
+    material = stdin.read(int.from_bytes(stdin.read(8), "big"))
+    kinds = tuple[dict[str, bytes], str, bool, tuple[str, int, int] | None]
+    by_name, folder, bell, camera = msgspec.msgpack.decode(material, type=kinds)
+    answers = {name.encode(): reply for name, reply in by_name.items()}
+    directory = Path(folder)
+
+    def end_with_parent() -> None:
+        stdin.read()
+        os._exit(0)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
+    rep = zmq.Context().socket(zmq.REP)
+    port = rep.bind_to_random_port("tcp://127.0.0.1")
+    threading.Thread(target=_answer_zmq, args=(answers, rep), daemon=True).start()
+    memory = _Memory(answers, directory)
+    if camera is not None:
+        threading.Thread(target=_write_pictures, args=(directory, camera), daemon=True).start()
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    if bell:
+        listener.bind(str(directory / doorbell.FILE))
+        listener.listen()
+    print(port, flush=True)
+    if not bell:
+        if sys.platform == "linux":  # or each sleep would take half as long again
+            ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, 1)
+        while True:
+            memory.serve()
+            time.sleep(_POLL_S)
+    while True:
+        client, _ = listener.accept()
+        while client.recv(4096):
+            while memory.serve():
+                client.send(doorbell.REPLY)
+
+
+if __name__ == "__main__":
+    _main()

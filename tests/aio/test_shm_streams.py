@@ -1,0 +1,275 @@
+"""State and pictures out of shared memory, written by the plugin's kind of writer: the same streams as over sockets."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import threading
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from plugin_memory import WrittenRegion
+from publisher import Publisher
+
+from urlab_client.aio.publishers import Publishers
+from urlab_client.aio.streams import Stream
+from urlab_client.aio.transport.shm import SharedMemory
+from urlab_client.protocol import shm
+from urlab_client.protocol.enums import CameraMode
+from urlab_client.protocol.messages.session import CameraInfo, HelloOk
+
+STATE = b"state/full"
+WIDTH, HEIGHT = 32, 24
+
+
+def snapshot(time: float) -> bytes:
+    clock = {"sec": int(time), "nsec": 0}
+    fields = {"op": "state_full", "time": time, "step": 1.0, "sim_time": clock, "wall_time": clock}
+    return msgspec.msgpack.encode(fields | {"per_articulation": {}, "entities": {}})
+
+
+class Camera:
+    name = "eye"
+    mode: CameraMode | str = CameraMode.REAL
+    info = CameraInfo(
+        mode="real",
+        resolution=(WIDTH, HEIGHT),
+        fovy=45.0,
+        zmq_endpoint="tcp://127.0.0.1:9",
+        zmq_topic="arm/camera/eye",
+    )
+
+
+def picture(value: int) -> bytes:
+    """BGRA pixels of one value each in blue, green and red."""
+    return bytes([value, value + 1, value + 2, 0]) * (WIDTH * HEIGHT)
+
+
+@pytest.fixture
+async def publisher() -> AsyncIterator[Publisher]:
+    made = Publisher()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+async def memory(tmp_path: Path) -> AsyncIterator[SharedMemory]:
+    made = SharedMemory(tmp_path)
+    hello = {"op": "hello_ok", "session_id": "s", "urlab_version": "", "mujoco_version": "", "mujoco_version_int": 0}
+    made.follow(msgspec.convert(hello | {"manager_present": True, "articulations": []}, HelloOk))
+    yield made
+    made.close()
+
+
+@pytest.fixture
+async def publishers(publisher: Publisher, memory: SharedMemory) -> AsyncIterator[Publishers]:
+    made = Publishers(lambda: "tcp://127.0.0.1:1", lambda: publisher.port, default_timeout=5.0, memory=memory)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def state_region(tmp_path: Path) -> Iterator[WrittenRegion]:
+    region = WrittenRegion(tmp_path / shm.STATE_FILE, 16_384)
+    yield region
+    region.close()
+
+
+@pytest.fixture
+def camera_region(tmp_path: Path) -> Iterator[WrittenRegion]:
+    region = WrittenRegion(tmp_path / "cam_arm_eye.shm", shm.camera_stride(WIDTH, HEIGHT))
+    yield region
+    region.close()
+
+
+def states(publishers: Publishers, policy: str = "latest") -> Stream[Any]:
+    return Stream(publishers.state(policy), policy=policy, default_timeout=5.0)
+
+
+def frames(publishers: Publishers, policy: str = "latest") -> Stream[Any]:
+    return Stream(publishers.camera(Camera(), policy), policy=policy, default_timeout=5.0)
+
+
+async def test_state_comes_from_the_region(publishers: Publishers, state_region: WrittenRegion) -> None:
+    state_region.publish(snapshot(1.0))
+    async with states(publishers) as stream:
+        assert (await stream.receive()).time == 1.0
+        for time in (2.0, 3.0, 4.0):
+            state_region.publish(snapshot(time))
+            assert (await stream.receive()).time == time
+
+
+async def test_a_second_reader_gets_what_is_there_and_takes_nothing_away(
+    publishers: Publishers, state_region: WrittenRegion
+) -> None:
+    state_region.publish(snapshot(1.0))
+    async with states(publishers) as first, states(publishers) as second:
+        assert (await first.receive()).time == (await second.receive()).time == 1.0
+        state_region.publish(snapshot(2.0))
+        assert (await first.receive()).time == (await second.receive()).time == 2.0
+
+
+async def test_without_a_region_it_comes_by_socket_until_there_is_one(
+    publishers: Publishers, publisher: Publisher, tmp_path: Path
+) -> None:
+    async with states(publishers) as stream:
+        await publisher.subscribed(STATE)
+        publisher.send(STATE, snapshot(1.0))
+        assert (await stream.receive()).time == 1.0
+        region = WrittenRegion(tmp_path / shm.STATE_FILE, 16_384)
+        region.publish(snapshot(2.0))
+        assert (await stream.receive()).time == 2.0
+        await publisher.subscribed()
+        region.close()
+
+
+async def test_snapshots_that_outgrow_their_slot_come_by_socket(
+    publishers: Publishers, publisher: Publisher, state_region: WrittenRegion
+) -> None:
+    state_region.publish(snapshot(1.0))
+    async with states(publishers) as stream:
+        await stream.receive()
+        # From now on the server publishes over ZMQ alone.
+        await publisher.subscribed(STATE)
+        publisher.send(STATE, snapshot(2.0))
+        assert (await stream.receive()).time == 2.0
+        state_region.publish(snapshot(3.0))
+        assert (await stream.receive()).time == 3.0
+
+
+async def test_all_of_them_come_by_socket(
+    publishers: Publishers, publisher: Publisher, state_region: WrittenRegion
+) -> None:
+    state_region.publish(snapshot(1.0))
+    async with states(publishers, "all") as stream:
+        await publisher.subscribed(STATE)
+        for time in (2.0, 3.0):
+            publisher.send(STATE, snapshot(time))
+        assert [(await stream.receive()).time for _ in range(2)] == [2.0, 3.0]
+
+
+async def test_a_region_made_anew_is_followed(
+    publishers: Publishers, state_region: WrittenRegion, tmp_path: Path
+) -> None:
+    state_region.publish(snapshot(1.0))
+    async with states(publishers) as stream:
+        await stream.receive()
+        state_region.path.unlink()
+        again = WrittenRegion(tmp_path / shm.STATE_FILE, 16_384)
+        again.publish(snapshot(2.0))
+        assert (await stream.receive()).time == 2.0
+        again.path.unlink()
+        again.close()
+
+
+async def test_a_region_cut_off_is_let_go(
+    publishers: Publishers, publisher: Publisher, state_region: WrittenRegion
+) -> None:
+    state_region.publish(snapshot(1.0))
+    async with states(publishers) as stream:
+        await stream.receive()
+        os.truncate(state_region.path, 0)
+        await publisher.subscribed(STATE)
+        publisher.send(STATE, snapshot(2.0))
+        assert (await stream.receive()).time == 2.0
+
+
+async def test_regions_are_let_go_before_play_stops(
+    publishers: Publishers, publisher: Publisher, state_region: WrittenRegion
+) -> None:
+    state_region.publish(snapshot(1.0))
+    async with states(publishers) as stream:
+        await stream.receive()
+        publishers.release_regions()
+        await publisher.subscribed(STATE)
+        publishers.refresh()
+        await publisher.subscribed()
+        state_region.publish(snapshot(2.0))
+        while (await stream.receive()).time != 2.0:
+            pass
+
+
+@pytest.mark.parametrize("mode", [CameraMode.REAL, CameraMode.DEPTH])
+async def test_pictures_become_arrays_of_the_reader(
+    publishers: Publishers, camera_region: WrittenRegion, monkeypatch: pytest.MonkeyPatch, mode: CameraMode
+) -> None:
+    monkeypatch.setattr(Camera, "mode", mode)
+    depth = np.full(WIDTH * HEIGHT, 250.0, np.float32).tobytes()
+    camera_region.publish(picture(10) if mode is CameraMode.REAL else depth)
+    async with frames(publishers) as stream:
+        first = (await stream.receive()).pixels
+        before = first.copy()
+        for value in range(4):
+            camera_region.publish(picture(100 + value))
+        assert np.array_equal(first, before), "it aliases the region"
+        if mode is CameraMode.REAL:
+            assert (first == [12, 11, 10, 255]).all()
+        else:
+            assert (first == 2.5).all()
+
+
+async def test_a_picture_read_in_place_of_the_one_before_does_not_come_twice(
+    publishers: Publishers, camera_region: WrittenRegion
+) -> None:
+    camera_region.publish(picture(1))
+    async with frames(publishers) as stream:
+        assert (await stream.receive()).pixels[0, 0, 2] == 1
+        camera_region.publish(picture(2))
+        assert (await stream.receive()).pixels[0, 0, 2] == 2
+        assert stream.receive_nowait() is None
+        with pytest.raises(TimeoutError, match=r"cam_arm_eye\.shm"):
+            await stream.receive(timeout=0.05)
+
+
+async def test_no_torn_picture_is_handed_out(publishers: Publishers, camera_region: WrittenRegion) -> None:
+    stop = threading.Event()
+
+    def hammer() -> None:
+        value = 0
+        while not stop.is_set():
+            value = (value + 1) % 250
+            camera_region.publish(picture(value))
+
+    camera_region.publish(picture(1))
+    writer = threading.Thread(target=hammer)
+    writer.start()
+    try:
+        async with frames(publishers) as stream:
+            for _ in range(100):
+                pixels = (await stream.receive()).pixels
+                assert (pixels == pixels[0, 0]).all()
+    finally:
+        stop.set()
+        writer.join()
+
+
+async def test_a_shared_frame_says_when_it_was_overwritten(
+    publishers: Publishers, camera_region: WrittenRegion
+) -> None:
+    camera = Camera()
+    assert publishers.shared_frame(camera) is None
+    camera_region.publish(picture(5))
+    async with frames(publishers) as stream:
+        await stream.receive()
+        frame = publishers.shared_frame(camera)
+        assert frame is not None
+        assert (frame.pixels[..., 0] == 5).all()
+        assert not frame.pixels.flags.writeable
+        assert frame.valid()
+        camera_region.publish(picture(6))
+        assert not frame.valid(), "the server may be writing into it by now"
+
+
+async def test_closing_ends_streams_and_threads(publishers: Publishers, state_region: WrittenRegion) -> None:
+    state_region.publish(snapshot(1.0))
+    stream = states(publishers)
+    await stream.receive()
+    waiting = asyncio.create_task(stream.receive())
+    await asyncio.sleep(0)
+    publishers.close()
+    with pytest.raises(ConnectionError, match="closed"):
+        await waiting
