@@ -146,7 +146,7 @@ async def test_a_queued_call_times_out_without_being_sent(client: Any, scripted:
     [
         (lambda c: c.call(Step(), timeout=5), OutcomeUnknown),
         (lambda c: c.runtime.set_paused(True, timeout=5), OutcomeUnknown),
-        (lambda c: c.scene.current_level(timeout=5), ConnectionLost),
+        (lambda c: c.scene.current_level(timeout=0.3), ConnectionLost),
     ],
 )
 async def test_a_server_that_dies_mid_call(client: Any, scripted: Any, call: Any, error: type[Exception]) -> None:

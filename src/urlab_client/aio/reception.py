@@ -105,7 +105,7 @@ class LiveReception(Sink):
         self._forget()
 
     def _take_over(self, snapshot: StateSnapshot) -> None:
-        if not self._lock.acquire(blocking=False):
+        if not self._free():
             if self._retry is None:
                 self._retry = asyncio.get_running_loop().call_later(_RETRY_S, self._try_again)
             return
@@ -115,6 +115,11 @@ class LiveReception(Sink):
         finally:
             self._lock.release()
         self.stats.absorbed += 1
+
+    def _free(self) -> bool:
+        """Acquire the lock, unless it is held, by this thread, too: a blocking call of its holder may run the loop."""
+        owned: bool = self._lock._is_owned()  # type: ignore[attr-defined]  # noqa: SLF001 - as Condition does
+        return not owned and self._lock.acquire(blocking=False)
 
     def _try_again(self) -> None:
         self._retry = None

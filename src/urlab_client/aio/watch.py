@@ -94,7 +94,7 @@ class Watch:
             self._present = True
             try:
                 subscriptions.attach(self._presence, self._wanted)
-            except URLabError as error:
+            except (URLabError, ValueError) as error:
                 log.debug("the state socket cannot be watched: %s", error)
         subscriptions.refresh()
 
