@@ -63,7 +63,7 @@ class Row:
         kind: `time`: time by the floor's time, to be at most `reach`; `rate`: rate by the floor's rate, at least it.
         p99: The ratio of 99th percentiles to keep, where bursts return single times.
         burst_s: Seconds per burst: longer than what disturbs single times, shorter than what disturbs whole bursts.
-        once: Whether a burst does it once: for what takes long.
+        count: Times per burst, where `burst_s` does not tell: 1 for what takes long.
     """
 
     name: str
@@ -74,7 +74,7 @@ class Row:
     kind: Literal["time", "rate"] = "time"
     p99: float | None = None
     burst_s: float = _BURST_S
-    once: bool = False
+    count: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +83,7 @@ class Result:
 
     Attributes:
         row: The row.
-        ratio: Of medians.
+        ratio: Median of the rounds' ratios of medians: what slows the machine down for a while spoils few of them.
         low: Tenth percentile of the rounds' own ratios; `high` the ninetieth. Far apart means a noisy machine.
         p99: Ratio of 99th percentiles; None where single times are not known.
         rounds: Rounds taken.
@@ -137,7 +137,7 @@ def percentile(values: Sequence[float], percent: float) -> float:
 def measure(row: Row, seconds: float) -> Result:
     """Take a row's ratio in about `seconds`, preparation not counted."""
     with row.prepare() as pair:
-        counts = {burst: 1 if row.once else _count(burst, row.burst_s) for burst in (pair.ours, pair.floor)}
+        counts = {burst: row.count or _count(burst, row.burst_s) for burst in (pair.ours, pair.floor)}
         ours: list[list[float]] = []
         floor: list[list[float]] = []
         gc.collect()
@@ -156,7 +156,7 @@ def measure(row: Row, seconds: float) -> Result:
     singles = min(len(all_ours), len(all_floor)) >= 100 and row.kind == "time"
     return Result(
         row=row,
-        ratio=_ratio(row, *medians),
+        ratio=statistics.median(of_rounds),
         low=percentile(of_rounds, 10),
         high=percentile(of_rounds, 90),
         p99=percentile(all_ours, 99) / percentile(all_floor, 99) if singles else None,

@@ -84,6 +84,6 @@ ROWS = (
         floor="raw transfer of the same bytes, MjModel load, mj_forward",
         reach=1.15,
         prepare=_handshake,
-        once=True,
+        count=1,
     ),
 )

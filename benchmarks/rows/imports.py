@@ -34,6 +34,6 @@ ROWS = (
         floor="import numpy, zmq, msgspec",
         reach=1.3,
         prepare=_imports,
-        once=True,
+        count=1,
     ),
 )

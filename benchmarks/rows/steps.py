@@ -104,7 +104,7 @@ ROWS = (
         floor="blocking REQ loop beside the same thread",
         reach=1.2,
         prepare=asynchronous_beside_busy_thread,
-        burst_s=0.2,
+        count=20,
     ),
     Row(
         name="step-facade-busy",
@@ -112,6 +112,6 @@ ROWS = (
         floor="blocking REQ loop beside the same thread",
         reach=1.2,
         prepare=blocking_beside_busy_thread,
-        burst_s=0.2,
+        count=20,
     ),
 )
