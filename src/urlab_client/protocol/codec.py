@@ -140,7 +140,7 @@ def decode_reply(op: Op, reply: type[R], frame: Buffer) -> R:
         raise ProtocolError(f"{op.name}: a reply of {len(frame)} bytes exceeds the limit {MAX_REPLY_BYTES}", op=op.name)
     try:
         answer = _decode_json(reply, frame) if frame[:1] == b"{" else _reply_decoder(reply).decode(frame)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise ProtocolError(
             f"{op.name}: the server's answer is not a valid {op.reply_name}: {error}.",
             op=op.name,

@@ -1,0 +1,199 @@
+"""Mutated frames through the codecs and through a live server.
+
+The short form runs in CI. The long form: `URLAB_FUZZ_FACTOR=100 pytest tests/server/test_fuzz.py --timeout 7200`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import random
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+import zmq
+from mangling import FACTOR, golden_replies, golden_requests, mutated
+from wire import Wire, pack
+
+from urlab_client import ProtocolError, URLabRPCError
+from urlab_client.protocol.codec import decode_reply
+from urlab_client.protocol.errors import RPC_ERRORS
+from urlab_client.protocol.messages.session import HelloOk, StepOk
+from urlab_client.protocol.registry import OPS
+from urlab_client.protocol.rows import (
+    STATE_FULL,
+    ActuatorInfo,
+    ControlPayload,
+    Topic,
+    TopicKind,
+    decode_gains,
+    decode_row,
+)
+from urlab_client.server import Limits, SimulatedServer
+from urlab_client.server.refusal import Refusal
+from urlab_client.server.requests import Incoming, RequestReader
+
+FRAMES = 5_000 * FACTOR
+"""For each direction of the codec."""
+
+LIVE_FRAMES = 1_000 * FACTOR
+
+# What a frame may do to a server is bounded, so that none takes seconds.
+LIMITS = Limits(n_steps=50, actors=60, grid_cells=20)
+
+
+def test_requests_are_read_or_refused() -> None:
+    reader = RequestReader()
+    read, refused = 0, Counter[str]()
+    for frame in mutated(golden_requests(), 1, FRAMES):
+        try:
+            assert isinstance(reader.read(frame), Incoming)
+            read += 1
+        except Refusal as refusal:
+            refused[refusal.code] += 1
+    assert read
+    assert [*refused] == ["bad_request"]
+
+
+def test_replies_are_read_or_raise_what_callers_expect() -> None:
+    ops = list(OPS.values())
+    read = raised = 0
+    for number, frame in enumerate(mutated(golden_replies(), 2, FRAMES)):
+        op = ops[number % len(ops)]
+        # As often as not the kind that the frame was made from.
+        for asked in (op, next((other for other in ops if other.reply_name.encode() in frame), op)):
+            try:
+                assert isinstance(decode_reply(asked, asked.reply, frame), asked.reply)
+                read += 1
+            except (ProtocolError, URLabRPCError):
+                raised += 1
+    assert read
+    assert raised
+
+
+def test_stream_payloads_are_read_or_raise_what_callers_expect() -> None:
+    numbers = np.arange(12, dtype="<f4").tobytes()
+    golden = [
+        numbers, numbers[:16], numbers[:4], pack({"joint": {"kp": 1.0}}), b'{"joint":{"kp":1.0}}',
+        ControlPayload(np.array([1, 2]), np.array([0.5, 1.0])).encode(), b"bot actuator a:0:-1:1|b:1:0:2",
+    ]  # fmt: skip
+    kinds = [kind for kind in TopicKind if kind is not TopicKind.SET_GAINS]
+    readers: list[Callable[[bytes], Any]] = [ControlPayload.decode, decode_gains, ActuatorInfo.decode]
+
+    def reader_of(kind: TopicKind) -> Callable[[bytes], Any]:
+        return lambda payload: decode_row(Topic(kind, "bot", "x"), payload)
+
+    readers += [reader_of(kind) for kind in kinds]
+    done = 0
+    for frame in mutated(golden, 3, max(1, FRAMES // 8)):
+        for read in readers:
+            with contextlib.suppress(ProtocolError, ValueError):  # the latter for topics that have no rows
+                read(frame)
+            done += 1
+    assert done >= FRAMES // 8
+
+
+def _talk(session: str) -> list[bytes]:
+    """Requests that mean something to the server under test."""
+    ask: list[tuple[str, dict[str, Any]]] = [
+        ("step", {"n_steps": 2, "per_articulation": {"bot": {"ctrl": [0.1], "ctrl_map": {"m": 0.2}}}}),
+        ("step", {"n_steps": 1, "per_articulation": {"bot": {"xfrc_applied": {"arm": [0.0] * 6}}}}),
+        ("reset", {"keyframe_name": "home", "per_articulation_qpos": {"bot": {"j": 0.1}}}),
+        ("forward", {}),
+        ("meta", {}),
+        ("set_mode", {"mode": "direct"}),
+        ("set_paused", {"paused": False}),
+        ("set_sim_speed", {"percent": 50.0}),
+        ("set_sim_options", {"timestep": 0.002, "integrator": "rk4", "gravity": [0.0, 0.0, -9.81]}),
+        ("set_qpos", {"articulation": "bot", "qpos": [0.0] * 8}),
+        ("set_twist", {"articulation": "bot", "linear": [1.0, 0.0, 0.0], "angular": [0.0, 0.0, 1.0]}),
+        ("get_contacts", {"max_contacts": 5}),
+        ("configure_controller", {"articulation": "bot", "params": {"kp": 5.0}}),
+        ("spawn_actor", {"blueprint": "/Game/MuJoCoImports/bot", "actor_id": "two", "location": [1.0, 2.0, 3.0]}),
+        (
+            "spawn_grid",
+            {"blueprint": "/Game/MuJoCoImports/bot", "base_actor_id": "g", "count_x": 2, "count_y": 2},
+        ),
+        ("spawn_light", {"kind": "point", "intensity": 100.0}),
+        ("set_actor_transform", {"target": "bot", "location": [0.0, 0.0, 1.0]}),
+        ("duplicate_actor", {"target": "bot", "new_actor_id": "twin"}),
+        ("get_actor_bounds", {"target": "bot"}),
+        ("list_actors", {}),
+        ("find_actors", {"name_prefix": "b"}),
+        ("draw_box", {"center": [0, 0, 0], "half_extents": [1, 1, 1], "color": [1, 0, 0], "ttl": 1.0}),
+        ("set_viewport_camera", {"location": [1, 1, 1]}),
+        ("recording_start", {"max_duration_s": 1.0}),
+        ("recording_save", {"path": "take.json"}),
+        ("recording_stop", {}),
+        ("replay_load", {"path": "take.json"}),
+        ("replay_start", {}),
+        ("replay_stop", {}),
+    ]
+    plain = [{"op": name, "session_id": session, **fields} for name, fields in ask]
+    return [*map(pack, plain), *map(msgspec.json.encode, plain), *golden_requests()]
+
+
+def test_a_live_server_answers_every_frame(models: Path, caplog: pytest.LogCaptureFixture) -> None:
+    codes = {*RPC_ERRORS} - {"internal_error"}
+    replies = {op.reply_name for op in OPS.values()}
+    refused = served = 0
+    caplog.set_level("ERROR")
+    with (
+        SimulatedServer(models / "bot.xml", play=True, unpaused=True, step_mode="direct", limits=LIMITS) as server,
+        Wire(server) as wire,
+    ):
+        for block in range(max(1, LIVE_FRAMES // 500)):
+            wire.hello(encoding="msgpack")
+            for frame in mutated(_talk(wire.session_id), block, 500):
+                answer = wire.exchange(frame)
+                reply = msgspec.json.decode(answer) if answer[:1] == b"{" else msgspec.msgpack.decode(answer)
+                if reply["op"] == "error":
+                    assert reply["code"] in codes, (frame, reply)
+                    refused += 1
+                else:
+                    assert reply["op"] in replies, (frame, reply)
+                    served += 1
+        wire.hello(encoding="msgpack")
+        assert wire.ask("meta")["ops"]
+    # Most mutations leave nothing to understand; some of what is left must reach the handlers.
+    assert refused
+    assert served > LIVE_FRAMES // 20
+
+
+def test_frames_on_the_other_sockets_leave_the_server_well(models: Path) -> None:
+    chance = random.Random(5)
+    golden = [b"bot/control", b"bot/set_gains", b"\x01", b"\x00state", b"", bytes(64), pack({"j": {"kp": 1.0}})]
+    with (
+        SimulatedServer(models / "bot.xml", play=True, unpaused=True) as server,
+        zmq.Context() as context,
+        context.socket(zmq.PUB) as commands,
+        context.socket(zmq.XSUB) as state,
+        Wire(server) as wire,
+    ):
+        for socket, port in ((commands, server.ctrl_port), (state, server.state_port)):
+            socket.linger = 0
+            socket.connect(f"{server.address}:{port}")
+        wire.hello()
+        for frame in mutated(golden, 6, 200 * FACTOR):
+            commands.send_multipart([chance.choice(golden), frame][: chance.randrange(1, 3)])
+            state.send(frame)
+        before = wire.ask("step")["time"]
+        assert any(reply["time"] > before for reply in wire.until("step"))
+
+
+def test_binary_values_that_are_not_base64() -> None:
+    frame = b'{"op":"hello_ok","session_id":"","urlab_version":"","mujoco_version":"","mjb__b64__":"x"}'
+    with pytest.raises(ProtocolError, match="padded|padding"):
+        decode_reply(OPS["hello"], HelloOk, frame)
+
+
+def test_golden_frames_are_good() -> None:
+    """Or the mutations would start from noise."""
+    reader = RequestReader()
+    assert {reader.read(frame).name for frame in golden_requests()} == {*OPS}
+    assert STATE_FULL
+    assert {HelloOk, StepOk} <= {op.reply for op in OPS.values()}
