@@ -60,10 +60,11 @@ def _locate(server: ServerCore, path: str, code: str) -> Path:
         folder = replay_folder(content.root)
         file = Path(os.path.abspath(folder / path))
         real = file.resolve()
+        is_folder = path.endswith(("/", os.sep)) or folder.is_relative_to(real) or real.is_dir()
     except (OSError, ValueError, RuntimeError) as error:  # too long, a null byte, a loop of links
         raise Refusal(code, f"{path!r} is no usable path: {error}", absolute_path=path) from None
     roots = (content.root, *content.model_roots)
-    if path.endswith(("/", os.sep)) or folder.is_relative_to(real) or real.is_dir():
+    if is_folder:
         raise Refusal(code, f"{file} is a folder", absolute_path=str(file))
     if not any(real.is_relative_to(root) and real != root for root in roots):
         text = ", ".join(map(str, roots))
