@@ -56,7 +56,9 @@ def main() -> None:
     sys.stdout.flush()
     while True:
         request = msgspec.msgpack.decode(socket.recv())
-        socket.send(msgspec.msgpack.encode(answers[request["op"]](request)))
+        # The client's own probes, too, when it has waited long.
+        unknown = {"op": "error", "code": "unknown_op", "message": request["op"]}
+        socket.send(msgspec.msgpack.encode(answers[request["op"]](request) if request["op"] in answers else unknown))
 
 
 if __name__ == "__main__":
