@@ -44,10 +44,11 @@ class _Order(msgspec.Struct):
 
 
 class _Outcome(msgspec.Struct):
-    """One line back; exactly one field is set."""
+    """One line back: what was done, or why not, and of what that is said if not of the file alone."""
 
     done: Compiled | None = None
     refused: str = ""
+    subject: str = ""
 
 
 class _Child:
@@ -127,7 +128,7 @@ def build_confined(file: Path, snapshot: Path, roots: tuple[Path, ...], limits: 
     order = _Order(str(file), str(snapshot), [str(root) for root in roots], limits)
     outcome = _child.build(order)
     if outcome.done is None:
-        raise Refusal("import_failed", f"{file}: {outcome.refused}")
+        raise Refusal("import_failed", f"{outcome.subject or file}: {outcome.refused}")
     return outcome.done
 
 
@@ -216,7 +217,7 @@ def _work(order: _Order) -> _Outcome:
             refused=f"compilation needs more than the limit model_memory_bytes, {limits.model_memory_bytes}"
         )
     except Exception as error:  # noqa: BLE001 - whatever it was, the server must hear of it
-        return _Outcome(refused=f"MuJoCo rejects it: {one_line(error)}")
+        return _Outcome(refused=one_line(error), subject=f"MuJoCo rejects {order.file}")
     if compiled.n_bytes > limits.model_bytes:
         return _Outcome(
             refused=f"compiled it takes {compiled.n_bytes} bytes, more than the limit model_bytes, {limits.model_bytes}"
