@@ -54,10 +54,23 @@ PAIR = """
 """
 
 
+# Looks down at a floor with a ball over its middle, whose shadow falls to the left.
+SHADE = """
+<mujoco model="shade">
+  <worldbody>
+    <light pos="0 0 3" dir="-1 0 -1" directional="true"/>
+    <camera name="above" pos="0 0 8" fovy="45" resolution="64 64"/>
+    <geom type="plane" size="5 5 1"/>
+    <geom type="sphere" size="0.7" pos="0 0 2.4"/>
+  </worldbody>
+</mujoco>
+"""
+
+
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("scenes")
-    for name, text in {"wall": WALL, "drop": DROP, "pair": PAIR}.items():
+    for name, text in {"wall": WALL, "drop": DROP, "pair": PAIR, "shade": SHADE}.items():
         (folder / f"{name}.xml").write_text(text)
     return folder
 
@@ -103,6 +116,24 @@ def test_colors_come_as_bgra_from_the_top(play: Play) -> None:
     blue, _, red = (image[:, :, channel].astype(int) for channel in range(3))
     assert (red[:14] > blue[:14] + 50).all()
     assert (blue[16:] > red[16:] + 50).all()
+
+
+def test_shadows_are_a_matter_of_quality(play: Play) -> None:
+    below_the_ball = {}
+    for quality in ("auto", "fast", "high"):
+        wire = play("shade", render_quality=quality)
+        image = pixels(wire.ask("step", include_cameras={"above": "sync"})["cameras"]["above"])
+        below_the_ball[quality] = int(image[32, 8, :3].sum()) / int(image[8, 8, :3].sum())
+    assert below_the_ball["fast"] > 0.95
+    assert below_the_ball["high"] < 0.8
+    backend = find_backend()
+    assert backend is not None
+    assert below_the_ball["auto"] == below_the_ball["fast" if backend.software else "high"]
+
+
+def test_an_unknown_quality_is_refused() -> None:
+    with pytest.raises(ValueError, match="auto, fast, high"):
+        SimulatedServer(render_quality="best")  # type: ignore[arg-type]  # what is tested
 
 
 def test_depth_is_planar_and_in_centimetres(play: Play) -> None:

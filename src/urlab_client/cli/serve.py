@@ -74,6 +74,7 @@ class ServeArguments(argparse.Namespace):
     controller: list[ControllerOption]
     camera_mode: list[CameraOption]
     camera_size: tuple[int, int] | None
+    render_quality: Literal["auto", "fast", "high"]
     mjcf_options: bool
     actor_names: Literal["model", "plugin"]
     json: bool
@@ -185,6 +186,14 @@ def add_parser(commands: Commands) -> None:
         help=f"{', '.join(CameraMode)}; repeatable (default: real)",
     )
     cameras.add_argument("--camera-size", type=_camera_size, metavar="WxH", help="pixels, for cameras that give none")
+    cameras.add_argument(
+        "--render-quality",
+        choices=("auto", "fast", "high"),
+        default="auto",
+        metavar="QUALITY",
+        help="fast: no shadows, reflections and smooth edges; high: with them; auto: fast where the processor draws "
+        "(default: auto)",
+    )
     life = parser.add_argument_group("for programs that start a server")
     life.add_argument("--json", action="store_true", help="say that the server is ready with one line of JSON")
     life.add_argument(
@@ -314,6 +323,7 @@ def _server(arguments: ServeArguments, saved_dir: Path) -> SimulatedServer:
             controllers={item.actor: ControllerConfig(item.kind, **item.gains) for item in arguments.controller},
             camera_modes={item.camera: item.mode for item in arguments.camera_mode},
             camera_size=arguments.camera_size,
+            render_quality=arguments.render_quality,
             mjcf_options=arguments.mjcf_options,
             actor_names=arguments.actor_names,
         )

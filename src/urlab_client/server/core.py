@@ -23,7 +23,7 @@ from urlab_client.server.limits import Limits
 from urlab_client.server.markers import Drawings
 from urlab_client.server.observe import Observer
 from urlab_client.server.play import Play, Running
-from urlab_client.server.rendering import CameraStudio
+from urlab_client.server.rendering import CameraStudio, RenderQuality
 from urlab_client.server.replay import recordings, replay_folder
 from urlab_client.server.scene import ArticulationIndex, Scene, compile_scene
 from urlab_client.server.session import Session
@@ -46,6 +46,7 @@ class PhysicsConfig:
         camera_modes: What a camera's pixels mean, by `ACTOR/CAMERA`, where the actor is an id or a key.
         camera_size: Width and height of cameras whose MJCF gives none, pixels.
         mjcf_options: Honour the `<option>` of the first model.
+        render_quality: How well cameras and the viewport are drawn.
     """
 
     step_mode: StepMode = StepMode.AUTO
@@ -54,6 +55,7 @@ class PhysicsConfig:
     camera_modes: Mapping[str, CameraMode] = field(default_factory=dict[str, CameraMode])
     camera_size: tuple[int, int] | None = None
     mjcf_options: bool = False
+    render_quality: RenderQuality = "auto"
 
     def controller(self, index: ArticulationIndex) -> ControllerConfig | None:
         """Return the controller an articulation is to get."""
@@ -161,7 +163,7 @@ class ServerCore:
             scene,
             engine.start(),
             Observer(scene, engine.controls),
-            CameraStudio(scene, modes, {actor.name: _kind(actor) for actor in actors}),
+            CameraStudio(scene, modes, {actor.name: _kind(actor) for actor in actors}, physics.render_quality),
             files,
             self.limits,
         )

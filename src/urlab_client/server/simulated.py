@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType, TracebackType
-from typing import Any, Final, Literal, Self
+from typing import Any, Final, Literal, Self, get_args
 
 import anyio
 import anyio.to_thread
@@ -35,6 +35,7 @@ from urlab_client.server.limits import Limits
 from urlab_client.server.markers import Drawings
 from urlab_client.server.publishing import StreamServer
 from urlab_client.server.refusal import Refusal
+from urlab_client.server.rendering import RenderQuality
 from urlab_client.server.scratch import Scratch
 from urlab_client.server.session import Session
 from urlab_client.server.viewport import Viewport
@@ -124,6 +125,7 @@ class SimulatedServer:
         controllers: Mapping[str, ControllerConfig] = MappingProxyType({}),
         camera_modes: Mapping[str, CameraMode | str] = MappingProxyType({}),
         camera_size: tuple[int, int] | None = None,
+        render_quality: RenderQuality = "auto",
         mjcf_options: bool = False,
         actor_names: Literal["model", "plugin"] = "model",
         faults: Faults | None = None,
@@ -152,6 +154,8 @@ class SimulatedServer:
             controllers: Controller by actor id or articulation key; `*` stands for all others.
             camera_modes: What a camera's pixels mean, by `ACTOR/CAMERA`.
             camera_size: Width and height of cameras whose MJCF gives none, pixels; default 640 by 480.
+            render_quality: `fast`, without shadows, reflections and smooth edges; `high`, with them; or `auto`: `fast`
+                where the processor draws, `high` on a graphics card.
             mjcf_options: Honour the `<option>` of the first model; the plugin ignores it.
             actor_names: Name articulations after their MJCF's model name (`robot`, `robot_1`) or as the plugin does
                 (`robot_C_0`, `robot_C_1`).
@@ -166,6 +170,8 @@ class SimulatedServer:
             raise ValueError(f"only one level can be open: {', '.join(filter(_is_level, names))}")
         if actor_names not in ("model", "plugin"):
             raise ValueError(f"actor_names is 'model' or 'plugin', not {actor_names!r}")
+        if render_quality not in get_args(RenderQuality):
+            raise ValueError(f"render_quality is {', '.join(get_args(RenderQuality))}, not {render_quality!r}")
         if camera_size is not None and (len(camera_size) != 2 or min(camera_size) < 1):
             raise ValueError(f"camera_size is a width and a height of at least 1 pixel, not {camera_size!r}")
         if curve is not None and insecure_no_auth:
@@ -192,6 +198,7 @@ class SimulatedServer:
                 camera_modes={camera: CameraMode(mode) for camera, mode in camera_modes.items()},
                 camera_size=camera_size,
                 mjcf_options=mjcf_options,
+                render_quality=render_quality,
             ),
             faults=faults,
         )
