@@ -180,7 +180,6 @@ def test_a_port_in_use(name: str, capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["arm", "--shm-dir", "/dev/shm"], ["--shm-dir", "not in this version"]),
         (["arm", "--step-port", "1", "--info-port", "1"], ["--step-port", "--info-port", "1"]),
         (["arm", "--host", "host.invalid"], ["host.invalid"]),
         (["arm", "--host", "0.0.0.0"], ["0.0.0.0", "--server-key", "--insecure-no-auth"]),

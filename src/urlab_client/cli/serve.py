@@ -65,7 +65,7 @@ class ServeArguments(argparse.Namespace):
     ctrl_port: int
     info_port: int
     camera_port: int
-    shm_dir: str | None
+    shm_dir: Path | None
     saved_dir: Path | None
     model_root: list[Path] | None
     play: bool
@@ -130,8 +130,13 @@ def add_parser(commands: Commands) -> None:
             f"--{name}-port", type=port, default=default, metavar="PORT", help="default %(default)s; 0: any free one"
         )
     memory = network.add_mutually_exclusive_group()
-    memory.add_argument("--shm-dir", metavar="DIR", help="refused: shared memory is not in this version")
-    memory.add_argument("--no-shm", action="store_true", help="do without shared memory, as this version always does")
+    memory.add_argument(
+        "--shm-dir",
+        type=Path,
+        metavar="DIR",
+        help="serve over shared memory, too, in a directory of its own below DIR (on Linux /dev/shm spares the disk)",
+    )
+    memory.add_argument("--no-shm", action="store_true", help="do without shared memory (default)")
     content = parser.add_argument_group("content")
     content.add_argument(
         "--saved-dir",
@@ -211,8 +216,6 @@ def run(arguments: ServeArguments) -> int:
         CommandError: An option cannot be honoured, or a model cannot be used.
         OSError: A port is in use, or a folder cannot be used.
     """
-    if arguments.shm_dir is not None:
-        raise CommandError("--shm-dir: shared memory is not in this version; leave the option out, or say --no-shm")
     _check_ports(arguments)
     events: _Events = queue.SimpleQueue()
     _stop_on_signals(events)
@@ -326,6 +329,7 @@ def _server(arguments: ServeArguments, saved_dir: Path) -> SimulatedServer:
             render_quality=arguments.render_quality,
             mjcf_options=arguments.mjcf_options,
             actor_names=arguments.actor_names,
+            shm_dir=arguments.shm_dir,
         )
     except ValueError as error:
         raise CommandError(str(error)) from None
@@ -350,7 +354,8 @@ def _announce(server: SimulatedServer, arguments: ServeArguments) -> None:
     if arguments.json:
         ready: dict[str, Any] = {"event": "ready", "address": server.address}
         ready |= {f"{name}_port": number for name, number in ports.items()}
-        ready |= {"shm_dir": None, "saved_dir": str(server.saved_dir), "pid": os.getpid()}
+        shm_dir = None if server.shm_dir is None else str(server.shm_dir)
+        ready |= {"shm_dir": shm_dir, "saved_dir": str(server.saved_dir), "pid": os.getpid()}
         ready |= {"open_to": server.open_to, "server_key": server.client_options().get("server_key")}
         print(json.dumps(ready), flush=True)
         return

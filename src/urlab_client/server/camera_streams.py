@@ -2,6 +2,7 @@
 
 For `SimulatedServer`. One thread draws, about thirty times a second and whatever physics does, the cameras that
 somebody has subscribed to. In the stepped modes nothing is published: images come with `step` there, as in the plugin.
+Shared memory gets images in every mode.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from urlab_client.server.endpoint import PortInUse, bind_tcp, bound_peers, tcp
 from urlab_client.server.guard import Door, Guard
 from urlab_client.server.play import Running
 from urlab_client.server.refusal import Refusal
+from urlab_client.server.shared_memory import SharedMemory
 
 __all__ = ["CameraStreams"]
 
@@ -81,13 +83,14 @@ class CameraStreams:
             `start`; called on the thread that sends.
     """
 
-    def __init__(self, *, host: str, port: int, door: Door | None = None) -> None:
+    def __init__(self, *, host: str, port: int, door: Door | None = None, memory: SharedMemory | None = None) -> None:
         """Bind the first port.
 
         Args:
             host: Address of the interface.
             port: Port of the first camera; the others get the free ones after it. 0 picks any.
             door: Who may connect; None for anybody who reaches the interface.
+            memory: Shared memory that gets the images as well, in every mode.
 
         Raises:
             PortInUse: Somebody has the port.
@@ -95,6 +98,7 @@ class CameraStreams:
         """
         self.filter: Callable[[bytes, bytes], bytes | None] | None = None
         self._host = host
+        self._memory = memory
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._guard = Guard(self._context, door)
         self._lock = threading.Lock()
@@ -136,6 +140,8 @@ class CameraStreams:
                 stream.socket.close()
             del self._streams[1:]
             keys = [] if running is None else running.cameras.keys
+            if self._memory is not None:
+                self._memory.show_cameras({} if running is None else running.cameras.resolutions())
             self._streams[0].show(keys[0] if keys else "")
             for key in keys[1:]:
                 stream = self._next_free()
@@ -184,9 +190,14 @@ class CameraStreams:
         with self._lock:
             running = self._running
             topics = {stream.key: stream.topic for stream in self._streams if stream.wanted()}
-        if running is None or not topics or running.engine.mode in (StepMode.DIRECT, StepMode.PUPPET):
+        if running is None:
             return
-        shots = running.cameras.shots(dict.fromkeys(topics, "sync"))
+        if running.engine.mode in (StepMode.DIRECT, StepMode.PUPPET):
+            topics = {}
+        shared = [] if self._memory is None else self._memory.wanted_cameras()
+        if not (topics or shared):
+            return
+        shots = running.cameras.shots(dict.fromkeys([*topics, *shared], "sync"))
         try:
             with running.engine.lock:
                 exposure = running.cameras.capture(shots)
@@ -194,12 +205,16 @@ class CameraStreams:
             return
         images: dict[str, bytes] = {}
         for key, frame in (running.cameras.frames(shots, exposure) or {}).items():
-            image = frame.data if self.filter is None else self.filter(topics[key], frame.data)
+            topic = camera_filter(key.replace("/", "/camera/", 1))
+            image = frame.data if self.filter is None else self.filter(topic, frame.data)
             if image is not None:
                 images[key] = image
         with self._lock:
             if self._running is not running:
                 return
+            if self._memory is not None:
+                for key, image in images.items():
+                    self._memory.publish_picture(key, image)
             for stream in self._streams:
-                if stream.key in images:
+                if stream.key in topics and stream.key in images:
                     stream.socket.send_multipart([stream.topic, images[stream.key]], zmq.DONTWAIT)

@@ -10,12 +10,14 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import mujoco
 
+from urlab_client.protocol.base import Request
 from urlab_client.protocol.codec import encode_reply
 from urlab_client.protocol.enums import CameraMode, PIEState, StepMode
-from urlab_client.protocol.messages.session import ErrorReply
+from urlab_client.protocol.messages.session import ErrorReply, Hello, Step
 from urlab_client.server.actors import Actor
 from urlab_client.server.controllers import ControllerConfig
 from urlab_client.server.engine import Engine
@@ -80,6 +82,7 @@ class ServerCore:
         world: The level being edited.
         physics: How play sessions are set up.
         camera_endpoint: Returns where a camera publishes, from articulation key and camera name.
+        shm_directory: Directory of the shared-memory regions; None without.
         session: The client's session.
         play: The play session.
         viewport: The viewport's camera.
@@ -90,6 +93,7 @@ class ServerCore:
     world: World
     physics: PhysicsConfig
     camera_endpoint: Callable[[str, str], str]
+    shm_directory: str | None = None
     session: Session = field(default_factory=Session)
     play: Play = field(default_factory=Play)
     viewport: Viewport = field(default_factory=Viewport)
@@ -107,6 +111,17 @@ class ServerCore:
     def limits(self) -> Limits:
         """How much is done for clients."""
         return self.world.content.limits
+
+    def least_reply_bytes(self, request: Request[Any] | None) -> int:
+        """Return how long the reply to a request is at least, as far as that shows before it is executed."""
+        running = self.play.current
+        if running is None:
+            return 0
+        if isinstance(request, Hello):
+            return mujoco.mj_sizeModel(running.scene.model) * 7 // 3  # as bytes and in base64
+        if isinstance(request, Step) and running.engine.mode in (StepMode.DIRECT, StepMode.PUPPET):
+            return running.cameras.frame_bytes(request.include_cameras)
+        return 0
 
     def begin_play(self) -> None:
         """Start play with the level as it is now; `play.wait` says how it ends."""

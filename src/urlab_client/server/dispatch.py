@@ -11,7 +11,7 @@ from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from typing import Any, Final, TypeVar, get_type_hints
 
-from urlab_client.protocol.base import Needs, Reply, Request
+from urlab_client.protocol.base import Needs, Reply, Request, Timing
 from urlab_client.protocol.codec import encode_reply
 from urlab_client.protocol.enums import Transport
 from urlab_client.protocol.messages.session import ErrorReply
@@ -95,19 +95,23 @@ class Dispatcher:
         self._reader = RequestReader(structs=table.structs, limits=core.world.content.limits)
         self._lock = threading.Lock()
 
-    def answer(self, frame: bytes, transport: Transport = Transport.ZMQ) -> bytes:
+    def answer(
+        self, frame: bytes, transport: Transport = Transport.ZMQ, *, max_reply_bytes: int | None = None
+    ) -> bytes:
         """Return the reply to a request; whatever happens, there is one.
 
         Args:
             frame: The request's bytes.
             transport: How it came; shared memory does not take the editor's ops.
+            max_reply_bytes: Longest reply that can be sent. A request whose reply cannot be shorter is not executed.
         """
         with self._lock:
             name = "request"
             try:
                 incoming = self._reader.read(frame)
                 name = incoming.name or name
-                return encode_reply(self._serve(incoming, transport), json=self._core.session.json)
+                reply = encode_reply(self._serve(incoming, transport, max_reply_bytes), json=self._core.session.json)
+                return _fitting(reply, incoming, max_reply_bytes)
             except Refusal as refusal:
                 path = refusal.absolute_path if refusal.code == "path_not_writable" else None
                 error = ErrorReply(code=refusal.code, message=refusal.message, absolute_path=path)
@@ -129,7 +133,7 @@ class Dispatcher:
             if idle:
                 self._lock.release()
 
-    def _serve(self, incoming: Incoming, transport: Transport) -> Reply:
+    def _serve(self, incoming: Incoming, transport: Transport, max_reply_bytes: int | None) -> Reply:
         op, name = incoming.op, incoming.name
         if transport is Transport.SHM and op is not None and op.needs is Needs.EDITOR:
             raise Refusal("wrong_transport", f"op '{name}' is not served over shared memory: send it over ZMQ")
@@ -148,8 +152,21 @@ class Dispatcher:
         handler = self._handlers.get(op.name)
         if handler is None:
             raise Refusal("unsupported", f"op '{op.name}' is not implemented by this simulated server")
+        if max_reply_bytes is not None and self._core.least_reply_bytes(incoming.request) > max_reply_bytes:
+            raise Refusal(
+                "wrong_transport", f"the reply to '{name}' would not fit into shared memory: send it over ZMQ"
+            )
         return handler(self._core, incoming.request)
 
     def _check_session(self, session_id: str) -> None:
         if not self._core.session.accepts(session_id):
             raise Refusal("session_expired", f"session '{session_id}' is not the active one: send hello first")
+
+
+def _fitting(reply: bytes, incoming: Incoming, limit: int | None) -> bytes:
+    if limit is None or len(reply) <= limit:
+        return reply
+    executed = ""
+    if incoming.op is not None and incoming.op.effect is not Timing.READ:
+        executed = " It was executed: do not send it again."
+    raise Refusal("reply_too_large", f"{incoming.name}: the reply has {len(reply)} bytes, {limit} fit.{executed}")

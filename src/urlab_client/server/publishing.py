@@ -50,6 +50,7 @@ from urlab_client.server.observe import Observer, sim_clock, wall_clock
 from urlab_client.server.play import Running
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.scene import Scene
+from urlab_client.server.shared_memory import SharedMemory
 
 __all__ = ["StreamServer", "next_info"]
 
@@ -116,6 +117,7 @@ class _Tick:
         wall_time: When the copies were made.
         arrays: Copies of what `_Broadcast.sources` lists; empty when nobody wants them.
         twists: Commanded twist and action keys of each articulation; likewise.
+        full: Whether the snapshot is wanted.
     """
 
     live: int
@@ -124,6 +126,7 @@ class _Tick:
     wall_time: Clock
     arrays: list[Floats]
     twists: list[tuple[float, float, float, int]]
+    full: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,15 +138,22 @@ class _Row:
 class _Broadcast:
     """One play session on the air: takes ticks from its physics and makes messages of them."""
 
-    def __init__(self, running: Running, hand_over: Callable[[_Broadcast, _Tick], None]) -> None:
+    def __init__(
+        self,
+        running: Running,
+        hand_over: Callable[[_Broadcast, _Tick], None],
+        memory: SharedMemory | None,
+    ) -> None:
         """Prepare the messages of a scene; `want` decides which are made.
 
         Args:
             running: The simulation.
             hand_over: Takes a tick to the thread that sends; called under the engine's lock.
+            memory: Where snapshots go besides, whenever it wants them.
         """
         self.running = running
         self._hand_over = hand_over
+        self._memory = memory
         self._engine = running.engine
         scene = running.scene
         # The encoders read a mirror of the data that only the sending thread touches.
@@ -171,7 +181,7 @@ class _Broadcast:
         self._full_wanted = STATE_FULL.startswith(prefixes) if prefixes else False
         self._info_wanted = any(True for _ in info)
         hooks = self._engine.on_tick
-        if not (self._wanted_rows or self._full_wanted or self._info_wanted):
+        if not (self._wanted_rows or self._full_wanted or self._info_wanted or self._memory is not None):
             self.leave()
         elif self._capture not in hooks:
             hooks.append(self._capture)
@@ -194,7 +204,7 @@ class _Broadcast:
                 payload = row.encode()
                 if payload is not None:
                     yield row.topic, payload
-        if self._full_wanted:
+        if tick.full:
             yield STATE_FULL, self._state_full(tick)
 
     def _state_full(self, tick: _Tick) -> bytes:
@@ -263,7 +273,8 @@ class _Broadcast:
         engine = self._engine
         live = engine.mode in _LIVE
         self._live_ticks += live
-        shown = self._full_wanted or (live and bool(self._wanted_rows))
+        full = self._full_wanted or (self._memory is not None and self._memory.wants_state())
+        shown = full or (live and bool(self._wanted_rows))
         if not shown and not (live and self._info_wanted and self._live_ticks >= self._info_due):
             return
         self._hand_over(
@@ -275,6 +286,7 @@ class _Broadcast:
                 wall_time=wall_clock(),
                 arrays=[array.copy() for array in self._sources] if shown else [],
                 twists=[_values(control.twist) for control in self._controls] if shown else [],
+                full=full,
             ),
         )
 
@@ -444,6 +456,7 @@ class StreamServer:
         ctrl_port: int = 0,
         info_port: int = 0,
         door: Door | None = None,
+        memory: SharedMemory | None = None,
     ) -> None:
         """Bind the sockets; `start` begins to serve.
 
@@ -454,6 +467,7 @@ class StreamServer:
             ctrl_port: TCP port.
             info_port: TCP port.
             door: Who may connect; None for anybody who reaches the interface.
+            memory: Shared memory that gets the snapshots as well.
 
         Raises:
             PortInUse: Somebody has a port.
@@ -461,6 +475,7 @@ class StreamServer:
         """
         self.filter: Callable[[bytes, bytes], bytes | None] | None = None
         self._cameras = cameras
+        self._memory = memory
         self._context = zmq.Context()
         self._context.linger = 0
         self._guard = Guard(self._context, door)
@@ -601,7 +616,7 @@ class StreamServer:
         self._leave()
         if target is None:
             return
-        broadcast = self._broadcast = _Broadcast(target, self._hand_over)
+        broadcast = self._broadcast = _Broadcast(target, self._hand_over, self._memory)
         self._listening = list(broadcast.command_topics())
         for topic in self._listening:
             self._control.subscribe(topic)
@@ -616,6 +631,8 @@ class StreamServer:
             self._control.unsubscribe(topic)
         self._listening = []
         self._ticks.clear()
+        if self._memory is not None:
+            self._memory.end_state()
 
     def _publish(self) -> None:
         for _ in range(len(self._ticks)):
@@ -625,6 +642,8 @@ class StreamServer:
             for topic, payload in broadcast.state_messages(tick):
                 sent = payload if self.filter is None else self.filter(topic, payload)
                 if sent is not None:
+                    if self._memory is not None and topic == STATE_FULL:
+                        self._memory.publish_state(sent)
                     self._state.send(topic, zmq.SNDMORE | zmq.NOBLOCK)
                     self._state.send(sent, zmq.NOBLOCK)
             for frame in broadcast.info_messages(tick, self._cameras):

@@ -276,6 +276,15 @@ class CameraStudio:
                 shots.append(Shot(key, camera, sync=kind.lower() == "sync"))
         return shots
 
+    def frame_bytes(self, include_cameras: bool | Mapping[str, str | None]) -> int:
+        """Return the size of the pixels that a request's `include_cameras` asks for."""
+        sizes = (shot.camera.info.resolution for shot in self.shots(include_cameras))
+        return sum(4 * width * height for width, height in sizes)
+
+    def resolutions(self) -> dict[str, tuple[int, int]]:
+        """Return width and height of all cameras by `ARTICULATION/CAMERA`."""
+        return {key: camera.info.resolution for key, camera in self._by_name.items()}
+
     def capture(self, shots: Iterable[Shot]) -> Exposure | None:
         """Copy the state that `frames` draws; the caller holds the engine's lock.
 

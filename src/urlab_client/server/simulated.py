@@ -11,6 +11,7 @@ import warnings
 import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Any, Final, Literal, Self, get_args
@@ -18,7 +19,7 @@ from typing import Any, Final, Literal, Self, get_args
 import anyio
 import anyio.to_thread
 
-from urlab_client.protocol.enums import CameraMode, PIEState, StepMode
+from urlab_client.protocol.enums import CameraMode, PIEState, StepMode, Transport
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.rows import CameraEndpoint
 from urlab_client.server.bundled import bundled_models
@@ -38,6 +39,7 @@ from urlab_client.server.refusal import Refusal
 from urlab_client.server.rendering import RenderQuality
 from urlab_client.server.scratch import Scratch
 from urlab_client.server.session import Session
+from urlab_client.server.shared_memory import MAX_REPLY_BYTES, SharedMemory
 from urlab_client.server.viewport import Viewport
 from urlab_client.server.world import World
 
@@ -85,6 +87,7 @@ class _Config:
     actor_names: Literal["model", "plugin"]
     physics: PhysicsConfig
     faults: Faults | None
+    shm_dir: Path | None
 
 
 class SimulatedServer:
@@ -129,6 +132,7 @@ class SimulatedServer:
         mjcf_options: bool = False,
         actor_names: Literal["model", "plugin"] = "model",
         faults: Faults | None = None,
+        shm_dir: str | os.PathLike[str] | None = None,
     ) -> None:
         """Describe a server; `start`, or entering it, opens it.
 
@@ -161,6 +165,8 @@ class SimulatedServer:
                 (`robot_C_0`, `robot_C_1`).
             faults: What is to go wrong with replies and published messages, for tests; may change while the server
                 runs.
+            shm_dir: Directory below which the server makes one of its own for shared-memory regions; a tmpfs such as
+                `/dev/shm` spares the disk. None for no shared memory.
 
         Raises:
             ValueError: A port, mode or size that is none, two levels, or both `curve` and `insecure_no_auth`.
@@ -201,6 +207,7 @@ class SimulatedServer:
                 render_quality=render_quality,
             ),
             faults=faults,
+            shm_dir=None if shm_dir is None else Path(shm_dir),
         )
         self._lock = threading.Lock()
         self._opened: _Opened | None = None
@@ -330,6 +337,12 @@ class SimulatedServer:
         return self._running.saved_dir
 
     @property
+    def shm_dir(self) -> Path | None:
+        """Directory of the shared-memory regions, one of this server alone; None without shared memory."""
+        memory = self._running.memory
+        return None if memory is None else memory.directory
+
+    @property
     def open_to(self) -> str:
         """Who can use the server, in words: this machine alone, holders of keys, or anyone on an interface."""
         host, door = self._running.host, self._running.door
@@ -388,6 +401,7 @@ class _Opened:
         self._faults = config.faults
         self._authored: object = None
         self._endpoint: RpcEndpoint | None = None
+        self._memory: SharedMemory | None = None
         self._core: ServerCore | None = None
         self._closed = False
         self._pid = os.getpid()
@@ -425,6 +439,11 @@ class _Opened:
         return self._cameras
 
     @property
+    def memory(self) -> SharedMemory | None:
+        """The shared memory, if there is any."""
+        return self._memory
+
+    @property
     def saved_dir(self) -> Path:
         """Folder of the content root."""
         if self._core is None:
@@ -433,7 +452,8 @@ class _Opened:
 
     def _start(self, config: _Config) -> None:
         ports = config.ports
-        cameras = self._cameras = CameraStreams(host=self.host, port=ports.camera, door=self.door)
+        memory = self._memory = None if config.shm_dir is None else SharedMemory(config.shm_dir)
+        cameras = self._cameras = CameraStreams(host=self.host, port=ports.camera, door=self.door, memory=memory)
         self._streams = StreamServer(
             lambda scene: [
                 CameraEndpoint(camera.name, cameras.endpoint(index.key, camera.name))
@@ -445,11 +465,13 @@ class _Opened:
             ctrl_port=ports.ctrl,
             info_port=ports.info,
             door=self.door,
+            memory=memory,
         )
         core = ServerCore(
             world=World(self._content(config), actor_names=config.actor_names),
             physics=config.physics,
             camera_endpoint=cameras.endpoint,
+            shm_directory=None if memory is None else str(memory.directory),
         )
         self._core = core
         if config.faults is not None:
@@ -476,6 +498,8 @@ class _Opened:
                 raise ModelError(f"play cannot start: {core.play.compile_error}")
         self._authored = self._mark(core)
         self._endpoint.start()
+        if memory is not None:
+            memory.start(partial(answer, transport=Transport.SHM, max_reply_bytes=MAX_REPLY_BYTES))
         if self.door is None and not is_loopback(self.host):
             logger.warning("open to anyone who reaches %s, without authentication or encryption", self.host)
         logger.info("serving at %s:%d", tcp(self.host), self._endpoint.port)
@@ -498,7 +522,7 @@ class _Opened:
             return False
         if self._faults is not None:
             self._faults.reset()
-        if not (self.endpoint.alive and self.streams.alive and self.cameras.alive):
+        if not all(served.alive for served in self._served()):
             return False
         with dispatcher.standstill(CLOSE_S) as idle:
             if not idle or self._mark(core) != self._authored:
@@ -519,6 +543,11 @@ class _Opened:
                 files.add((file, status.st_mtime_ns, status.st_size))
         return core.world.authored(), files
 
+    def _served(self) -> list[RpcEndpoint | StreamServer | CameraStreams | SharedMemory]:
+        """Return what has a thread; shared memory last, since the streams write to it."""
+        every = (self._endpoint, self._streams, self._cameras, self._memory)
+        return [served for served in every if served is not None]
+
     def close(self) -> None:
         """Release everything. Safe to call twice; a forked child, which has none of it, leaves it alone."""
         if self._closed or os.getpid() != self._pid:
@@ -527,21 +556,13 @@ class _Opened:
         deadline = time.monotonic() + CLOSE_S
         if self._injector is not None:
             self._injector.close()
-        if self._endpoint is not None:
-            self._endpoint.stop()
-        if self._streams is not None:
-            self._streams.stop()
-        if self._cameras is not None:
-            self._cameras.stop()
+        for served in self._served():
+            served.stop()
         idle = True
         if self._core is not None:
             idle = self._core.play.close(CLOSE_S / 2)
-        if self._endpoint is not None:
-            idle = self._endpoint.join(max(0.0, deadline - time.monotonic())) and idle
-        if self._streams is not None:
-            idle = self._streams.join(max(0.0, deadline - time.monotonic())) and idle
-        if self._cameras is not None:
-            idle = self._cameras.join(max(0.0, deadline - time.monotonic())) and idle
+        for served in self._served():
+            idle = served.join(max(0.0, deadline - time.monotonic())) and idle
         if not idle:
             logger.warning("a request was still under way when the server closed; its thread ends after it")
         if self._scratch is not None:

@@ -69,6 +69,7 @@ def handshake(server: ServerCore, session_id: str, *, include_assets: bool = Fal
     )
     if not server.play.manager_present:
         return reply
+    reply.shm_session_dir = server.shm_directory
     reply.entities = {}
     reply.global_cameras = {}
     running = server.play.current

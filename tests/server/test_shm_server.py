@@ -1,0 +1,329 @@
+"""The server's shared memory: layout of the files, requests, streams, damage, and what is left behind."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import socket
+import stat
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import zmq
+from raw_shm import HEADER, RawRegion, RawShm
+
+from urlab_client.server import SimulatedServer
+
+Rpc = Callable[..., dict[str, Any]]
+
+
+@pytest.fixture
+def base() -> Iterator[Path]:
+    """A short path: Unix sockets have room for about a hundred bytes."""
+    with tempfile.TemporaryDirectory(prefix="urlab-test-", dir="/tmp") as directory:
+        yield Path(directory)
+
+
+@pytest.fixture
+def server(base: Path) -> Iterator[SimulatedServer]:
+    with SimulatedServer("arm", play=True, camera_size=(32, 24), shm_dir=base) as server:
+        yield server
+
+
+@contextmanager
+def zmq_line(server: SimulatedServer) -> Iterator[Rpc]:
+    """Requests over ZeroMQ, for what shared memory does not take."""
+    context = zmq.Context()
+    line = context.socket(zmq.REQ)
+    line.rcvtimeo = 10_000
+    line.connect(f"{server.address}:{server.step_port}")
+
+    def call(**request: Any) -> dict[str, Any]:
+        line.send(msgspec.msgpack.encode(request))
+        return msgspec.msgpack.decode(line.recv())
+
+    yield call
+    context.destroy(linger=0)
+
+
+@pytest.fixture
+def rpc(server: SimulatedServer) -> Iterator[Rpc]:
+    with zmq_line(server) as call:
+        yield call
+
+
+@pytest.fixture
+def session(rpc: Rpc) -> str:
+    session = rpc(op="hello")["session_id"]
+    assert rpc(op="set_mode", session_id=session, mode="direct")["op"] == "set_mode_ok"
+    return session
+
+
+def eventually(condition: Callable[[], Any], seconds: float = 10.0) -> Any:
+    """Wait for something to be true, looking often."""
+    deadline = time.monotonic() + seconds
+    while not (found := condition()):
+        assert time.monotonic() < deadline, "it did not happen in time"
+        time.sleep(0.002)
+    return found
+
+
+def snapshot_of(state: RawRegion, step: int) -> dict[str, Any] | None:
+    snapshot = msgspec.msgpack.decode(state.read()[1])
+    return snapshot if snapshot["step"] == step else None
+
+
+def directory_of(server: SimulatedServer) -> Path:
+    assert server.shm_dir is not None
+    return server.shm_dir
+
+
+def test_the_files_are_laid_out_as_the_plugins(server: SimulatedServer, rpc: Rpc) -> None:
+    directory = directory_of(server)
+    assert rpc(op="hello")["shm_session_dir"] == str(directory)
+    assert directory.name == "live"
+    assert stat.S_IMODE(directory.stat().st_mode) == 0o700
+    for name in ("req.shm", "rep.shm"):
+        assert (directory / name).stat().st_size == 2_097_216
+        assert HEADER.unpack_from((directory / name).read_bytes())[:4] == (0x424C5255, 1, 1_048_576, 2)
+        assert stat.S_IMODE((directory / name).stat().st_mode) == 0o600
+    state = eventually(lambda: (directory / "state.shm").is_file() and directory / "state.shm")
+    assert state.stat().st_size == 32_832
+    for camera in ("overview", "wrist"):
+        stride = 32 * 24 * 4 + 4
+        assert (directory / f"cam_arm_{camera}.shm").stat().st_size == 64 + 2 * stride
+
+
+def test_play_that_ends_takes_its_regions_along(server: SimulatedServer, rpc: Rpc, session: str) -> None:
+    directory = directory_of(server)
+    eventually((directory / "state.shm").is_file)
+    rpc(op="stop_pie", session_id=session)
+    eventually(lambda: {path.name for path in directory.iterdir()} == {"req.shm", "rep.shm", "doorbell.sock"})
+    assert "shm_session_dir" not in rpc(op="hello")
+
+
+@pytest.mark.parametrize("bell", [True, False])
+def test_steps_are_answered_as_over_zmq(server: SimulatedServer, rpc: Rpc, session: str, bell: bool) -> None:
+    with RawShm(directory_of(server), bell=bell) as shm:
+        for count in range(1, 6):
+            reply = shm.call({"op": "step", "session_id": session})
+            assert reply is not None
+            assert (reply["op"], reply["step"]) == ("step_ok", count)
+        over_zmq = rpc(op="step", session_id=session)
+    assert over_zmq["step"] == 6
+    assert over_zmq.keys() == reply.keys()
+
+
+def test_bytes_of_a_reply_are_those_of_zmq(server: SimulatedServer, rpc: Rpc) -> None:
+    request = {"op": "step", "session_id": "sync-1234"}
+    with RawShm(directory_of(server), bell=True) as shm:
+        assert shm.call(request) == rpc(**request)
+    assert rpc(**request)["code"] == "session_expired"
+    assert "sync-1234" in rpc(**request)["message"]
+
+
+def test_what_does_not_travel_this_way_is_refused_before_it_is_executed(
+    server: SimulatedServer, rpc: Rpc, session: str
+) -> None:
+    with RawShm(directory_of(server), bell=True) as shm:
+        for op in ("import_xml", "stop_pie", "list_actors"):
+            refused = shm.call({"op": op, "session_id": session})
+            assert refused is not None
+            assert refused["code"] == "wrong_transport"
+    assert rpc(op="step", session_id=session)["step"] == 1
+
+
+def test_a_step_whose_pictures_cannot_fit_is_not_taken(base: Path) -> None:
+    with (
+        SimulatedServer("arm", play=True, camera_size=(640, 480), shm_dir=base) as server,
+        zmq_line(server) as rpc,
+        RawShm(directory_of(server), bell=True) as shm,
+    ):
+        session = rpc(op="hello")["session_id"]
+        rpc(op="set_mode", session_id=session, mode="direct")
+        refused = shm.call({"op": "step", "session_id": session, "include_cameras": True})
+        assert refused is not None
+        assert refused["code"] == "wrong_transport"
+        taken = shm.call({"op": "step", "session_id": session})
+        assert taken is not None
+        assert taken["step"] == 1
+
+
+def test_a_handshake_whose_model_cannot_fit_opens_no_session(server: SimulatedServer, rpc: Rpc, session: str) -> None:
+    with RawShm(directory_of(server), bell=True) as shm:
+        refused = shm.call({"op": "hello"})
+        assert refused is not None
+        assert refused["code"] == "wrong_transport"
+    assert rpc(op="step", session_id=session)["op"] == "step_ok"
+
+
+def test_a_reply_that_turns_out_too_large_says_so_and_whether_it_was_executed(
+    base: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("urlab_client.server.simulated.MAX_REPLY_BYTES", 200)
+    with (
+        SimulatedServer("ball", play=True, shm_dir=base) as server,
+        zmq_line(server) as rpc,
+        RawShm(directory_of(server), bell=True) as shm,
+    ):
+        read = shm.call({"op": "meta"})
+        assert read is not None
+        assert read["code"] == "reply_too_large"
+        assert "executed" not in read["message"]
+        changed = shm.call({"op": "reset", "session_id": rpc(op="hello")["session_id"]})
+        assert changed is not None
+        assert changed["code"] == "reply_too_large"
+        assert "was executed" in changed["message"]
+
+
+def test_snapshots_come_with_each_step_to_whom_asks_for_them(server: SimulatedServer, session: str, rpc: Rpc) -> None:
+    directory = directory_of(server)
+    with RawShm(directory, bell=True) as shm:
+        assert shm.bell is not None
+        shm.bell.send(b"S")
+        state = RawRegion(eventually(lambda: (directory / "state.shm").is_file() and directory / "state.shm"))
+        for count in range(1, 30):
+            reply = shm.call({"op": "step", "session_id": session})
+            assert reply is not None
+            snapshot = eventually(partial(snapshot_of, state, count))
+            assert snapshot["op"] == "state_full"
+            assert snapshot["time"] == reply["time"]
+            assert snapshot["per_articulation"]["arm"]["qpos"] == reply["per_articulation"]["arm"]["qpos"]
+        state.close()
+
+
+def test_pictures_come_to_whom_asks_for_them_in_every_mode(server: SimulatedServer, session: str) -> None:
+    directory = directory_of(server)
+    with RawShm(directory, bell=True) as shm:
+        assert shm.bell is not None
+        shm.bell.send(b"C")
+        region = RawRegion(directory / "cam_arm_overview.shm")
+        eventually(lambda: region.sequence >= 3)
+        assert b"c" in shm.wait(5.0)
+        _, pixels = region.read()
+        assert len(pixels) == 32 * 24 * 4
+        assert len(set(pixels)) > 10
+        region.close()
+
+
+HOSTILE = {
+    "size zero": lambda r: r.map.__setitem__(slice(64, 68), b"\0\0\0\0"),
+    "size beyond the slot": lambda r: [
+        r.map.__setitem__(slice(at, at + 4), b"\xff" * 4) for at in (64, 64 + 1_048_576)
+    ],
+    "slot that is none": lambda r: r.map.__setitem__(slice(24, 28), b"\x07\0\0\0"),
+    "sequence that jumps back": lambda r: r.map.__setitem__(slice(16, 24), b"\1" + b"\0" * 7),
+    "another magic": lambda r: r.map.__setitem__(slice(0, 4), b"NOPE"),
+    "another stride": lambda r: r.map.__setitem__(slice(8, 12), b"\xff\xff\xff\xff"),
+}
+
+
+@pytest.mark.parametrize("damage", HOSTILE)
+def test_a_damaged_request_region_harms_nobody(server: SimulatedServer, rpc: Rpc, session: str, damage: str) -> None:
+    directory = directory_of(server)
+    with RawShm(directory, bell=True) as shm:
+        assert shm.call({"op": "step", "session_id": session}) is not None
+        good = shm.requests.map[:64]
+        HOSTILE[damage](shm.requests)
+        sequence = int.from_bytes(shm.requests.map[16:24], "little")
+        shm.requests.map[16:24] = (sequence + 5).to_bytes(8, "little")
+        assert shm.bell is not None
+        shm.bell.send(b"q")
+        assert rpc(op="step", session_id=session)["op"] == "step_ok"
+        shm.requests.map[:64] = good
+        eventually(lambda: shm.call({"op": "meta"}, 1.0))
+
+
+@pytest.mark.parametrize("name", ["req.shm", "rep.shm", "state.shm"])
+def test_files_that_are_cut_off_do_not_kill_the_server(
+    server: SimulatedServer, rpc: Rpc, session: str, name: str
+) -> None:
+    directory = directory_of(server)
+    eventually((directory / name).is_file)
+    requests = RawRegion(directory / "req.shm")
+    with socket.socket(socket.AF_UNIX) as bell:
+        bell.connect(os.fspath(directory / "doorbell.sock"))
+        bell.send(b"S")
+        os.truncate(directory / name, 10)
+        if name != "req.shm":
+            requests.publish(msgspec.msgpack.encode({"op": "meta"}))
+        bell.send(b"q")
+        for _ in range(20):
+            assert rpc(op="step", session_id=session)["op"] == "step_ok"
+    requests.close()
+    eventually(lambda: (directory / name).stat().st_size > 64)
+    with RawShm(directory, bell=True) as shm:
+        eventually(lambda: shm.call({"op": "meta"}, 0.5))
+
+
+def test_nonsense_at_the_doorbell_disturbs_nobody(server: SimulatedServer, session: str) -> None:
+    directory = directory_of(server)
+    noise = random.Random(5)
+    with ExitStack() as strangers, RawShm(directory, bell=False) as shm:
+        for number in range(50):
+            stranger = strangers.enter_context(socket.socket(socket.AF_UNIX))
+            stranger.connect(os.fspath(directory / "doorbell.sock"))
+            with suppress(OSError):  # beyond the limit they are shut out
+                stranger.send(noise.randbytes(3000))
+            if number % 2:
+                stranger.close()
+        for count in range(1, 20):
+            reply = shm.call({"op": "step", "session_id": session})
+            assert reply is not None
+            assert reply["step"] == count
+
+
+def test_a_path_too_long_for_a_socket_leaves_polling(tmp_path: Path) -> None:
+    deep = tmp_path / ("d" * 100)
+    with SimulatedServer("ball", play=True, shm_dir=deep) as server, RawShm(directory_of(server), bell=False) as shm:
+        assert not (directory_of(server) / "doorbell.sock").exists()
+        assert shm.call({"op": "meta"}) is not None
+
+
+def test_two_servers_share_a_base_and_leave_nothing(base: Path) -> None:
+    with SimulatedServer("ball", play=True, shm_dir=base) as one, SimulatedServer("ball", shm_dir=base) as two:
+        assert directory_of(one) != directory_of(two)
+        for server in (one, two):
+            with RawShm(directory_of(server), bell=True) as shm:
+                assert shm.call({"op": "meta"}) is not None
+    assert [path.name for path in base.iterdir()] == [f".urlab-lock-{os.getuid()}"]
+
+
+def serve(base: Path) -> tuple[subprocess.Popen[bytes], Path]:
+    command = [sys.executable, "-m", "urlab_client", "serve", "ball", "--json", "--shm-dir", os.fspath(base)]
+    ports = [f"--{name}-port=0" for name in ("step", "state", "ctrl", "info", "camera")]
+    process = subprocess.Popen([*command, *ports], stdout=subprocess.PIPE, stdin=subprocess.DEVNULL)
+    assert process.stdout is not None
+    return process, Path(msgspec.json.decode(process.stdout.readline())["shm_dir"])
+
+
+def end(process: subprocess.Popen[bytes], number: int) -> None:
+    process.send_signal(number)
+    process.wait(20)
+    assert process.stdout is not None
+    process.stdout.close()
+
+
+def test_a_terminated_server_cleans_up_and_a_killed_one_is_cleaned_up_after(base: Path) -> None:
+    killed, left = serve(base)
+    (base / "urlab-not-ours").mkdir()
+    (base / "urlab-not-ours" / "lock").write_text("somebody's")
+    end(killed, signal.SIGKILL)
+    assert left.is_dir()
+    terminated, directory = serve(base)
+    assert not left.exists()
+    assert directory.is_dir()
+    with RawShm(directory, bell=True) as shm:
+        assert shm.call({"op": "meta"}) is not None
+    end(terminated, signal.SIGTERM)
+    assert {path.name for path in base.iterdir()} == {f".urlab-lock-{os.getuid()}", "urlab-not-ours"}
