@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import sys
+import tempfile
 from collections.abc import Callable, Sequence
 from urllib.parse import parse_qsl
 
@@ -67,8 +69,8 @@ class LaunchedTransport:
         self.stats = TransportStats()
         self._address = address
         self._arguments = serve_arguments(address)
-        if not shm:
-            self._arguments.append("--no-shm")
+        if shm and not any(argument.startswith("--shm-dir") for argument in self._arguments):
+            self._arguments.append(f"--shm-dir={_memory_directory()}")
         self._process: asyncio.subprocess.Process | None = None
         self._drain: asyncio.Task[None] | None = None
         self._inner: ZmqTransport | None = None
@@ -189,6 +191,12 @@ class LaunchedTransport:
         raise ServerUnreachable(
             f"{op.name}: no simulated server for {self._address}: {reason or 'it ended without a word'}", op=op.name
         )
+
+
+def _memory_directory() -> str:
+    """Return where regions are best: in memory, where the system has a directory there."""
+    memory = "/dev/shm"  # noqa: S108 - the server makes a directory of its own in it, for its user alone
+    return memory if os.access(memory, os.W_OK) else tempfile.gettempdir()
 
 
 _DEFAULTS: Sequence[str] = (
