@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import subprocess
 import sys
+from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -40,13 +43,44 @@ def after_import(module: str, **environment: str) -> dict[str, Any]:
     return json.loads(done.stdout)
 
 
-@pytest.mark.parametrize("module", ["urlab_client", "urlab_client.aio", "urlab_client.enums", "urlab_client.cli"])
+@pytest.mark.parametrize("module", ["urlab_client.sync", "urlab_client.aio", "urlab_client.enums", "urlab_client.cli"])
 def test_an_import_is_light_and_silent(module: str) -> None:
     # MuJoCo's own import fails with such a value: so the clients need neither it nor OpenGL until they get a model.
     report = after_import(module, MUJOCO_GL="garbage")
     assert not {"mujoco", "OpenGL", "glfw", "matplotlib", "rich", "gymnasium"} & set(report["modules"])
     assert not [name for name in report["own"] if name.startswith("urlab_client.server")]
     assert (report["opened"], report["contexts"], report["threads"]) == ([], 0, 1)
+
+
+def test_the_package_loads_nothing_before_a_name_is_asked_for() -> None:
+    report = after_import("urlab_client")
+    assert report["own"] == ["urlab_client"]
+    assert not {"asyncio", "msgspec", "numpy", "zmq"} & set(report["modules"])
+    report = after_import("urlab_client; urlab_client.NoEngine")
+    assert not [name for name in report["own"] if name.startswith(("urlab_client.aio", "urlab_client.sync"))]
+
+
+def test_a_name_is_what_type_checkers_are_told_it_is() -> None:
+    import urlab_client
+
+    tree = ast.parse(Path(urlab_client.__file__).read_text())
+    told: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("urlab_client"):
+            for alias in node.names:
+                told.add(alias.name)
+                assert getattr(urlab_client, alias.name) is getattr(import_module(str(node.module)), alias.name)
+    assert told == set(urlab_client.__all__) - {"__version__"}
+    assert told <= set(dir(urlab_client))
+    assert urlab_client.aio is import_module("urlab_client.aio")  # as after any import of the package's names
+
+
+def test_all_names_can_be_imported_with_a_star() -> None:
+    names: dict[str, Any] = {}
+    exec("from urlab_client import *", names)
+    import urlab_client
+
+    assert set(urlab_client.__all__) <= set(names)
 
 
 def test_the_protocol_alone_needs_no_transport() -> None:

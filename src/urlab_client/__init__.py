@@ -1,169 +1,194 @@
 """Python clients for URLab, the Unreal plugin that embeds MuJoCo.
 
 `URLabClient` here is the blocking one; its async twin is `urlab_client.aio.URLabClient`.
+Names are loaded when they are first asked for, so that the import alone costs nothing.
 """
 
-from typing import Any
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
-from urlab_client.protocol.enums import (
-    ActuatorType,
-    CameraMode,
-    CameraTiming,
-    ControllerKind,
-    ControlMode,
-    ObservationLevel,
-    PIEState,
-    StepMode,
-    Transport,
-)
-from urlab_client.protocol.errors import (
-    ActorHierarchyFailed,
-    AddQuickConvertFailed,
-    AuthenticationFailed,
-    BadMode,
-    BadRequest,
-    BadValue,
-    ClientClosed,
-    ConcurrentReadError,
-    ConnectionLost,
-    ControllerSchemaViolation,
-    CreateLevelFailed,
-    DestroyAssetFailed,
-    DestroyFailed,
-    DimMismatch,
-    DuplicateFailed,
-    FindActorsFailed,
-    ForkedError,
-    GameThreadTimeout,
-    GetActorBoundsFailed,
-    ImportFailed,
-    InternalError,
-    InvalidCount,
-    InvalidMode,
-    ListActorsFailed,
-    ListBlueprintsFailed,
-    LoadLevelFailed,
-    MissingField,
-    MissingOp,
-    ModeLocked,
-    NoActiveManager,
-    NoBounds,
-    NoController,
-    NoEngine,
-    NoJoints,
-    NotInEditor,
-    NotMocapBody,
-    NotReady,
-    NoTwistController,
-    NoViewport,
-    NoWorld,
-    OutcomeUnknown,
-    PathNotReadable,
-    PathNotWritable,
-    ProtocolError,
-    RecordingAlreadyActive,
-    RecordingNotActive,
-    RemoveQuickConvertFailed,
-    ReplayRequiresStepped,
-    ReplaySessionNotFound,
-    ReplyTooLarge,
-    SaveLevelFailed,
-    SelectFailed,
-    ServerUnreachable,
-    SessionTakenOver,
-    SetActorTransformFailed,
-    ShuttingDown,
-    SnapshotFailed,
-    SpawnFailed,
-    StepTimeout,
-    StreamOverflow,
-    TooManyCells,
-    UnknownActor,
-    UnknownArticulation,
-    UnknownBody,
-    UnknownKeyframe,
-    UnknownOp,
-    Unsupported,
-    URLabConnectionError,
-    URLabError,
-    URLabPIEError,
-    URLabRPCError,
-    URLabTimeoutError,
-    URLabVersionMismatch,
-    WrongTransport,
-)
-from urlab_client.protocol.messages.streams import (
-    CameraSample,
-    ClientEvent,
-    PlayEnded,
-    PlayStarted,
-    RowSample,
-    ServerAnswers,
-    ServerConnected,
-    ServerLost,
-    ServerReconnected,
-    ServerSilent,
-    SessionLost,
-    SessionOpened,
-    StateSnapshot,
-    StreamPolicy,
-    StreamStats,
-)
-from urlab_client.protocol.names import UnknownName
-from urlab_client.protocol.types import (
-    ActorBounds,
-    ActorHierarchyNode,
-    ActorInfo,
-    BlueprintInfo,
-    CameraPose,
-    ClientConfig,
-    Contact,
-    ContactsResult,
-    Diagnosis,
-    Finding,
-    KeyframeInfo,
-    MocapPose,
-    PIEStartResult,
-    PIEStatus,
-    RecordingHandle,
-    RecordingSummary,
-    ReplaySession,
-    ReplayStatus,
-    Resync,
-    SceneActor,
-    SceneSnapshot,
-    SimOptions,
-    URLabAsset,
-    URLabBlueprint,
-    URLabLightHandle,
-    URLabSpawnHandle,
-    Verdict,
-)
-from urlab_client.sync import (
-    DEFAULT,
-    Actuator,
-    Body,
-    Joint,
-    Sensor,
-    Stream,
-    URLabArticulation,
-    URLabCameraView,
-    URLabClient,
-    URLabController,
-    URLabEntity,
-    URLabPDController,
-)
+if TYPE_CHECKING:
+    from urlab_client.protocol.enums import (
+        ActuatorType,
+        CameraMode,
+        CameraTiming,
+        ControllerKind,
+        ControlMode,
+        ObservationLevel,
+        PIEState,
+        StepMode,
+        Transport,
+    )
+    from urlab_client.protocol.errors import (
+        ActorHierarchyFailed,
+        AddQuickConvertFailed,
+        AuthenticationFailed,
+        BadMode,
+        BadRequest,
+        BadValue,
+        ClientClosed,
+        ConcurrentReadError,
+        ConnectionLost,
+        ControllerSchemaViolation,
+        CreateLevelFailed,
+        DestroyAssetFailed,
+        DestroyFailed,
+        DimMismatch,
+        DuplicateFailed,
+        FindActorsFailed,
+        ForkedError,
+        GameThreadTimeout,
+        GetActorBoundsFailed,
+        ImportFailed,
+        InternalError,
+        InvalidCount,
+        InvalidMode,
+        ListActorsFailed,
+        ListBlueprintsFailed,
+        LoadLevelFailed,
+        MissingField,
+        MissingOp,
+        ModeLocked,
+        NoActiveManager,
+        NoBounds,
+        NoController,
+        NoEngine,
+        NoJoints,
+        NotInEditor,
+        NotMocapBody,
+        NotReady,
+        NoTwistController,
+        NoViewport,
+        NoWorld,
+        OutcomeUnknown,
+        PathNotReadable,
+        PathNotWritable,
+        ProtocolError,
+        RecordingAlreadyActive,
+        RecordingNotActive,
+        RemoveQuickConvertFailed,
+        ReplayRequiresStepped,
+        ReplaySessionNotFound,
+        ReplyTooLarge,
+        SaveLevelFailed,
+        SelectFailed,
+        ServerUnreachable,
+        SessionTakenOver,
+        SetActorTransformFailed,
+        ShuttingDown,
+        SnapshotFailed,
+        SpawnFailed,
+        StepTimeout,
+        StreamOverflow,
+        TooManyCells,
+        UnknownActor,
+        UnknownArticulation,
+        UnknownBody,
+        UnknownKeyframe,
+        UnknownOp,
+        Unsupported,
+        URLabConnectionError,
+        URLabError,
+        URLabPIEError,
+        URLabRPCError,
+        URLabTimeoutError,
+        URLabVersionMismatch,
+        WrongTransport,
+    )
+    from urlab_client.protocol.messages.streams import (
+        CameraSample,
+        ClientEvent,
+        PlayEnded,
+        PlayStarted,
+        RowSample,
+        ServerAnswers,
+        ServerConnected,
+        ServerLost,
+        ServerReconnected,
+        ServerSilent,
+        SessionLost,
+        SessionOpened,
+        StateSnapshot,
+        StreamPolicy,
+        StreamStats,
+    )
+    from urlab_client.protocol.names import UnknownName
+    from urlab_client.protocol.types import (
+        ActorBounds,
+        ActorHierarchyNode,
+        ActorInfo,
+        BlueprintInfo,
+        CameraPose,
+        ClientConfig,
+        Contact,
+        ContactsResult,
+        Diagnosis,
+        Finding,
+        KeyframeInfo,
+        MocapPose,
+        PIEStartResult,
+        PIEStatus,
+        RecordingHandle,
+        RecordingSummary,
+        ReplaySession,
+        ReplayStatus,
+        Resync,
+        SceneActor,
+        SceneSnapshot,
+        SimOptions,
+        URLabAsset,
+        URLabBlueprint,
+        URLabLightHandle,
+        URLabSpawnHandle,
+        Verdict,
+    )
+    from urlab_client.sync import (
+        DEFAULT,
+        Actuator,
+        Body,
+        Joint,
+        Sensor,
+        Stream,
+        URLabArticulation,
+        URLabCameraView,
+        URLabClient,
+        URLabController,
+        URLabEntity,
+        URLabPDController,
+    )
 
 __version__: str
 
+# Where a name is looked for, the light modules first. A test holds them against the imports above.
+_HOMES = (
+    "urlab_client.protocol.enums",
+    "urlab_client.protocol.errors",
+    "urlab_client.protocol.names",
+    "urlab_client.protocol.types",
+    "urlab_client.protocol.messages.streams",
+    "urlab_client.sync",
+)
+_PACKAGES = ("aio", "protocol", "sync")
+
 
 def __getattr__(name: str) -> Any:
-    # Reading the installed metadata costs milliseconds that most programs need not pay.
-    if name == "__version__":
-        from importlib.metadata import version  # noqa: PLC0415
+    if name in _PACKAGES:
+        return import_module(f"urlab_client.{name}")
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = globals()[name] = _load(name)
+    return value
 
-        return version("urlab-client")
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+def _load(name: str) -> Any:
+    if name == "__version__":
+        # Reading the installed metadata costs milliseconds that most programs need not pay.
+        return import_module("importlib.metadata").version("urlab-client")
+    return next(getattr(module, name) for module in map(import_module, _HOMES) if hasattr(module, name))
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_PACKAGES, *__all__})
 
 
 __all__ = [
