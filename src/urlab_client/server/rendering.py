@@ -47,8 +47,8 @@ logger = logging.getLogger("urlab_client.server")
 Bytes = NDArray[np.uint8]
 
 RenderQuality: TypeAlias = Literal["auto", "fast", "high"]
-"""`fast` leaves out smooth edges, shadows, reflections and blending between mipmaps; `high` has them, as far as the
-driver can; `auto` is `fast` where the processor draws and `high` elsewhere."""
+"""`fast` leaves out smooth edges, shadows, reflections and blending between mipmaps, and draws round shapes a little
+coarser; `high` does not; `auto` is `fast` where the processor draws and `high` elsewhere."""
 
 NO_HIT_CM: Final = 1e8
 """Depth where a ray meets nothing, centimetres."""
@@ -63,6 +63,10 @@ FRAMES_DEADLINE_S: Final = 30.0
 """Longest wait for the frames of a step; the first ones include the search for OpenGL."""
 
 _PROBE_DEADLINE_S: Final = 60.0
+
+_SLICES: Final = 20
+_STACKS: Final = 10
+"""How finely round shapes are drawn when it has to be fast; MuJoCo's own numbers are 28 and 16."""
 
 _OPAQUE: Final = np.array(0xFF000000, "<u4")
 
@@ -252,6 +256,7 @@ class CameraStudio:
                 self._by_name[f"{index.key}/{info.name}"] = camera
                 self._bare[info.name] = camera  # of several, the last
         self._model: mujoco.MjModel | None = None
+        self._spare: list[mujoco.MjData] = []  # making one takes longer than copying a state
         self._queue: queue.SimpleQueue[Exposure | None] = queue.SimpleQueue()
         self._pending: set[Exposure] = set()
         self._lock = threading.Lock()
@@ -297,7 +302,10 @@ class CameraStudio:
             return None
         if self._model is None:
             self._model = copy.copy(self._scene.model)  # its own visual settings, and no eye on changing options
-        data = mujoco.MjData(self._model)
+        try:
+            data = self._spare.pop()
+        except IndexError:
+            data = mujoco.MjData(self._model)
         mujoco.mj_copyData(data, self._model, self._scene.data)
         return Exposure(cameras, data, now)
 
@@ -379,6 +387,7 @@ class CameraStudio:
                     return
                 camera.frame = stage.draw(job.data, camera.info, camera.mode)
                 camera.drawn_at = job.taken_at
+            self._spare.append(job.data)
             with self._lock:
                 self._pending.discard(job)
             job.done.set()
@@ -402,6 +411,7 @@ class _Stage:
         if self._fast:
             model.vis.quality.offsamples = 0
             model.vis.quality.shadowsize = 0
+            model.vis.quality.numslices, model.vis.quality.numstacks = _SLICES, _STACKS
         self._option = mujoco.MjvOption()
         self._option.sitegroup[:] = 0  # marks for the modeller, not things to be seen
         self._view = mujoco.MjvCamera()
