@@ -28,7 +28,7 @@ import time
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, cached_property
 from types import TracebackType
 from typing import Any, Final, Literal, Self, TypeAlias
 
@@ -37,10 +37,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client.protocol.enums import CameraMode
+from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import CameraFrame
+from urlab_client.server.picture import Picture, add_primitives, aim, ascii_text, bounding_box, light_evenly, showing
 from urlab_client.server.scene import CameraInfo, Scene
+from urlab_client.server.viewport import ViewMode
 
-__all__ = ["NO_HIT_CM", "Backend", "CameraStudio", "Exposure", "RenderQuality", "Shot", "find_backend", "tint"]
+__all__ = [
+    "NO_HIT_CM",
+    "Backend",
+    "CameraStudio",
+    "Exposure",
+    "Painting",
+    "RenderQuality",
+    "RenderingUnavailable",
+    "Shot",
+    "find_backend",
+    "need_backend",
+    "tint",
+]
 
 logger = logging.getLogger("urlab_client.server")
 
@@ -105,6 +120,10 @@ print(GL.glGetString(GL.GL_RENDERER).decode(errors="replace"))
 # OpenGL
 
 
+class RenderingUnavailable(URLabError):
+    """No picture can be drawn: this machine has no OpenGL, drawing failed, or it took too long."""
+
+
 @dataclass(frozen=True)
 class Backend:
     """A way to OpenGL that works on this machine.
@@ -128,6 +147,24 @@ def find_backend() -> Backend | None:
 
     `MUJOCO_GL` names the only one to try, or disables drawing. The answer is looked for once per process.
     """
+    found = _search()
+    return found if isinstance(found, Backend) else None
+
+
+def need_backend() -> Backend:
+    """Return what draws on this machine.
+
+    Raises:
+        RenderingUnavailable: Nothing does; the message says why and what to install.
+    """
+    found = _search()
+    if isinstance(found, Backend):
+        return found
+    raise RenderingUnavailable(f"nothing can be drawn here: {found}")
+
+
+def _search() -> Backend | str:
+    """Return what draws, or why nothing does."""
     with _probing:
         return _find(os.environ.get(_CHOICE, "").lower().strip())
 
@@ -136,10 +173,11 @@ _probing = threading.Lock()
 
 
 @cache
-def _find(choice: str) -> Backend | None:
+def _find(choice: str) -> Backend | str:
     if choice in _DISABLED:
-        logger.warning("camera images are left out: %s=%s disables OpenGL; unset it", _CHOICE, choice)
-        return None
+        reason = f"{_CHOICE}={choice} disables OpenGL; unset it"
+        logger.warning("camera images are left out: %s", reason)
+        return reason
     reasons: list[str] = []
     for name in _candidates(choice):
         found = _probe(name)
@@ -148,8 +186,9 @@ def _find(choice: str) -> Backend | None:
             return found
         reasons.append(f"{name}: {found}")
     advice = _PACKAGES if sys.platform == "linux" else "install a graphics driver"
-    logger.warning("camera images are left out, because no OpenGL works here: %s (%s)", advice, "; ".join(reasons))
-    return None
+    reason = f"no OpenGL works here: {advice} ({'; '.join(reasons)})"
+    logger.warning("camera images are left out: %s", reason)
+    return reason
 
 
 def _candidates(choice: str) -> Sequence[str]:
@@ -227,6 +266,23 @@ class Exposure:
     done: threading.Event = field(default_factory=threading.Event)
 
 
+@dataclass(eq=False)
+class Painting:
+    """A state of which a picture of the viewport is to be drawn.
+
+    Attributes:
+        picture: What it shows.
+        data: The state.
+        pixels: Red, green, blue and alpha from the top, shape (height, width, 4); None until it is drawn.
+        done: Set when it is drawn, or never will be.
+    """
+
+    picture: Picture
+    data: mujoco.MjData
+    pixels: Bytes | None = None
+    done: threading.Event = field(default_factory=threading.Event)
+
+
 class CameraStudio:
     """Draws the cameras of one scene; all share one OpenGL context, which belongs to a thread of its own."""
 
@@ -257,8 +313,8 @@ class CameraStudio:
                 self._bare[info.name] = camera  # of several, the last
         self._model: mujoco.MjModel | None = None
         self._spare: list[mujoco.MjData] = []  # making one takes longer than copying a state
-        self._queue: queue.SimpleQueue[Exposure | None] = queue.SimpleQueue()
-        self._pending: set[Exposure] = set()
+        self._queue: queue.SimpleQueue[Exposure | Painting | None] = queue.SimpleQueue()
+        self._pending: set[Exposure | Painting] = set()
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
         self._drawing = False
@@ -300,14 +356,7 @@ class CameraStudio:
         cameras = list(dict.fromkeys(shot.camera for shot in shots if shot.sync or shot.camera.stale(now)))
         if not cameras or self._broken:
             return None
-        if self._model is None:
-            self._model = copy.copy(self._scene.model)  # its own visual settings, and no eye on changing options
-        try:
-            data = self._spare.pop()
-        except IndexError:
-            data = mujoco.MjData(self._model)
-        mujoco.mj_copyData(data, self._model, self._scene.data)
-        return Exposure(cameras, data, now)
+        return Exposure(cameras, self._copy_state(), now)
 
     def frames(self, shots: Sequence[Shot], job: Exposure | None) -> dict[str, CameraFrame] | None:
         """Draw what has to be drawn and return the frames by the request's keys; None without any.
@@ -326,6 +375,33 @@ class CameraStudio:
             if shot.camera.frame is not None and (not shot.sync or job is None or shot.camera.drawn_at >= job.taken_at)
         }
         return frames or None
+
+    def capture_viewport(self, picture: Picture) -> Painting:
+        """Copy the state that `paint` draws; the caller holds the engine's lock."""
+        return Painting(picture, self._copy_state())
+
+    def paint(self, job: Painting) -> Bytes:
+        """Draw a picture of the viewport.
+
+        Args:
+            job: What `capture_viewport` returned.
+
+        Returns:
+            Red, green, blue and alpha from the top, shape (height, width, 4).
+
+        Raises:
+            RenderingUnavailable: It cannot be drawn.
+        """
+        need_backend()
+        if not self._submit(job):
+            raise RenderingUnavailable(
+                "play ended before the picture was drawn" if self._closed else "drawing failed; the log says why"
+            )
+        if not job.done.wait(FRAMES_DEADLINE_S):
+            raise RenderingUnavailable(f"no picture within {FRAMES_DEADLINE_S:g} s")
+        if job.pixels is None:
+            raise RenderingUnavailable("the picture was not drawn; if play has not ended, the log says why")
+        return job.pixels
 
     def close(self, timeout: float = 1.0) -> bool:
         """Stop drawing and release whoever waits. Safe to call twice.
@@ -348,7 +424,17 @@ class CameraStudio:
         thread.join(max(0.0, timeout))
         return not thread.is_alive()
 
-    def _submit(self, job: Exposure) -> bool:
+    def _copy_state(self) -> mujoco.MjData:
+        if self._model is None:
+            self._model = copy.copy(self._scene.model)  # its own visual settings, and no eye on changing options
+        try:
+            data = self._spare.pop()
+        except IndexError:
+            data = mujoco.MjData(self._model)
+        mujoco.mj_copyData(data, self._model, self._scene.data)
+        return data
+
+    def _submit(self, job: Exposure | Painting) -> bool:
         with self._lock:
             if self._closed or self._broken:
                 return False
@@ -382,11 +468,14 @@ class CameraStudio:
     def _draw(self, stage: _Stage) -> None:
         while (job := self._queue.get()) is not None:
             stage.prepare(job.data)
-            for camera in job.cameras:
-                if self._closed:
-                    return
-                camera.frame = stage.draw(job.data, camera.info, camera.mode)
-                camera.drawn_at = job.taken_at
+            if isinstance(job, Painting):
+                job.pixels = stage.paint(job.data, job.picture)
+            else:
+                for camera in job.cameras:
+                    if self._closed:
+                        return
+                    camera.frame = stage.draw(job.data, camera.info, camera.mode)
+                    camera.drawn_at = job.taken_at
             self._spare.append(job.data)
             with self._lock:
                 self._pending.discard(job)
@@ -415,7 +504,6 @@ class _Stage:
         self._option = mujoco.MjvOption()
         self._option.sitegroup[:] = 0  # marks for the modeller, not things to be seen
         self._view = mujoco.MjvCamera()
-        self._view.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._scene = mujoco.MjvScene(model, maxgeom=max(10_000, 2 * model.ngeom + 1000))
         width, height = model.vis.global_.offwidth, model.vis.global_.offheight
         self._gl: Any = importlib.import_module(f"mujoco.{backend.name}").GLContext(width, height)
@@ -447,6 +535,7 @@ class _Stage:
 
     def draw(self, data: mujoco.MjData, camera: CameraInfo, mode: CameraMode) -> CameraFrame:
         """Draw what a camera sees."""
+        self._view.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._view.fixedcamid = camera.id
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(self._model, data, self._option, None, self._view, everything, self._scene)
@@ -454,6 +543,7 @@ class _Stage:
             _bring_near(side)
         flags, kinds = self._scene.flags, mujoco.mjtRndFlag
         flags[kinds.mjRND_SHADOW] = flags[kinds.mjRND_REFLECTION] = not self._fast
+        flags[kinds.mjRND_WIREFRAME] = False
         flags[kinds.mjRND_SEGMENT] = flags[kinds.mjRND_IDCOLOR] = mode is not CameraMode.REAL
         width, height = camera.resolution
         area = mujoco.MjrRect(0, 0, width, height)
@@ -467,6 +557,35 @@ class _Stage:
         colors = np.empty((height, width, 3), np.uint8)
         mujoco.mjr_readPixels(colors, None, area, self._renderer)
         return _frame(camera, "bgra8", self._segments(colors[::-1], mode))
+
+    def paint(self, data: mujoco.MjData, picture: Picture) -> Bytes:
+        """Draw the viewport; return red, green, blue and alpha from the top, shape (height, width, 4)."""
+        width, height = picture.size
+        view, mode, renderer = picture.view, picture.mode, self._renderer
+        if width > renderer.offWidth or height > renderer.offHeight:
+            mujoco.mjr_resizeOffscreen(max(width, renderer.offWidth), max(height, renderer.offHeight), renderer)
+        self._model.vis.global_.fovy = view.fovy(width / height)
+        aim(self._view, view)
+        everything = mujoco.mjtCatBit.mjCAT_ALL.value
+        with showing(mode, self._model, self._option):
+            mujoco.mjv_updateScene(self._model, data, self._option, None, self._view, everything, self._scene)
+        for side in self._scene.camera:
+            side.forward[:], side.up[:] = view.forward, view.up
+        if mode is ViewMode.UNLIT:
+            light_evenly(self._scene)
+        chosen = self._tints.owned_by(picture.selected) if picture.selected else None
+        box = None if chosen is None else bounding_box(self._model, data, chosen)
+        add_primitives(self._scene, picture.primitives if box is None else [*picture.primitives, box])
+        flags, kinds = self._scene.flags, mujoco.mjtRndFlag
+        flags[kinds.mjRND_SHADOW] = flags[kinds.mjRND_REFLECTION] = not self._fast and mode is ViewMode.LIT
+        flags[kinds.mjRND_SEGMENT] = flags[kinds.mjRND_IDCOLOR] = False
+        flags[kinds.mjRND_WIREFRAME] = mode is ViewMode.WIREFRAME
+        area = mujoco.MjrRect(0, 0, width, height)
+        mujoco.mjr_render(area, self._scene, renderer)
+        if picture.overlay:
+            font, corner = mujoco.mjtFont.mjFONT_NORMAL, mujoco.mjtGridPos.mjGRID_TOPLEFT
+            mujoco.mjr_overlay(font, corner, area, ascii_text(picture.overlay), "", renderer)
+        return self._read_colors(area, "RGBA")
 
     def _simplify_textures(self) -> None:
         """Sample one mipmap of a texture, and none of a cube, which is seen enlarged: a third of the time."""
@@ -544,7 +663,7 @@ def _frame(camera: CameraInfo, dtype: str, pixels: NDArray[Any]) -> CameraFrame:
 
 
 class _Tints:
-    """Colours of the geoms in the segmentation modes, blue, green, red."""
+    """Whose the geoms are, and their colours in the segmentation modes, blue, green, red."""
 
     def __init__(self, scene: Scene, classes: Mapping[str, str]) -> None:
         self._scene = scene
@@ -557,14 +676,26 @@ class _Tints:
             self._found[mode] = self._compute(mode)
         return self._found[mode]
 
-    def _compute(self, mode: CameraMode) -> Bytes:
+    def owned_by(self, actor: str) -> NDArray[np.bool_]:
+        """Return which geoms belong to an actor, by its name; shape (ngeom,)."""
+        return np.array([owner == actor for owner in self._owners], np.bool_)
+
+    @cached_property
+    def _owners(self) -> list[str]:
+        """Name of the actor that a geom belongs to; empty for none."""
         model = self._scene.model
         bodies: dict[int, str] = {entity.body: self._owner(entity.name) for entity in self._scene.entities}
         for index in self._scene.articulations:
             bodies.update(dict.fromkeys(index.bodies.tolist(), index.key))
+        return [
+            bodies.get(body) or self._owner(model.geom(geom).name)
+            for geom, body in enumerate(model.geom_bodyid.tolist())
+        ]
+
+    def _compute(self, mode: CameraMode) -> Bytes:
+        model = self._scene.model
         colors = np.zeros((model.ngeom, 3), np.uint8)
-        for geom, body in enumerate(model.geom_bodyid.tolist()):
-            owner = bodies.get(body) or self._owner(model.geom(geom).name)
+        for geom, (owner, body) in enumerate(zip(self._owners, model.geom_bodyid.tolist(), strict=True)):
             if owner:
                 group = zlib.crc32(self._classes.get(owner, owner).encode())
                 red, green, blue = tint(group, body if mode is CameraMode.INSTANCE else None)
