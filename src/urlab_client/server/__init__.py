@@ -10,6 +10,7 @@ from urlab_client.server.endpoint import PortInUse
 from urlab_client.server.faults import ActiveFault, Corrupt, Cut, Delay, Drop, Fault, Faults, Refuse
 from urlab_client.server.guard import CurveServer, UnprotectedServer
 from urlab_client.server.limits import Limits
+from urlab_client.server.rendering import RenderingUnavailable
 from urlab_client.server.simulated import ModelError, SimulatedServer
 
 __all__ = [
@@ -26,6 +27,7 @@ __all__ = [
     "ModelError",
     "PortInUse",
     "Refuse",
+    "RenderingUnavailable",
     "SimulatedServer",
     "UnprotectedServer",
     "bundled_models",

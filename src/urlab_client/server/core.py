@@ -178,10 +178,24 @@ class ServerCore:
             scene,
             engine.start(),
             Observer(scene, engine.controls),
-            CameraStudio(scene, modes, {actor.name: _kind(actor) for actor in actors}, physics.render_quality),
+            self._studio(scene, actors, modes),
             files,
             self.limits,
         )
+
+    def authored_studio(self) -> CameraStudio:
+        """Compile the level as it is now and return what draws it; the caller closes it.
+
+        Raises:
+            CompileFailed: MuJoCo rejects the level.
+        """
+        actors = self.world.freeze()
+        return self._studio(compile_scene(actors, honour_mjcf_options=self.physics.mjcf_options), actors, {})
+
+    def _studio(
+        self, scene: Scene, actors: Sequence[Actor], modes: Mapping[tuple[str, str], CameraMode]
+    ) -> CameraStudio:
+        return CameraStudio(scene, modes, {actor.name: _kind(actor) for actor in actors}, self.physics.render_quality)
 
     def stop_play(self) -> None:
         """End play, if it runs."""

@@ -1,7 +1,8 @@
 """Debug drawing: primitives with a time to live, and one line of text.
 
-For the `debug` handlers, which add to a `Drawings`, and for whoever draws the viewport, which reads from it. Robot
-cameras do not show any of it. Positions are metres and rotations quaternions (x, y, z, w), both in MuJoCo's frame.
+For the `debug` handlers, which add to a `Drawings`, and for `snapshot`, which reads from it. Robot cameras do not show
+any of it, so that it gets into no training data. Positions are metres and rotations quaternions (x, y, z, w), both in
+MuJoCo's frame.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ class Line:
         start: One end.
         end: The other.
         color: Red, green, blue in 0..1.
-        thickness: Width, pixels.
+        thickness: Width; 1 is the usual.
     """
 
     start: Vec3
@@ -97,7 +98,7 @@ class Arrow:
         end: Tip.
         color: Red, green, blue in 0..1.
         head: Size of the head, metres.
-        thickness: Width of the shaft, in Unreal units.
+        thickness: Width of its lines; 1 is the usual.
     """
 
     start: Vec3

@@ -11,7 +11,7 @@ import logging
 import math
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 import mujoco
 import numpy as np
@@ -19,15 +19,30 @@ from numpy.typing import NDArray
 
 from urlab_client.protocol.base import Quat, Vec3
 from urlab_client.protocol.rotation import IDENTITY, rotate
+from urlab_client.server.geometry import box_around
 from urlab_client.server.markers import MARKER_RADIUS_M, Arrow, Box, Line, Primitive, Sphere, Text
 from urlab_client.server.viewport import CameraView, ViewMode
 
-__all__ = ["SELECTED", "Picture", "add_primitives", "aim", "ascii_text", "bounding_box", "light_evenly", "showing"]
+__all__ = [
+    "SELECTED",
+    "Bounds",
+    "Picture",
+    "add_primitives",
+    "aim",
+    "ascii_text",
+    "bounds_of",
+    "light_evenly",
+    "outline",
+    "showing",
+]
 
 logger = logging.getLogger("urlab_client.server")
 
 SELECTED: Final[Vec3] = (1.0, 0.55, 0.05)
 """Colour of the box around what is selected."""
+
+Bounds: TypeAlias = tuple[Vec3, Vec3]
+"""Lowest and highest corner of an axis-aligned box, metres."""
 
 _LINE_PIXELS: Final = 2.0
 """Width of a line of thickness 1, pixels."""
@@ -50,10 +65,12 @@ class Picture:
         primitives: Debug drawing.
         overlay: Text over the picture.
         selected: Name of the actor that is marked as selected; may be empty.
+        fit: Move the camera, without turning it, so that everything but endless planes is in the picture.
     """
 
     size: tuple[int, int]
     view: CameraView
+    fit: bool = False
     mode: ViewMode = ViewMode.LIT
     primitives: Sequence[Primitive] = ()
     overlay: str = ""
@@ -102,21 +119,24 @@ def light_evenly(scene: mujoco.MjvScene) -> None:
     light.ambient[:], light.diffuse[:], light.specular[:] = 1.0, 0.0, 0.0
 
 
-def bounding_box(model: mujoco.MjModel, data: mujoco.MjData, geoms: NDArray[np.bool_]) -> Box | None:
-    """Return the box around the chosen geoms; None if none of them has bounds.
+def bounds_of(model: mujoco.MjModel, data: mujoco.MjData, geoms: NDArray[np.bool_]) -> Bounds | None:
+    """Return the box around the chosen geoms; None if none of them has bounds, as planes have not.
 
     Args:
         model: The model.
         data: Its data with positions computed.
         geoms: Mask, shape (ngeom,).
     """
-    chosen = geoms & (model.geom_type != int(mujoco.mjtGeom.mjGEOM_PLANE))
-    if not chosen.any():
+    bounded = geoms & (model.geom_type != int(mujoco.mjtGeom.mjGEOM_PLANE))
+    if not bounded.any():
         return None
-    turn = data.geom_xmat[chosen].reshape(-1, 3, 3)
-    middle = data.geom_xpos[chosen] + np.einsum("nij,nj->ni", turn, model.geom_aabb[chosen, :3])
-    reach = np.einsum("nij,nj->ni", np.abs(turn), model.geom_aabb[chosen, 3:])
-    low, high = (middle - reach).min(axis=0), (middle + reach).max(axis=0)
+    low, high = box_around(model, data, bounded)
+    return _point(low), _point(high)
+
+
+def outline(bounds: Bounds) -> Box:
+    """Return the box that marks what is selected."""
+    low, high = np.array(bounds)
     return Box(
         center=_point((low + high) / 2.0), half_extents=_point((high - low) / 2.0), rotation=IDENTITY, color=SELECTED
     )
@@ -167,8 +187,8 @@ def _strokes(primitive: Primitive) -> list[_Stroke]:
     color = primitive.color
     match primitive:
         case Sphere():
-            radius = (MARKER_RADIUS_M,) * 3
-            return [_Stroke(kind=kinds.mjGEOM_SPHERE, at=primitive.center, color=color, size=radius)]
+            size = (MARKER_RADIUS_M, MARKER_RADIUS_M, MARKER_RADIUS_M)
+            return [_Stroke(kind=kinds.mjGEOM_SPHERE, at=primitive.center, color=color, size=size)]
         case Text():
             text = ascii_text(primitive.text)[:_LABEL_BYTES]
             return [_Stroke(kind=kinds.mjGEOM_LABEL, at=primitive.at, color=color, size=(0.1, 0.1, 0.1), text=text)]
@@ -195,16 +215,19 @@ def _line(start: Vec3, end: Vec3, color: Vec3, thickness: float) -> _Stroke:
 
 def _arrow(arrow: Arrow) -> list[_Stroke]:
     """Return the shaft and the four edges of the head."""
-    tail, tip = np.array(arrow.start), np.array(arrow.end)
+    tail: NDArray[np.float64] = np.array(arrow.start)
+    tip: NDArray[np.float64] = np.array(arrow.end)
     length = float(np.linalg.norm(tip - tail))
     strokes = [_line(arrow.start, arrow.end, arrow.color, arrow.thickness)]
     if length == 0.0:
         return strokes
     along = (tip - tail) / length
-    side = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
-    side /= np.linalg.norm(side)
-    for out in (side, -side, np.cross(along, side), -np.cross(along, side)):
-        barb = tip - arrow.head * (along - _HEAD_SPREAD * out)
+    least: NDArray[np.float64] = np.eye(3)[np.argmin(np.abs(along))]
+    side: NDArray[np.float64] = np.cross(along, least)
+    side /= float(np.linalg.norm(side))
+    other: NDArray[np.float64] = np.cross(along, side)
+    for out in (side, -side, other, -other):
+        barb: NDArray[np.float64] = tip - arrow.head * (along - _HEAD_SPREAD * out)
         strokes.append(_line(arrow.end, _point(barb), arrow.color, arrow.thickness))
     return strokes
 

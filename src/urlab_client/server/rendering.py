@@ -39,7 +39,16 @@ from numpy.typing import NDArray
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import CameraFrame
-from urlab_client.server.picture import Picture, add_primitives, aim, ascii_text, bounding_box, light_evenly, showing
+from urlab_client.server.picture import (
+    Picture,
+    add_primitives,
+    aim,
+    ascii_text,
+    bounds_of,
+    light_evenly,
+    outline,
+    showing,
+)
 from urlab_client.server.scene import CameraInfo, Scene
 from urlab_client.server.viewport import ViewMode
 
@@ -564,18 +573,21 @@ class _Stage:
         view, mode, renderer = picture.view, picture.mode, self._renderer
         if width > renderer.offWidth or height > renderer.offHeight:
             mujoco.mjr_resizeOffscreen(max(width, renderer.offWidth), max(height, renderer.offHeight), renderer)
+            mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, renderer)
+        if picture.fit and (bounds := bounds_of(self._model, data, self._model.geom_rgba[:, 3] > 0.0)):
+            view = view.framing(*bounds)
         self._model.vis.global_.fovy = view.fovy(width / height)
         aim(self._view, view)
-        everything = mujoco.mjtCatBit.mjCAT_ALL.value
+        kinds_of_geoms = mujoco.mjtCatBit.mjCAT_ALL.value
         with showing(mode, self._model, self._option):
-            mujoco.mjv_updateScene(self._model, data, self._option, None, self._view, everything, self._scene)
+            mujoco.mjv_updateScene(self._model, data, self._option, None, self._view, kinds_of_geoms, self._scene)
         for side in self._scene.camera:
             side.forward[:], side.up[:] = view.forward, view.up
         if mode is ViewMode.UNLIT:
             light_evenly(self._scene)
-        chosen = self._tints.owned_by(picture.selected) if picture.selected else None
-        box = None if chosen is None else bounding_box(self._model, data, chosen)
-        add_primitives(self._scene, picture.primitives if box is None else [*picture.primitives, box])
+        add_primitives(self._scene, picture.primitives)
+        if picture.selected and (bounds := bounds_of(self._model, data, self._tints.owned_by(picture.selected))):
+            add_primitives(self._scene, [outline(bounds)])
         flags, kinds = self._scene.flags, mujoco.mjtRndFlag
         flags[kinds.mjRND_SHADOW] = flags[kinds.mjRND_REFLECTION] = not self._fast and mode is ViewMode.LIT
         flags[kinds.mjRND_SEGMENT] = flags[kinds.mjRND_IDCOLOR] = False

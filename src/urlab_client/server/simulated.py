@@ -18,6 +18,8 @@ from typing import Any, Final, Literal, Self, get_args
 
 import anyio
 import anyio.to_thread
+import numpy as np
+from numpy.typing import NDArray
 
 from urlab_client.protocol.enums import CameraMode, PIEState, StepMode, Transport
 from urlab_client.protocol.errors import URLabError
@@ -36,10 +38,11 @@ from urlab_client.server.limits import Limits
 from urlab_client.server.markers import Drawings
 from urlab_client.server.publishing import StreamServer
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.rendering import RenderQuality
+from urlab_client.server.rendering import RenderQuality, find_backend
 from urlab_client.server.scratch import Scratch
 from urlab_client.server.session import Session
 from urlab_client.server.shared_memory import MAX_REPLY_BYTES, SharedMemory
+from urlab_client.server.snapshot import LARGEST_PIXELS, take_snapshot
 from urlab_client.server.viewport import Viewport
 from urlab_client.server.world import World
 
@@ -267,6 +270,35 @@ class SimulatedServer:
         if opened is not None and not opened.restore():
             self.close()
             self.start()
+
+    def snapshot(self, size: tuple[int, int] = (1280, 720), *, frame_all: bool = False) -> NDArray[np.uint8]:
+        """Draw the viewport: what the editor would show, with debug drawing, overlay text and what is selected.
+
+        The camera and the view mode are those that the `viewport` ops have set. During play it shows the simulation,
+        else the level as authored. In `collision` mode are the geoms that collide, meshes as their convex hulls. It
+        blocks for as long as drawing takes; in async code call it with `anyio.to_thread.run_sync(server.snapshot)`.
+
+        Args:
+            size: Width and height, pixels.
+            frame_all: Move the camera for this picture so that everything is in it; it is not turned.
+
+        Returns:
+            Red, green, blue and alpha, rows from the top, shape (height, width, 4).
+
+        Raises:
+            RenderingUnavailable: This machine has no OpenGL (the message names the packages), the level does not
+                compile, or the server is busy.
+            ValueError: A size that is none.
+            RuntimeError: The server is closed.
+        """
+        if len(size) != 2 or not all(1 <= side <= LARGEST_PIXELS for side in size):
+            raise ValueError(f"size is a width and a height from 1 to {LARGEST_PIXELS} pixels, not {size!r}")
+        return self._running.snapshot((int(size[0]), int(size[1])), frame_all=frame_all)
+
+    @property
+    def can_render(self) -> bool:
+        """Whether pictures can be drawn on this machine; finding out takes about a second, once per process."""
+        return find_backend() is not None
 
     def __enter__(self) -> Self:
         return self.start()
@@ -533,6 +565,13 @@ class _Opened:
                 return core.begin_play_again(CLOSE_S)
             core.stop_play()
             return True
+
+    def snapshot(self, size: tuple[int, int], *, frame_all: bool) -> NDArray[np.uint8]:
+        """Draw the viewport; see `SimulatedServer.snapshot`."""
+        core, dispatcher = self._core, self._dispatcher
+        if core is None or dispatcher is None:
+            raise RuntimeError("the server is still starting")
+        return take_snapshot(core, dispatcher, size, frame_all=frame_all)
 
     def _mark(self, core: ServerCore) -> object:
         """Return something that compares equal for as long as nothing was authored or written."""

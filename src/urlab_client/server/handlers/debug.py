@@ -106,7 +106,8 @@ def draw_axes(server: ServerCore, request: DrawAxes) -> DrawAxesOk:
     rotation = _rotation(request, request.rotation_quat, request.rotation_euler)
     length = abs(request.scale) if math.isfinite(request.scale) else 0.2
     arrows: list[Primitive] = []
-    for axis, color in (((length, 0.0, 0.0), _RED), ((0.0, length, 0.0), _GREEN), ((0.0, 0.0, length), _BLUE)):
+    # Unreal's axes, whose y is the other way than MuJoCo's.
+    for axis, color in (((length, 0.0, 0.0), _RED), ((0.0, -length, 0.0), _GREEN), ((0.0, 0.0, length), _BLUE)):
         dx, dy, dz = rotate(rotation, axis)
         x, y, z = origin
         arrows.append(Arrow(start=origin, end=(x + dx, y + dy, z + dz), color=color, head=_HEAD * length))

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
-
-if TYPE_CHECKING:
-    import mujoco
 
 __all__ = ["Box", "box_around"]
 

@@ -1,0 +1,81 @@
+"""A picture of the viewport, as the ops of a server have set it up.
+
+For `SimulatedServer.snapshot`; the wire has no op for it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from urlab_client.server.core import ServerCore
+from urlab_client.server.dispatch import Dispatcher
+from urlab_client.server.handlers.viewport import look
+from urlab_client.server.picture import Picture
+from urlab_client.server.refusal import Refusal
+from urlab_client.server.rendering import RenderingUnavailable, need_backend
+from urlab_client.server.scene import CompileFailed
+
+__all__ = ["LARGEST_PIXELS", "take_snapshot"]
+
+LARGEST_PIXELS: Final = 16384
+"""Most pixels of a side, the most that usual drivers draw."""
+
+PATIENCE_S: Final = 10.0
+"""Longest wait for a request that is being answered."""
+
+_FRAMING_FOV: Final = 40.0
+
+
+def take_snapshot(
+    server: ServerCore, dispatcher: Dispatcher, size: tuple[int, int], *, frame_all: bool
+) -> NDArray[np.uint8]:
+    """Draw the viewport.
+
+    Args:
+        server: The server.
+        dispatcher: What answers its requests, none of which is answered while the state is read.
+        size: Width and height, pixels.
+        frame_all: Look at everything, from the viewport camera's direction.
+
+    Returns:
+        Red, green, blue and alpha from the top, shape (height, width, 4).
+
+    Raises:
+        RenderingUnavailable: It cannot be drawn.
+    """
+    need_backend()
+    with dispatcher.standstill(PATIENCE_S) as idle:
+        if not idle:
+            raise RenderingUnavailable(f"a request was being answered for more than {PATIENCE_S:g} s")
+        view = look(server)
+        picture = Picture(
+            size=size,
+            view=replace(view, fov=min(view.fov, _FRAMING_FOV)) if frame_all else view,
+            fit=frame_all,
+            mode=server.viewport.mode,
+            primitives=server.drawings.take_frame(in_play=server.world.pie_running),
+            overlay=server.drawings.overlay,
+            selected=server.world.selected,
+        )
+        running = server.play.current
+        try:
+            if running is not None:
+                with running.engine.lock:
+                    job = running.cameras.capture_viewport(picture)
+                studio = running.cameras
+            else:
+                studio = server.authored_studio()
+                job = studio.capture_viewport(picture)
+        except Refusal as refusal:
+            raise RenderingUnavailable(f"the state cannot be read: {refusal.message}") from None
+        except CompileFailed as error:
+            raise RenderingUnavailable(f"the level does not compile: {error.message}") from None
+    try:
+        return studio.paint(job)
+    finally:
+        if running is None:
+            studio.close()
