@@ -399,6 +399,8 @@ class URLabClient:
         n_steps = operator.index(n_steps)  # a hot op: its request is not checked again before it is sent
         level = state.level if isinstance(observations, SessionLevel) else ObservationLevel(observations)
         cameras = self._cameras(include_cameras)
+        for observer in state.observers:
+            cameras = observer.wanted_pictures(cameras, n_steps)
         if timeout is DEFAULT and isinstance(cameras, dict):
             waits = sum(timing == CameraTiming.SYNC for timing in cameras.values())
             timeout = _SYNC_CAMERA_S * waits + (op_of(Step).timeout or 0.0) if waits else DEFAULT

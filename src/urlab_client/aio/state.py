@@ -10,7 +10,7 @@ import re
 import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import anyio.to_thread
 import numpy as np
@@ -54,7 +54,7 @@ from urlab_client.protocol.types import SimOptions
 if TYPE_CHECKING:
     import mujoco
 
-__all__ = ["SimState"]
+__all__ = ["SimState", "StateObserver"]
 
 log = logging.getLogger("urlab_client.client")
 
@@ -63,6 +63,18 @@ _OVERTAKEN_S = 1.0
 
 # Unreal's actor names: class, then a number or a generated id.
 _ENGINE_NAME = re.compile(r"(?P<stem>.+)_C_(?:\d+|UAID_\w+)")
+
+
+class StateObserver(Protocol):
+    """Looks on while the client works. Called on the event loop, so it must be quick; it must not raise."""
+
+    def on_state(self, reply: StateReply | StateSnapshot) -> None:
+        """Take note of a state that was taken over. Its arrays are replaced by later ones, never written."""
+        ...
+
+    def wanted_pictures(self, asked: bool | dict[str, str | None], n_steps: int) -> bool | dict[str, str | None]:
+        """Return the pictures that the next step is to bring: what its caller asked for, and more."""
+        ...
 
 
 class SimState:
@@ -85,6 +97,7 @@ class SimState:
         on_adopted: Told of each handshake taken over, and of the end of play.
         doubts: Requests whose replies were lost.
         stopping: Whether this client is ending play, so that its end is no news.
+        observers: Told of each state taken over, such as recorders.
     """
 
     def __init__(
@@ -125,6 +138,7 @@ class SimState:
         self.doubts = Doubts()
         self.on_adopted: Callable[[], None] | None = None
         self.stopping = False
+        self.observers: list[StateObserver] = []
         self._records: dict[str, ArticulationRecord] = {}
         self._entity_records: dict[str, EntityRecord] = {}
 
@@ -374,6 +388,8 @@ class SimState:
                 self.mirror.data.time = reply.time
             self.mirror.mark_stale()
             self._absorb_clocks(reply, received)
+        for observer in self.observers:
+            observer.on_state(reply)
 
     def _check_perturbation(self, reply: StateReply | StateSnapshot, op: str) -> None:
         drag = reply.perturbation if isinstance(reply, StepOk) else None

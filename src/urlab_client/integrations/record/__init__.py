@@ -1,0 +1,26 @@
+"""Recording a run into an MCAP file that Foxglove opens, reading it back, and converting it.
+
+Needs the extra `mcap`; `video` and `dataset` for some conversions.
+"""
+
+from urlab_client.integrations.record._extras import need
+
+need("mcap", "PIL", extra="mcap")
+
+from urlab_client.integrations.record.reader import Camera, Run, Summary, Table, Topic, read_run  # noqa: E402
+from urlab_client.integrations.record.recorder import AsyncRecorder, Recorder, record  # noqa: E402
+from urlab_client.integrations.record.writer import RecorderStats, RecordingError  # noqa: E402
+
+__all__ = [
+    "AsyncRecorder",
+    "Camera",
+    "Recorder",
+    "RecorderStats",
+    "RecordingError",
+    "Run",
+    "Summary",
+    "Table",
+    "Topic",
+    "read_run",
+    "record",
+]

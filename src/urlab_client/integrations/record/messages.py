@@ -1,0 +1,271 @@
+"""What a recording holds: one struct per schema, JSON as Foxglove reads it. No I/O.
+
+Messages named `foxglove.*` have the fields of Foxglove's own schemas, so its panels show them without any set-up; those
+named `urlab.*` are this project's and can be plotted there.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+from msgspec import Struct
+
+from urlab_client.protocol.base import Floats
+
+__all__ = [
+    "ArticulationMessage",
+    "CameraCalibration",
+    "CompressedImage",
+    "ContactMessage",
+    "ContactsMessage",
+    "EntityMessage",
+    "FrameTransform",
+    "FrameTransforms",
+    "GapMessage",
+    "JointState",
+    "JointStates",
+    "Quaternion",
+    "RawImage",
+    "Time",
+    "Vector3",
+    "encode",
+    "schema_name",
+    "schema_of",
+    "values",
+]
+
+_NAN, _PLUS, _MINUS = "NaN", "Infinity", "-Infinity"  # as protobuf writes them in JSON
+
+
+class Time(Struct, frozen=True):
+    """A time of the recording's clock."""
+
+    sec: int
+    nsec: int
+
+    @classmethod
+    def of(cls, nanoseconds: int) -> Time:
+        """Split nanoseconds."""
+        return cls(*divmod(nanoseconds, 1_000_000_000))
+
+    @property
+    def nanoseconds(self) -> int:
+        """Both parts as one number."""
+        return self.sec * 1_000_000_000 + self.nsec
+
+
+class Vector3(Struct, frozen=True):
+    """Metres, or newtons."""
+
+    x: float
+    y: float
+    z: float
+
+
+class Quaternion(Struct, frozen=True):
+    """A rotation, scalar last as Foxglove orders it."""
+
+    x: float
+    y: float
+    z: float
+    w: float
+
+
+class ArticulationMessage(Struct, kw_only=True, omit_defaults=True):
+    """State of one articulation, as the server sent it.
+
+    Attributes:
+        timestamp: Time of the recording's clock.
+        sim_time: `mjData.time`, seconds.
+        sample: Number of the sample; articulations and entities with the same one belong together.
+        step: Step counter of the session.
+        episode: Number of resets before.
+        wall_time: The server's UTC clock.
+        qpos: Joint positions; what each value is, the channel's `layout` says.
+        qvel: Joint velocities.
+        set_points: What the client had set, before any controller.
+        ctrl: `mjData.ctrl`, as applied.
+        act: Activations.
+        sensors: Readings by name.
+    """
+
+    timestamp: Time
+    sim_time: float
+    sample: int
+    step: int
+    episode: int
+    wall_time: Time
+    qpos: list[float]
+    qvel: list[float]
+    set_points: list[float] = []
+    ctrl: list[float] = []
+    act: list[float] = []
+    sensors: dict[str, list[float]] = {}
+
+
+class EntityMessage(Struct, kw_only=True, omit_defaults=True):
+    """State of one plain entity: position in metres, orientation (w, x, y, z), of a free one the joint's velocity."""
+
+    timestamp: Time
+    sim_time: float
+    sample: int
+    step: int
+    episode: int
+    position: list[float]
+    orientation: list[float]
+    qvel: list[float] = []
+
+
+class JointState(Struct, frozen=True):
+    """One hinge or slide joint: radians or metres, and per second."""
+
+    name: str
+    position: float
+    velocity: float
+
+
+class JointStates(Struct, frozen=True):
+    """All hinge and slide joints by compiled name."""
+
+    timestamp: Time
+    joints: list[JointState]
+
+
+class FrameTransform(Struct, frozen=True):
+    """Pose of a frame in another one."""
+
+    timestamp: Time
+    parent_frame_id: str
+    child_frame_id: str
+    translation: Vector3
+    rotation: Quaternion
+
+
+class FrameTransforms(Struct, frozen=True):
+    """Poses of all bodies and recorded cameras in the world."""
+
+    transforms: list[FrameTransform]
+
+
+class CompressedImage(Struct, frozen=True):
+    """A picture as JPEG or PNG."""
+
+    timestamp: Time
+    frame_id: str
+    data: bytes
+    format: str
+
+
+class RawImage(Struct, frozen=True):
+    """A picture of depths, metres, as 32-bit floats."""
+
+    timestamp: Time
+    frame_id: str
+    width: int
+    height: int
+    encoding: str
+    step: int
+    data: bytes
+
+
+class CameraCalibration(Struct, frozen=True):
+    """Pinhole parameters of a camera."""
+
+    timestamp: Time
+    frame_id: str
+    width: int
+    height: int
+    distortion_model: str
+    D: list[float]
+    K: list[float]
+    R: list[float]
+    P: list[float]
+
+
+class ContactMessage(Struct, frozen=True):
+    """One contact: metres; the force is the one on the second body, newtons, world frame."""
+
+    body1: str
+    body2: str
+    geom1: str
+    geom2: str
+    position: Vector3
+    normal: Vector3
+    distance: float
+    force: Vector3
+
+
+class ContactsMessage(Struct, frozen=True):
+    """Contacts, computed from the recorded state with the client's model."""
+
+    timestamp: Time
+    contacts: list[ContactMessage]
+
+
+class GapMessage(Struct, frozen=True):
+    """What was dropped since the previous message of this kind, because the file could not be written fast enough."""
+
+    timestamp: Time
+    states: int
+    frames: int
+
+
+_FOXGLOVE = (CameraCalibration, CompressedImage, FrameTransforms, JointStates, RawImage)
+_URLAB: dict[type[Struct], str] = {
+    ArticulationMessage: "urlab.ArticulationState",
+    EntityMessage: "urlab.EntityState",
+    ContactsMessage: "urlab.Contacts",
+    GapMessage: "urlab.Gap",
+}
+
+
+def schema_name(kind: type[Struct]) -> str:
+    """Return the name of a message's schema."""
+    return f"foxglove.{kind.__name__}" if kind in _FOXGLOVE else _URLAB[kind]
+
+
+def schema_of(kind: type[Struct]) -> bytes:
+    """Return the JSON schema of a message, without references: readers in the field do not follow them."""
+    (whole,), definitions = msgspec.json.schema_components([kind], ref_template="{name}")
+    schema = _inlined(whole, definitions)
+    schema["title"] = schema_name(kind)
+    return msgspec.json.encode(schema)
+
+
+def _inlined(node: Any, definitions: dict[str, Any]) -> Any:
+    if isinstance(node, dict):
+        reference: Any = node.get("$ref")  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
+        if reference is not None:
+            return _inlined(definitions[reference], definitions)
+        return {key: _inlined(value, definitions) for key, value in node.items()}  # pyright: ignore[reportUnknownVariableType]
+    if isinstance(node, list):
+        return [_inlined(item, definitions) for item in node]  # pyright: ignore[reportUnknownVariableType]
+    return node
+
+
+_encode = msgspec.json.Encoder().encode
+
+
+def encode(message: Struct) -> bytes:
+    """Return the message as JSON. Numbers read back to the same bits; NaN and infinities are written as text."""
+    data = _encode(message)
+    # msgspec writes null for what JSON has no number for. A name that holds the word costs only time.
+    return _encode(_spelled_out(msgspec.to_builtins(message))) if b"null" in data else data
+
+
+def _spelled_out(node: Any) -> Any:
+    match node:
+        case float():
+            return node if node - node == 0 else _NAN if node != node else _PLUS if node > 0 else _MINUS  # noqa: PLR0124
+        case dict():
+            return {key: _spelled_out(value) for key, value in node.items()}  # pyright: ignore[reportUnknownVariableType]
+        case list():
+            return [_spelled_out(value) for value in node]  # pyright: ignore[reportUnknownVariableType]
+        case _:
+            return node
+
+
+def values(array: Floats | None) -> list[float]:
+    """Return the numbers of an array; none for None."""
+    return [] if array is None else array.tolist()

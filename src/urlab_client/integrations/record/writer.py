@@ -1,0 +1,477 @@
+"""The thread that turns states and pictures into an MCAP file, and the bounded queue in front of it."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import version
+from io import BufferedWriter
+from pathlib import Path
+
+import numpy as np
+from mcap.writer import CompressionType, Writer
+from msgspec import Struct
+from PIL import Image
+
+from urlab_client.integrations.record.messages import (
+    ArticulationMessage,
+    CompressedImage,
+    ContactsMessage,
+    EntityMessage,
+    FrameTransforms,
+    GapMessage,
+    JointStates,
+    RawImage,
+    Time,
+    encode,
+    schema_name,
+    schema_of,
+    values,
+)
+from urlab_client.integrations.record.scene import CameraLayout, Scene, Simulation, calibration, to_metadata
+from urlab_client.protocol.enums import CameraMode
+from urlab_client.protocol.errors import URLabError
+from urlab_client.protocol.messages.session import CameraFrame, EntityState, StateReply, StepOk
+from urlab_client.protocol.messages.streams import StateSnapshot
+from urlab_client.protocol.rows import Pixels, decode_camera
+
+__all__ = ["FORMAT", "Picture", "RecorderStats", "RecordingError", "Schedule", "State", "WriterOptions", "WriterThread"]
+
+log = logging.getLogger("urlab_client.record")
+
+FORMAT = "1"
+"""Version of what is in a recording."""
+
+_WAKE_S = 0.02  # in batches: a thread that wakes for each state would take the interpreter from who steps each time
+_CHUNK_BYTES = 1 << 20
+_STATE_BYTES = 1 << 10  # what a state is taken to occupy besides its arrays
+_FALLBACK_NS = 1_000_000
+
+
+class RecordingError(URLabError):
+    """A recording could not be written to its end, or is not one."""
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """One state on its way into the file."""
+
+    scene: Scene
+    reply: StateReply | StateSnapshot
+    set_points: dict[str, list[float]]
+    nanoseconds: int
+    restarts: bool
+    wall_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """One picture on its way into the file; without a time of its own it belongs to the last state before it."""
+
+    camera: CameraLayout
+    frame: CameraFrame | Pixels
+    nanoseconds: int | None
+    wall_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class WriterOptions:
+    """How to write.
+
+    Attributes:
+        image_format: `jpeg` or `png`, of colour pictures.
+        jpeg_quality: 1 to 95.
+        pose_ns: Least time between two sets of poses, nanoseconds; 0 for none.
+        contacts: Whether to add contacts to each set of poses.
+        buffer_bytes: What may wait.
+        flush_s: Seconds after which a chunk is written even if it is not full.
+        overwrite: Whether the file may exist.
+        about: Metadata.
+    """
+
+    image_format: str
+    jpeg_quality: int
+    pose_ns: int
+    contacts: bool
+    buffer_bytes: int
+    flush_s: float
+    overwrite: bool
+    about: Mapping[str, str]
+
+
+class RecorderStats(Struct, kw_only=True, frozen=True):
+    """Counters of a recording.
+
+    Attributes:
+        states: States written.
+        frames: Pictures written.
+        dropped_states: States that found the queue full, or came after a failure.
+        dropped_frames: Likewise pictures.
+        waiting_bytes: What waits to be written, about.
+        file_bytes: Bytes written to the file.
+    """
+
+    states: int
+    frames: int
+    dropped_states: int
+    dropped_frames: int
+    waiting_bytes: int
+    file_bytes: int
+
+
+class Schedule:
+    """Says when something is due that happens at most once in each period of simulation time."""
+
+    def __init__(self, period_ns: int) -> None:
+        self._period = period_ns
+        self._slack = period_ns // 100  # times are rounded on their way
+        self._next = 0
+
+    def due(self, now: int) -> bool:
+        """Return whether it is due at `now`, nanoseconds, and wait for the next period if so."""
+        now += self._slack
+        if self._next - self._period <= now < self._next:
+            return False
+        self._next = now - now % self._period + self._period  # also when time was set back
+        return True
+
+
+@dataclass(slots=True)
+class _Clock:
+    """The recording's clock: simulation time that goes on where a reset sets it back."""
+
+    offset: int = 0
+    last: int | None = None
+    sim: int = 0
+    step: int = _FALLBACK_NS
+    episode: int = 0
+
+    def advance(self, sim: int, restarts: bool) -> int:
+        if self.last is not None and (restarts or sim < self.sim):
+            self.offset = self.last + self.step - sim
+            self.episode += 1
+        elif sim > self.sim:
+            self.step = sim - self.sim
+        self.sim, self.last = sim, self.offset + sim
+        return self.last
+
+
+class WriterThread:
+    """Writes one file. `put` may be called from one thread, `close` from any.
+
+    Args:
+        path: The file.
+        options: How to write.
+    """
+
+    def __init__(self, path: Path, options: WriterOptions) -> None:
+        self.path = path
+        self.error: OSError | RecordingError | None = None
+        self._options = options
+        self._queue: deque[tuple[State | Picture, int]] = deque()
+        # Each number has one writer, so no lock: the producer adds, the thread takes away.
+        self._put_bytes = self._taken_bytes = 0
+        self._dropped_states = self._dropped_frames = 0
+        self._file: _Counted | None = None
+        self._sink: _Sink | None = None
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="urlab-record", daemon=True)
+
+    def open(self) -> None:
+        """Create the file and start the thread.
+
+        Raises:
+            OSError: The file cannot be made, or exists already.
+        """
+        raw = io.FileIO(self.path, "wb" if self._options.overwrite else "xb")
+        self._file = _Counted(raw)
+        try:
+            self._sink = _Sink(self._file, self._options)
+        except BaseException:
+            raw.close()
+            raise
+        self._thread.start()
+
+    @property
+    def stats(self) -> RecorderStats:
+        """Counters up to now."""
+        sink, file = self._sink, self._file
+        return RecorderStats(
+            states=sink.states if sink else 0,
+            frames=sink.frames if sink else 0,
+            dropped_states=self._dropped_states,
+            dropped_frames=self._dropped_frames,
+            waiting_bytes=self._put_bytes - self._taken_bytes,
+            file_bytes=file.written if file else 0,
+        )
+
+    def put(self, item: State | Picture) -> None:
+        """Queue an item, or drop it: pictures give way at half the queue's size, so that states find room."""
+        size = _size(item)
+        limit, waiting = self._options.buffer_bytes, self._put_bytes - self._taken_bytes
+        if isinstance(item, State):
+            if self.error is not None or waiting + size > limit:
+                self._dropped_states += 1
+                return
+        elif self.error is not None or waiting + size > limit // 2:
+            self._dropped_frames += 1
+            return
+        self._put_bytes += size
+        self._queue.append((item, size))
+
+    def close(self) -> None:
+        """Write what waits, finish the file, and wait for that. Idempotent.
+
+        Raises:
+            RecordingError: Something could not be written.
+        """
+        self._stop.set()
+        self._thread.join()
+        if self.error is not None:
+            stats = self.stats
+            raise RecordingError(
+                f"{self.path}: the recording broke off: {self.error.strerror or self.error}"
+                if isinstance(self.error, OSError)
+                else str(self.error),
+                hint=f"{stats.states} states were taken over before; what was written of them can be read.",
+            ) from self.error
+
+    def _run(self) -> None:
+        sink, file = self._sink, self._file
+        if sink is None or file is None:
+            return
+        try:
+            while not self._stop.wait(_WAKE_S):
+                self._drain(sink)
+                sink.flush_if_due(self._dropped_states, self._dropped_frames)
+            self._drain(sink)
+            sink.finish(self._dropped_states, self._dropped_frames)
+        except OSError as error:
+            self._fail(error)
+        except Exception as error:  # noqa: BLE001  # whatever it was, the simulation goes on and `close` tells
+            self._fail(RecordingError(f"{self.path}: the recording broke off: {error!r}"))
+        finally:
+            with contextlib.suppress(OSError):  # a buffer that cannot be written: told already
+                file.close()
+
+    def _drain(self, sink: _Sink) -> None:
+        while self._queue:
+            item, size = self._queue.popleft()
+            sink.write(item)
+            self._taken_bytes += size
+
+    def _fail(self, error: OSError | RecordingError) -> None:
+        self.error = error
+        log.warning("%s: recording stopped: %s", self.path, error)
+        while self._queue:
+            item, size = self._queue.popleft()
+            self._taken_bytes += size
+            if isinstance(item, State):
+                self._dropped_states += 1
+            else:
+                self._dropped_frames += 1
+
+
+class _Counted(BufferedWriter):
+    """A buffered file that knows how much went through it."""
+
+    def __init__(self, raw: io.FileIO) -> None:
+        super().__init__(raw)
+        self.written = 0
+
+    def write(self, data: bytes) -> int:  # type: ignore[override]  # the writer passes bytes only
+        """Count and write."""
+        self.written += len(data)
+        return super().write(data)
+
+
+@dataclass(slots=True)
+class _Topic:
+    channel: int
+    sequence: int = 0
+
+
+@dataclass
+class _Sink:
+    """Encodes items and writes them. All of it happens in the writing thread, apart from making it."""
+
+    file: _Counted
+    options: WriterOptions
+    states: int = 0
+    frames: int = 0
+    _clock: _Clock = field(default_factory=_Clock)
+    _schemas: dict[type[Struct], int] = field(default_factory=dict[type[Struct], int])
+    _topics: dict[tuple[str, str], _Topic] = field(default_factory=dict[tuple[str, str], _Topic])
+    _scene: Scene | None = None
+    _simulation: Simulation | None = None
+    _reported: tuple[int, int] = (0, 0)
+    _dirty_since: float | None = None
+
+    def __post_init__(self) -> None:
+        self._poses = Schedule(self.options.pose_ns)
+        self._writer = Writer(self.file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._writer.start(profile="", library=f"urlab-client {version('urlab-client')}")
+        started = datetime.now(UTC).isoformat(timespec="milliseconds")
+        self._writer.add_metadata("urlab", {"format": FORMAT, "started": started, **self.options.about})
+        self.file.flush()
+
+    def write(self, item: State | Picture) -> None:
+        """Write one item."""
+        if isinstance(item, State):
+            self._write_state(item)
+        else:
+            self._write_picture(item)
+
+    def flush_if_due(self, dropped_states: int, dropped_frames: int) -> None:
+        """Write the chunk if its oldest message is old enough, so that a crash costs no more than that."""
+        self._report(dropped_states, dropped_frames)
+        now = time.monotonic()
+        if self._dirty_since is not None and now - self._dirty_since >= self.options.flush_s:
+            self._writer.flush()
+            self._dirty_since = None
+
+    def finish(self, dropped_states: int, dropped_frames: int) -> None:
+        """Write the rest, the index and the summary."""
+        self._report(dropped_states, dropped_frames)
+        totals = {
+            "states": self.states,
+            "frames": self.frames,
+            "dropped_states": dropped_states,
+            "dropped_frames": dropped_frames,
+        }
+        self._writer.flush()  # metadata stands outside of chunks, and would come before the last one
+        self._writer.add_metadata("urlab.end", {name: str(count) for name, count in totals.items()})
+        self._writer.finish()
+        self.file.flush()
+
+    def _write_state(self, item: State) -> None:
+        reply = item.reply
+        if item.scene is not self._scene:
+            self._use(item.scene)
+        now = self._clock.advance(item.nanoseconds, item.restarts)
+        stamp, wall, clock = Time.of(now), Time.of(item.wall_ns), self._clock
+        for key, state in reply.per_articulation.items():
+            names = item.scene.names.get(key)
+            message = ArticulationMessage(
+                timestamp=stamp,
+                sim_time=reply.time,
+                sample=self.states,
+                step=reply.step,
+                episode=clock.episode,
+                wall_time=wall,
+                qpos=state.qpos.tolist(),
+                qvel=state.qvel.tolist(),
+                set_points=item.set_points.get(key, []),
+                ctrl=values(state.ctrl),
+                act=values(state.act),
+                sensors=state.sensors or {},
+            )
+            self._add(f"/state/{key}", message, now, item.wall_ns, to_metadata(names) if names else {})
+        entities: Mapping[str, EntityState] = {}
+        if isinstance(reply, StepOk | StateSnapshot):
+            entities = reply.entities or {}
+        for name, entity in entities.items():
+            pose = EntityMessage(
+                timestamp=stamp,
+                sim_time=reply.time,
+                sample=self.states,
+                step=reply.step,
+                episode=clock.episode,
+                position=list(entity.xpos),
+                orientation=list(entity.xquat),
+                qvel=values(entity.qvel),
+            )
+            self._add(f"/entity/{name}", pose, now, item.wall_ns, {})
+        self.states += 1
+        if self._simulation is not None and (self._poses.due(now) or item.restarts):
+            self._simulation.take(reply.per_articulation, entities, forces=self.options.contacts)
+            self._write_derived(self._simulation, now, item.wall_ns)
+
+    def _write_derived(self, simulation: Simulation, now: int, wall_ns: int) -> None:
+        stamp = Time.of(now)
+        self._add("/tf", FrameTransforms(simulation.transforms(stamp)), now, wall_ns, {})
+        joints = simulation.joints()
+        if joints:
+            self._add("/joint_states", JointStates(stamp, joints), now, wall_ns, {})
+        if self.options.contacts:
+            self._add("/contacts", ContactsMessage(stamp, simulation.contacts()), now, wall_ns, {})
+
+    def _write_picture(self, item: Picture) -> None:
+        clock, camera = self._clock, item.camera
+        sim = clock.sim if item.nanoseconds is None else item.nanoseconds
+        now = max(0, clock.offset + sim)
+        stamp, topic = Time.of(now), f"/camera/{camera.name}"
+        pixels = (
+            decode_camera(item.frame.data, camera.view.mode, item.frame.width, item.frame.height).pixels
+            if isinstance(item.frame, CameraFrame)
+            else item.frame
+        )
+        height, width = pixels.shape[:2]
+        if pixels.dtype == np.float32:
+            depths = np.ascontiguousarray(pixels, "<f4").tobytes()
+            message: Struct = RawImage(stamp, camera.name, width, height, "32FC1", 4 * width, depths)
+        else:
+            lossy = camera.view.mode == CameraMode.REAL and self.options.image_format == "jpeg"
+            message = CompressedImage(
+                stamp, camera.name, self._compressed(pixels, camera, lossy), "jpeg" if lossy else "png"
+            )
+        metadata = {"mode": str(camera.view.mode)}
+        self._add(topic, message, now, item.wall_ns, metadata)
+        self._add(f"{topic}/calibration", calibration(camera, stamp), now, item.wall_ns, {})
+        self.frames += 1
+
+    def _compressed(self, pixels: Pixels, camera: CameraLayout, lossy: bool) -> bytes:
+        target = io.BytesIO()
+        if camera.view.mode == CameraMode.REAL:
+            image = Image.fromarray(np.ascontiguousarray(pixels[..., :3]))
+        else:
+            image = Image.fromarray(np.ascontiguousarray(pixels[..., [2, 1, 0, 3]]))
+        if lossy:
+            image.save(target, "JPEG", quality=self.options.jpeg_quality)
+        else:
+            image.save(target, "PNG", compress_level=1)
+        return target.getvalue()
+
+    def _use(self, scene: Scene) -> None:
+        self._scene = scene
+        wanted = scene.model is not None and self.options.pose_ns > 0
+        self._simulation = Simulation(scene, scene.model) if wanted and scene.model is not None else None
+
+    def _report(self, dropped_states: int, dropped_frames: int) -> None:
+        if (dropped_states, dropped_frames) != self._reported:
+            before, self._reported = self._reported, (dropped_states, dropped_frames)
+            now = self._clock.last or 0
+            gap = GapMessage(Time.of(now), dropped_states - before[0], dropped_frames - before[1])
+            self._add("/recording/gaps", gap, now, time.time_ns(), {})
+
+    def _add(self, name: str, message: Struct, now: int, wall_ns: int, metadata: dict[str, str]) -> None:
+        topic = self._topics.get((name, metadata.get("layout", "")))
+        if topic is None:
+            topic = self._register(name, type(message), metadata)
+        self._writer.add_message(topic.channel, now, encode(message), wall_ns, topic.sequence)
+        topic.sequence += 1
+        if self._dirty_since is None:
+            self._dirty_since = time.monotonic()
+
+    def _register(self, name: str, kind: type[Struct], metadata: dict[str, str]) -> _Topic:
+        schema = self._schemas.get(kind)
+        if schema is None:
+            schema = self._writer.register_schema(schema_name(kind), "jsonschema", schema_of(kind))
+            self._schemas[kind] = schema
+        topic = _Topic(self._writer.register_channel(name, "json", schema, metadata))
+        self._topics[name, metadata.get("layout", "")] = topic
+        return topic
+
+
+def _size(item: State | Picture) -> int:
+    if isinstance(item, Picture):
+        return len(item.frame.data) if isinstance(item.frame, CameraFrame) else item.frame.nbytes
+    states = item.reply.per_articulation.values()
+    return _STATE_BYTES * (1 + sum(1 for _ in states)) + sum(8 * (len(s.qpos) + len(s.qvel)) for s in states)

@@ -1,0 +1,463 @@
+"""Recordings of real robots: what the client saw is in the file, also after a crash, and stepping never waits."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import json
+import math
+import os
+import resource
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import hypothesis
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+import urlab_client
+from urlab_client.aio import URLabClient as AsyncClient
+from urlab_client.integrations.record import RecordingError, Run, read_run, record
+from urlab_client.integrations.record import writer as writing
+from urlab_client.integrations.record.messages import (
+    ArticulationMessage,
+    CameraCalibration,
+    CompressedImage,
+    FrameTransforms,
+    JointStates,
+    RawImage,
+    Time,
+    encode,
+    schema_of,
+)
+from urlab_client.integrations.record.reader import _state
+from urlab_client.server import SimulatedServer
+
+# Fields of Foxglove's schemas of these names.
+FOXGLOVE = {
+    CompressedImage: {"timestamp", "frame_id", "data", "format"},
+    RawImage: {"timestamp", "frame_id", "width", "height", "encoding", "step", "data"},
+    FrameTransforms: {"transforms"},
+    JointStates: {"timestamp", "joints"},
+    CameraCalibration: {"timestamp", "frame_id", "width", "height", "distortion_model", "D", "K", "R", "P"},
+}
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[SimulatedServer]:
+    with SimulatedServer("quadruped", "arm", play=True) as made:
+        yield made
+
+
+@pytest.fixture
+def client(server: SimulatedServer) -> Iterator[urlab_client.URLabClient]:
+    with urlab_client.URLabClient(**server.client_options(), step_mode="direct") as made:
+        made.discover()
+        made.reset()
+        yield made
+
+
+def messages(path: Path) -> list[tuple[str, str, int, dict[str, Any]]]:
+    """Topic, schema, log time and content of each message, as another MCAP reader sees them."""
+    with path.open("rb") as file:
+        found = make_reader(file).iter_messages(log_time_order=False)
+        return [(c.topic, s.name if s else "", m.log_time, json.loads(m.data)) for s, c, m in found]
+
+
+def bits(values: Any) -> bytes:
+    return np.asarray(values, dtype=np.float64).tobytes()
+
+
+def watch(client: Any, seen: list[dict[str, Any]]) -> None:
+    seen.append(
+        {
+            "time": client.sim_time,
+            "step": client.step_count,
+            **{
+                f"{key}/{field}": bits(values)
+                for key, art in client.articulations.items()
+                for field, values in (
+                    ("qpos", art.qpos_array),
+                    ("qvel", art.qvel_array),
+                    ("ctrl", art.last_applied_ctrl),
+                    ("set_points", art.ctrl_array),
+                    ("sensors", np.concatenate([*art.get_sensors().values()])),
+                )
+            },
+        }
+    )
+
+
+def assert_equal_to(run: Run, seen: list[dict[str, Any]]) -> None:
+    table = run.table()
+    assert len(table) == len(seen)
+    for row, expected in enumerate(seen):
+        assert table.sim_time[row] == expected["time"]
+        assert table.step[row] == expected["step"]
+        for name in expected.keys() - {"time", "step"}:
+            assert bits(table.columns[name].values[row]) == expected[name], (row, name)
+
+
+def test_the_file_holds_to_the_bit_what_the_client_saw(client: urlab_client.URLabClient, tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    seen: list[dict[str, Any]] = []
+    with record(client, tmp_path / "run.mcap") as recorder:
+        for i in range(120):
+            for art in client.articulations.values():
+                art.ctrl_array[:] = rng.uniform(-0.3, 0.3, len(art.ctrl_array))
+            if i == 60:
+                client.reset()
+            else:
+                client.step(n_steps=2)
+            watch(client, seen)
+    assert (recorder.stats.states, recorder.stats.dropped_states) == (120, 0)
+    run = read_run(recorder.path)
+    assert_equal_to(run, seen)
+    table = run.table()
+    assert table.episode.tolist() == [0] * 60 + [1] * 60
+    assert (np.diff(table.time) > 0).all()
+    assert np.allclose(np.diff(table.time), 0.004)
+    assert (np.diff(table.wall_ns) >= 0).all()
+    assert table.columns["arm/qpos"].names[:2] == list(client.articulations["arm"].joints)[:2]
+    assert table.columns["quadruped/qpos"].names[:8] == [
+        *(f"root.{part}" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")),
+        "FL_hip",
+    ]
+    summary = run.summary()
+    assert (summary.complete, summary.episodes, summary.dropped_states) == (True, 2, 0)
+    assert summary.about["step_mode"] == "direct"
+    assert summary.topics["/state/arm"].messages == 120
+    assert summary.topics["/state/arm"].rate_hz == pytest.approx(250)
+    assert math.isclose(summary.duration_s, 0.004 * 119)
+
+
+async def test_the_async_flavour_writes_the_same(server: SimulatedServer, tmp_path: Path) -> None:
+    seen: list[dict[str, Any]] = []
+    async with AsyncClient(**server.client_options(), step_mode="direct") as client:
+        await client.discover()
+        await client.reset()
+        async with record(client, tmp_path / "run.mcap") as recorder:
+            for _ in range(30):
+                await client.step()
+                watch(client, seen)
+        await client.step()  # no longer recorded
+    assert recorder.stats.states == 30
+    assert_equal_to(read_run(recorder.path), seen)
+
+
+def test_poses_joint_states_and_contacts_are_those_of_the_state(
+    client: urlab_client.URLabClient, tmp_path: Path
+) -> None:
+    robot, arm = client.articulations["quadruped"], client.articulations["arm"]
+    client.step(n_steps=1000)
+    with record(client, tmp_path / "run.mcap", pose_hz=100, contacts=True):
+        for _ in range(20):
+            client.step(n_steps=5)
+    found = messages(tmp_path / "run.mcap")
+    kinds = {topic: schema for topic, schema, _, _ in found}
+    assert kinds["/tf"] == "foxglove.FrameTransforms"
+    assert kinds["/joint_states"] == "foxglove.JointStates"
+    poses = [content for topic, _, _, content in found if topic == "/tf"]
+    assert len(poses) == 20
+    last = {frame["child_frame_id"]: frame for frame in poses[-1]["transforms"]}
+    trunk = last[f"quadruped_{next(iter(robot.bodies))}"]
+    assert trunk["parent_frame_id"] == "world"
+    assert bits(list(trunk["translation"].values())) == bits(robot.root_pos_w)
+    assert [trunk["rotation"][axis] for axis in "wxyz"] == pytest.approx(robot.root_quat_w.tolist())
+    joints = [content for topic, _, _, content in found if topic == "/joint_states"][-1]["joints"]
+    position = {joint["name"]: joint["position"] for joint in joints}
+    for name, value in arm.get_qpos().items():
+        assert position[f"arm_{name}"] == value
+
+    with record(client, tmp_path / "contacts.mcap", contacts=True):
+        client.runtime.forward()  # the server's contacts are those of the state before the last step
+        theirs = client.runtime.get_contacts().contacts
+    (ours,) = [c["contacts"] for topic, _, _, c in messages(tmp_path / "contacts.mcap") if topic == "/contacts"]
+    assert len(ours) == len(theirs) > 3
+    for mine, other in zip(ours, theirs, strict=True):
+        assert (mine["body1"], mine["body2"]) == (other.body1, other.body2)
+        assert list(mine["position"].values()) == pytest.approx(list(other.pos), abs=1e-6)
+        assert mine["distance"] == pytest.approx(other.dist, abs=1e-6)
+    carried = sum(contact["force"]["z"] for contact in ours)
+    assert carried == pytest.approx(
+        9.81 * client.model.body_mass[[body.id for body in robot.bodies.values()]].sum(), rel=0.2
+    )
+
+
+def test_two_recordings_at_once_and_one_inside_the_other(client: urlab_client.URLabClient, tmp_path: Path) -> None:
+    with record(client, tmp_path / "a.mcap") as outer:
+        client.step()
+        with record(client, tmp_path / "b.mcap", pose_hz=0) as inner:
+            client.step()
+        client.step()
+    assert (outer.stats.states, inner.stats.states) == (3, 1)
+    assert set(read_run(inner.path).summary().topics) == {"/state/arm", "/state/quadruped"}
+
+
+def test_an_existing_file_is_not_overwritten_unasked(client: urlab_client.URLabClient, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(b"precious")
+    with pytest.raises(FileExistsError), record(client, path):
+        pass
+    assert path.read_bytes() == b"precious"
+    with record(client, path, overwrite=True):
+        client.step()
+    assert len(read_run(path).table()) == 1
+
+
+def test_a_client_closed_inside_the_block_leaves_a_whole_file(server: SimulatedServer, tmp_path: Path) -> None:
+    client = urlab_client.URLabClient(**server.client_options(), step_mode="direct")
+    client.discover()
+    with record(client, tmp_path / "run.mcap"):
+        client.step()
+        client.close()
+    assert read_run(tmp_path / "run.mcap").summary().complete
+
+
+def test_wrong_arguments_are_refused(client: urlab_client.URLabClient, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    for options in (
+        {"camera_hz": 0},
+        {"pose_hz": -1},
+        {"jpeg_quality": 100},
+        {"buffer_mib": 0},
+        {"image_format": "gif"},
+        {"cameras": "arm/wrist"},
+        {"contacts": True, "pose_hz": 0},
+    ):
+        with pytest.raises(ValueError, match=next(iter(options))):
+            record(client, path, **options)
+    with pytest.raises(KeyError, match="arm/wrist"), record(client, path, cameras=["nose"]):
+        pass
+    stranger = urlab_client.URLabClient("tcp://127.0.0.1:1")
+    with pytest.raises(urlab_client.URLabError, match="discover"), record(stranger, path):
+        pass
+    stranger.close()
+    assert not path.exists()
+
+
+# Pictures
+
+
+def test_pictures_come_when_due_and_are_those_of_the_client(client: urlab_client.URLabClient, tmp_path: Path) -> None:
+    view = client.articulations["arm"].cameras["wrist"]
+    with record(client, tmp_path / "run.mcap", cameras=["arm/wrist"], camera_hz=50, image_format="png") as recorder:
+        shots = []
+        for _ in range(20):
+            client.step(n_steps=4)
+            shots.append((client.sim_time, view.latest_frame))
+    assert recorder.stats.frames == pytest.approx(0.16 * 50, abs=1)
+    run = read_run(recorder.path)
+    assert run.cameras() == ["arm/wrist"]
+    by_time = {round(time, 9): pixels for time, pixels in shots}
+    pictures = list(run.frames("arm/wrist"))
+    assert len(pictures) == recorder.stats.frames
+    for picture in pictures:
+        assert np.array_equal(picture.pixels, by_time[round(picture.time, 9)][..., :3])
+    calibration = next(c for topic, _, _, c in messages(recorder.path) if topic == "/camera/arm/wrist/calibration")
+    assert (calibration["width"], calibration["height"]) == view.resolution
+    frames = {
+        frame["child_frame_id"]
+        for topic, _, _, content in messages(recorder.path)
+        if topic == "/tf"
+        for frame in content["transforms"]
+    }
+    assert "arm/wrist" in frames
+    with pytest.raises(KeyError, match="arm/wrist"):
+        next(run.frames("arm/nose"))
+
+
+# Live mode
+
+
+async def test_live_mode_records_every_snapshot_and_modes_may_change(tmp_path: Path) -> None:
+    with SimulatedServer("arm", play=True) as server:
+        async with AsyncClient(**server.client_options(), step_mode="live") as client:
+            await client.discover()
+            await client.runtime.set_paused(False)
+            async with record(client, tmp_path / "run.mcap") as recorder, asyncio.timeout(30):
+                while recorder.stats.states < 50:  # noqa: ASYNC110
+                    await asyncio.sleep(0.01)
+                await client.runtime.set_mode("direct")
+                await client.step()
+                first = client.sim_time
+                for _ in range(5):
+                    await client.step()
+                last = client.sim_time
+    table = read_run(recorder.path).table()
+    timestep = 0.002
+    assert np.allclose(np.diff(table.sim_time)[:40], timestep)
+    assert [time for time in table.sim_time if first <= time <= last] == pytest.approx(
+        np.linspace(first, last, 6).tolist()
+    )
+
+
+# What goes wrong
+
+CHILD = """
+import sys
+from urlab_client import URLabClient
+from urlab_client.integrations.record import record
+address, path = sys.argv[1:]
+with URLabClient(address, step_mode="direct") as client:
+    client.discover()
+    client.reset()
+    with record(client, path) as recorder:
+        while True:
+            client.step()
+            print(client.step_count, recorder.stats.states, recorder.stats.file_bytes, flush=True)
+"""
+
+
+def test_a_killed_process_leaves_what_was_written(server: SimulatedServer, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    address = f"{server.address}:{server.step_port}"
+    with subprocess.Popen([sys.executable, "-c", CHILD, address, path], stdout=subprocess.PIPE, text=True) as child:
+        guard = threading.Timer(60, child.kill)
+        guard.start()
+        assert child.stdout is not None
+        start = written = 0
+        for line in child.stdout:
+            _, _, written = map(int, line.split())
+            start = start or written
+            if written > start:  # a chunk is in the file
+                break
+        os.kill(child.pid, signal.SIGKILL)
+        child.wait()
+        guard.cancel()
+    run = read_run(path)
+    table = run.table()
+    assert len(table) > 0
+    assert table.step.tolist() == list(range(1, len(table) + 1))
+    summary = run.summary()
+    assert not summary.complete
+    assert summary.about["mujoco_version"]
+
+
+def test_a_cut_file_is_read_up_to_the_cut(client: urlab_client.URLabClient, tmp_path: Path) -> None:
+    path, cut = tmp_path / "run.mcap", tmp_path / "cut.mcap"
+    with record(client, path, pose_hz=0):
+        for _ in range(50):
+            client.step()
+    whole, table = path.read_bytes(), read_run(path).table()
+    steps = []
+    for size in sorted({8, 9, 17, *np.linspace(100, len(whole) - 1, 40, dtype=int).tolist()}):
+        cut.write_bytes(whole[:size])
+        run = read_run(cut)
+        part = run.table()
+        assert run.damage
+        steps.append(len(part))
+        assert part.step.tolist() == table.step[: len(part)].tolist()
+    assert steps == sorted(steps)
+    assert steps[-1] == 50
+    for size in (0, 7):
+        cut.write_bytes(whole[:size])
+        with pytest.raises(RecordingError, match="no MCAP file"):
+            read_run(cut)
+    cut.write_bytes(b"PK" + whole)
+    with pytest.raises(RecordingError, match="no MCAP file"):
+        read_run(cut)
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_a_full_disk_is_told_and_costs_the_simulation_nothing(
+    client: urlab_client.URLabClient, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "run.mcap"
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    recorder = record(client, path)
+    rng = np.random.default_rng(0)
+    try:
+        with pytest.raises(RecordingError, match=r"broke off: File too large.*can be read") as caught, recorder:  # noqa: PT012
+            start = recorder.stats.file_bytes
+            for _ in range(200_000):
+                for art in client.articulations.values():
+                    art.ctrl_array[:] = rng.uniform(-1, 1, len(art.ctrl_array))
+                client.step()
+                if recorder.failed:
+                    break
+                if recorder.stats.file_bytes > start and resource.getrlimit(resource.RLIMIT_FSIZE) == before:
+                    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 1000, before[1]))
+            assert recorder.failed
+            written = recorder.stats.states
+            client.step()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    cause = caught.value.__cause__
+    assert isinstance(cause, OSError)
+    assert cause.errno == errno.EFBIG
+    assert recorder.stats.states == written
+    assert recorder.stats.dropped_states > 0
+    assert "recording stopped" in caplog.text
+    run = read_run(path)
+    table = run.table()
+    assert 0 < len(table) <= written
+    assert table.step.tolist() == list(range(1, len(table) + 1))
+    assert not run.summary().complete
+
+
+def test_what_the_file_cannot_keep_up_with_is_dropped_and_counted(
+    client: urlab_client.URLabClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    going = threading.Event()
+    write: Callable[..., None] = writing._Sink.write
+
+    def slowly(self: Any, item: Any) -> None:
+        assert going.wait(30)
+        write(self, item)
+
+    monkeypatch.setattr(writing._Sink, "write", slowly)
+    with record(client, tmp_path / "run.mcap", buffer_mib=0.1) as recorder:
+        for _ in range(200):
+            client.step()
+        dropped = recorder.stats.dropped_states
+        assert recorder.stats.waiting_bytes <= 0.1 * 2**20
+        assert 100 < dropped < 200
+        going.set()
+    table, summary = read_run(recorder.path).table(), read_run(recorder.path).summary()
+    assert (len(table), summary.dropped_states) == (200 - dropped, dropped)
+    assert table.step.tolist() == list(range(1, 201 - dropped))
+
+
+# Messages
+
+FLOATS = st.floats(allow_nan=True, allow_infinity=True, width=64)
+
+
+@hypothesis.given(st.lists(FLOATS, max_size=5), FLOATS)
+def test_numbers_survive_to_the_bit(numbers: list[float], time: float) -> None:
+    message = ArticulationMessage(
+        timestamp=Time.of(1_000_000_001),
+        sim_time=time,
+        sample=0,
+        step=0,
+        episode=0,
+        wall_time=Time.of(0),
+        qpos=numbers,
+        qvel=[],
+        sensors={"null": numbers},
+    )
+    read = _state(encode(message))
+    for back in ([float(v) for v in read.qpos], [float(v) for v in read.sensors["null"]]):
+        assert len(back) == len(numbers)
+        for got, expected in zip(back, numbers, strict=True):
+            assert bits(got) == bits(expected) or (math.isnan(got) and math.isnan(expected))
+    assert json.loads(encode(message))["timestamp"] == {"sec": 1, "nsec": 1}
+
+
+@pytest.mark.parametrize(("kind", "fields"), FOXGLOVE.items(), ids=lambda value: getattr(value, "__name__", ""))
+def test_schemas_are_foxgloves_and_hold_no_references(kind: type, fields: set[str]) -> None:
+    text = schema_of(kind)
+    schema = json.loads(text)
+    assert schema["title"] == f"foxglove.{kind.__name__}"
+    assert set(schema["properties"]) == fields
+    assert b"$ref" not in text
+    if "data" in fields:
+        assert schema["properties"]["data"] == {"type": "string", "contentEncoding": "base64"}
