@@ -10,7 +10,7 @@ from threading import Lock, RLock
 from msgspec import Struct
 
 from urlab_client.aio.sources import CameraSource, StateSource
-from urlab_client.aio.transport.subscriber import Sink
+from urlab_client.aio.transport.subscriber import MessageGone, Sink
 from urlab_client.protocol.errors import ProtocolError, URLabError
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.rows import BytesLike, Pixels
@@ -179,6 +179,8 @@ class Pictures(Sink):
                 (topic, payload), self._message = self._message, None
                 try:
                     sample = self._source.decode(topic, payload)
+                except MessageGone:
+                    pass  # the one before it stays the newest
                 except ProtocolError as error:
                     self._warn(str(error))
                 else:

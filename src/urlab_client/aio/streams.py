@@ -13,7 +13,7 @@ from typing import Generic, Protocol, Self, TypeVar
 
 from urlab_client.aio.buffers import Buffer, Entry
 from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.transport.subscriber import Sink
+from urlab_client.aio.transport.subscriber import MessageGone, Sink
 from urlab_client.protocol.errors import (
     ConcurrentReadError,
     ProtocolError,
@@ -254,7 +254,8 @@ class _Channel(Sink, Generic[T]):
             item = self._source.decode(entry.topic, payload)
         except ProtocolError as error:
             entry.malformed = True
-            self._warn(str(error))
+            if not isinstance(error, MessageGone):
+                self._warn(str(error))
             return None
         item.seq, item.dropped, item.gap, item.recv_wall_time_ns = entry.seq, entry.dropped, entry.gap, entry.wall_ns
         with self._lock:

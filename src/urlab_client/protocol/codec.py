@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import base64
 import re
-from collections.abc import Callable
+from _thread import allocate_lock
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from functools import cache
 from typing import Any, TypeVar, cast
 
@@ -26,6 +28,7 @@ from urlab_client.protocol.registry import OPS
 __all__ = [
     "MAX_REPLY_BYTES",
     "MAX_REQUEST_BYTES",
+    "building",
     "check_request",
     "decode_reply",
     "encode_reply",
@@ -42,7 +45,27 @@ _BINARY_SUFFIX = "__b64__"
 R = TypeVar("R", bound=Reply)
 Buffer = bytes | bytearray | memoryview
 
+# `_thread` and not `threading`: nothing here starts threads, but clients and servers call from several.
+_BUILDING = allocate_lock()
+_BUILD_S = 1.0
+
 _OP_BY_REQUEST = {op.request: op for op in OPS.values()}
+
+
+@contextmanager
+def building() -> Generator[None]:
+    """Hold while msgspec first looks at a struct, to build a decoder or to convert.
+
+    msgspec 0.22 keeps the description of a struct while it is still being made, and another thread that takes it then
+    crashes the process. Two clients that connect at the same time from two threads are enough.
+    """
+    # Nobody builds for so long: the lock was held in the process that this one is a fork of.
+    held = _BUILDING.acquire(timeout=_BUILD_S)
+    try:
+        yield
+    finally:
+        if held:
+            _BUILDING.release()
 
 
 def op_of(request: Request[Any] | type[Request[Any]]) -> Op:
@@ -99,7 +122,8 @@ def _escape(match: re.Match[str]) -> str:
 
 @cache
 def _request_decoder(kind: type[Request[Any]]) -> msgspec.msgpack.Decoder[Request[Any]]:
-    return msgspec.msgpack.Decoder(kind, dec_hook=from_wire_array)
+    with building():
+        return msgspec.msgpack.Decoder(kind, dec_hook=from_wire_array)
 
 
 def check_request(request: Request[Any], frame: bytes) -> None:
@@ -123,10 +147,9 @@ def check_request(request: Request[Any], frame: bytes) -> None:
 @cache
 def _reply_decoder(reply: type[R]) -> msgspec.msgpack.Decoder[R | ErrorReply]:
     # Not strict: the plugin sends integers as floats.
-    return cast(
-        "msgspec.msgpack.Decoder[R | ErrorReply]",
-        msgspec.msgpack.Decoder(reply | ErrorReply, strict=False, dec_hook=from_wire_array),
-    )
+    with building():
+        decoder = msgspec.msgpack.Decoder(reply | ErrorReply, strict=False, dec_hook=from_wire_array)
+    return cast("msgspec.msgpack.Decoder[R | ErrorReply]", decoder)
 
 
 def decode_reply(op: Op, reply: type[R], frame: Buffer) -> R:
@@ -160,6 +183,7 @@ def _refusal(op: Op, answer: ErrorReply) -> Exception:
 
 def _decode_json(reply: type[R], frame: Buffer) -> R | ErrorReply:
     plain = _restore_binary(msgspec.json.decode(frame))
+    _reply_decoder(reply)  # so that `convert` finds the structs described
     return cast("R | ErrorReply", msgspec.convert(plain, reply | ErrorReply, strict=False, dec_hook=from_wire_array))
 
 

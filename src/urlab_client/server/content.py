@@ -132,6 +132,9 @@ class _Record(msgspec.Struct, frozen=True, kw_only=True):
     n_bytes: int = 0
 
 
+_RECORD: Final = msgspec.json.Decoder(_Record)
+
+
 class Compiled(msgspec.Struct, frozen=True, kw_only=True):
     """What is learnt from compiling a model; see `Blueprint` for the fields it shares.
 
@@ -511,7 +514,7 @@ def mujoco_messages() -> Generator[list[str]]:
 
 
 def _load(record: Path) -> Blueprint:
-    decoded = msgspec.json.decode(record.read_bytes(), type=_Record)
+    decoded = _RECORD.decode(record.read_bytes())
     folder = record.parent / decoded.digest
     if not (folder / "model.xml").is_file():
         raise ValueError(f"its snapshot {folder} is gone")

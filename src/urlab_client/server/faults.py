@@ -321,6 +321,10 @@ class _Named(msgspec.Struct):
     op: str = ""
 
 
+_JSON: Final = msgspec.json.Decoder(_Named)
+_MSGPACK: Final = msgspec.msgpack.Decoder(_Named)
+
+
 class Injector:
     """Applies faults to what a server's sockets receive and send."""
 
@@ -435,7 +439,7 @@ def _shut(descriptor: int) -> None:
 
 def _op_of(frame: bytes) -> str:
     try:
-        return (msgspec.json if frame[:1] == b"{" else msgspec.msgpack).decode(frame, type=_Named).op
+        return (_JSON if frame[:1] == b"{" else _MSGPACK).decode(frame).op
     except (msgspec.DecodeError, UnicodeDecodeError):
         return ""  # no request; the server will say so
 

@@ -73,6 +73,10 @@ class _Level(Struct, forbid_unknown_fields=True):
     actors: list[_Actor]
 
 
+_HEADER: Final = msgspec.json.Decoder(_Header)
+_LEVEL: Final = msgspec.json.Decoder(_Level)
+
+
 def write_level(path: Path, actors: Iterable[Actor], content: ContentRoot) -> None:
     """Write a level atomically.
 
@@ -138,12 +142,12 @@ def read_level(path: Path, content: ContentRoot, *, trusted: bool = False) -> di
     except OSError as error:
         raise LevelError(f"cannot read {path}: {error.strerror or error}") from None
     try:
-        header = msgspec.json.decode(data, type=_Header)
+        header = _HEADER.decode(data)
         if header.format != FORMAT:
             raise LevelError(f'{path} is no level: it lacks "format": "{FORMAT}"')
         if header.version != VERSION:
             raise LevelError(f"{path} has version {header.version} of the level format; this server reads {VERSION}")
-        level = msgspec.json.decode(data, type=_Level)
+        level = _LEVEL.decode(data)
     except msgspec.DecodeError as error:
         raise LevelError(f"{path} is no level: {error}") from None
     folder = path.parent.resolve()

@@ -177,6 +177,9 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     Frames: list[_Frame]
 
 
+_FILE: Final = msgspec.json.Decoder(_File)
+
+
 def encode_json(frames: Iterable[Frame]) -> bytes:
     """Return the content of a recording file."""
     # Frame by frame: one call for all of them would keep physics from running for as long as it takes.
@@ -199,7 +202,7 @@ def decode_json(content: bytes) -> list[Frame]:
     text = _text(content)
     try:
         try:
-            frames = msgspec.json.decode(text, type=_File).Frames
+            frames = _FILE.decode(text).Frames
         except msgspec.ValidationError:
             frames = _read_loosely(msgspec.json.decode(text))
     except (RecursionError, OverflowError) as error:

@@ -21,6 +21,7 @@ import numpy as np
 from msgspec import NODEFAULT, UNSET, Struct, inspect
 
 from urlab_client.protocol.base import Op, Request
+from urlab_client.protocol.codec import building
 from urlab_client.protocol.registry import OPS
 from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
@@ -107,10 +108,11 @@ class RequestReader:
                 exact = cast("type[Request[Any]]", _strict_struct(struct))
                 self._exact[exact] = op
                 strict.append(exact)
-        self._decoder: msgspec.msgpack.Decoder[Request[Any]] = msgspec.msgpack.Decoder(
-            Union[tuple(strict)],  # noqa: UP007 - a union of a run-time list
-            dec_hook=_strict_array,
-        )
+        with building():
+            self._decoder: msgspec.msgpack.Decoder[Request[Any]] = msgspec.msgpack.Decoder(
+                Union[tuple(strict)],  # noqa: UP007 - a union of a run-time list
+                dec_hook=_strict_array,
+            )
         self._collides = {kind: _collision_test(inspect.type_info(kind)) for kind in self._exact}
 
     def read(self, frame: bytes) -> Incoming:

@@ -51,6 +51,10 @@ class _Outcome(msgspec.Struct):
     subject: str = ""
 
 
+_ORDER: Final = msgspec.json.Decoder(_Order)
+_OUTCOME: Final = msgspec.json.Decoder(_Outcome)
+
+
 class _Child:
     """The process that compiles; started when needed and kept."""
 
@@ -70,7 +74,7 @@ class _Child:
                 if line:
                     if not hasattr(os, "fork"):
                         self._end()
-                    return msgspec.json.decode(line, type=_Outcome)
+                    return _OUTCOME.decode(line)
                 self._end()
         return _Outcome(refused="compilation ended without an answer: it exceeded its limits, or MuJoCo failed")
 
@@ -142,7 +146,7 @@ def _serve() -> None:
     for signum in (signal.SIGINT, signal.SIGTERM):
         signal.signal(signum, signal.SIG_IGN)  # Ctrl-C is for the server, which ends this process
     for line in sys.stdin.buffer:
-        order = msgspec.json.decode(line, type=_Order)
+        order = _ORDER.decode(line)
         outcome = _fork(order) if hasattr(os, "fork") else _work(order)
         answers.write(msgspec.json.encode(outcome) + b"\n")
         answers.flush()
@@ -168,7 +172,7 @@ def _fork(order: _Order) -> _Outcome:
             os.kill(pid, signal.SIGKILL)
         status = os.waitpid(pid, 0)[1]
     if answer and in_time:
-        return msgspec.json.decode(answer, type=_Outcome)
+        return _OUTCOME.decode(answer)
     limits = order.limits
     if not in_time:
         return _Outcome(refused=f"compilation took longer than the limit model_wall_s, {limits.model_wall_s} s")

@@ -12,6 +12,7 @@ from urlab_client.aio.namespaces._base import Vector, fill, target_by
 from urlab_client.aio.namespaces._ops import RuntimeOps
 from urlab_client.aio.session import Session
 from urlab_client.aio.state import SimState
+from urlab_client.protocol.codec import building
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.messages.runtime import ContactFilter, GetContacts, SetQpos, SetSimOptions
 from urlab_client.protocol.messages.session import Forward, ForwardOk
@@ -90,7 +91,8 @@ class RuntimeNamespace(RuntimeOps):
         if unknown:
             known = ", ".join(SimOptions.__struct_fields__)
             raise TypeError(f"set_sim_options: unknown option {', '.join(unknown)}; it takes {known}")
-        options = msgspec.convert(opts, SimOptions)
+        with building():
+            options = msgspec.convert(opts, SimOptions)
         reply = await self._call(SetSimOptions(options=options), timeout)
         self._state.mirror_options(reply.options)
         return reply.options

@@ -18,7 +18,7 @@ from msgspec import Struct
 
 from urlab_client.aio.transport.mapping import Mapping
 from urlab_client.aio.transport.shm import SharedMemory
-from urlab_client.aio.transport.subscriber import Sink, Subscription, Subscriptions, client_closed
+from urlab_client.aio.transport.subscriber import MessageGone, Sink, Subscription, Subscriptions, client_closed
 from urlab_client.aio.transport.waiter import Stream
 from urlab_client.protocol import doorbell
 from urlab_client.protocol.errors import ProtocolError
@@ -84,7 +84,8 @@ class SharedPicture:
         """Make something of this picture, or of a newer one that took its place. From any thread.
 
         Raises:
-            ProtocolError: It is gone, or none could be read whole.
+            MessageGone: Its region is gone.
+            ProtocolError: None could be read whole.
         """
         return self.reader.read(take)
 
@@ -133,7 +134,7 @@ class _Reader:
                     if found is not None:
                         return found
                 raise ProtocolError(f"{self.mapping.path}: pictures come faster than they can be read.")
-        raise ProtocolError(f"{self.mapping.path}: the picture is gone.")
+        raise MessageGone(f"{self.mapping.path}: the picture is gone.")
 
     def view(self) -> tuple[Publication[memoryview], Callable[[], bool]] | None:
         """Return a live view of what is there now, and what tells whether it still is."""

@@ -26,7 +26,7 @@ from urlab_client.aio.transport.curve import SERVER_KEY_HINT, ClientKeys
 from urlab_client.protocol.errors import ClientClosed, ProtocolError, URLabError
 from urlab_client.protocol.rows import BytesLike
 
-__all__ = ["Line", "Sink", "Subscription", "Subscriptions", "client_closed"]
+__all__ = ["Line", "MessageGone", "Sink", "Subscription", "Subscriptions", "client_closed"]
 
 log = logging.getLogger("urlab_client.transport")
 
@@ -46,6 +46,10 @@ _OBSTACLES = {
 }
 # Topics differ for ever only where a server is out of its mind; then forget them.
 _REMEMBERED_TOPICS = 4096
+
+
+class MessageGone(ProtocolError):
+    """A message was overwritten or removed before anybody looked at it. Nothing is wrong with either side."""
 
 
 class Sink(ABC):
