@@ -1,0 +1,139 @@
+"""`urlab console`: a page in the browser to see and touch a simulation."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import socket
+import webbrowser
+
+from urlab_client.cli._arguments import Commands, add_keys, port
+from urlab_client.cli._failure import CommandError
+from urlab_client.cli._mujoco import import_mujoco
+
+__all__ = ["add_parser", "run"]
+
+_PORT = 8355
+
+
+class ConsoleArguments(argparse.Namespace):
+    """What the command line says."""
+
+    address: str
+    step_port: int
+    state_port: int
+    host: str
+    port: int
+    allow_host: list[str]
+    open: bool
+    server_key: str | None
+    client_key: str | None
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command to the parser."""
+    parser = commands.add_parser(
+        "console",
+        help="a page in the browser to see and touch a simulation",
+        description="Serve a page to see and touch a simulation, on this machine alone, and print a link that lets one "
+        "browser in. The page makes links for more. It ends with exit code 0 on SIGINT (Ctrl-C) and SIGTERM.",
+    )
+    parser.add_argument(
+        "address",
+        nargs="?",
+        default="tcp://localhost",
+        metavar="ADDRESS",
+        help="tcp://HOST, ipc://PATH, or sim://MODEL for a simulated server of its own, as in "
+        "'sim://arm?play&unpaused' (default: %(default)s)",
+    )
+    for name, default in (("step", 5559), ("state", 5555)):
+        parser.add_argument(
+            f"--{name}-port", type=port, default=default, metavar="PORT", help="of the server (default: %(default)s)"
+        )
+    add_keys(parser)
+    parser.add_argument("--port", type=port, default=_PORT, help="of the page; 0: any free one (default: %(default)s)")
+    parser.add_argument(
+        "--host",
+        default="127.0.0.1",
+        help="interface to bind (default: %(default)s); others need --allow-host. The page is not encrypted: put it "
+        "behind a proxy that does, or an SSH tunnel",
+    )
+    parser.add_argument(
+        "--allow-host",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="host name under which browsers reach the page, besides this machine's own; repeatable",
+    )
+    parser.add_argument("--open", action="store_true", help="open the page in the browser")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: ConsoleArguments) -> int:
+    """Serve the page until told to stop.
+
+    Raises:
+        CommandError: An option cannot be honoured, or the `web` extra is not installed.
+        OSError: The port is in use.
+    """
+    try:
+        import uvicorn  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]
+
+        from urlab_client.web import Access  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]
+    except ImportError as error:
+        raise CommandError(f"{error.name or error}: not installed; pip install 'urlab-client[web]'") from None
+    if arguments.host not in {"127.0.0.1", "::1", "localhost"} and not arguments.allow_host:
+        raise CommandError(f"--host {arguments.host}: say with --allow-host NAME how browsers reach it")
+    import_mujoco()
+    asyncio.run(_serve(arguments))
+    return 0
+
+
+async def _serve(arguments: ConsoleArguments) -> None:
+    import uvicorn  # noqa: PLC0415
+
+    from urlab_client.aio import URLabClient  # noqa: PLC0415
+    from urlab_client.web import Access, app  # noqa: PLC0415
+    from urlab_client.web.access import LOOPBACK  # noqa: PLC0415
+
+    access = Access(hosts=[*LOOPBACK, *(name.lower() for name in arguments.allow_host)])
+    try:
+        client = URLabClient(
+            arguments.address,
+            step_port=arguments.step_port,
+            state_port=arguments.state_port,
+            server_key=arguments.server_key,
+            client_key=arguments.client_key,
+        )
+    except ValueError as error:
+        raise CommandError(str(error)) from None
+    async with client:
+        with _bound(arguments.host, arguments.port) as listener:
+            name = arguments.allow_host[0] if arguments.allow_host else "127.0.0.1"
+            link = f"http://{name}:{listener.getsockname()[1]}/?token={access.invite()}"
+            config = uvicorn.Config(
+                app(client, access=access),
+                log_config=None,
+                access_log=False,
+                ws="websockets-sansio",
+                ws_max_size=1024 * 1024,
+                timeout_graceful_shutdown=1,
+                proxy_headers=False,
+                server_header=False,
+            )
+            print(f"{arguments.address} is shown at {link} (good for one browser); Ctrl-C ends it.", flush=True)
+            if arguments.open:
+                webbrowser.open(link)
+            await uvicorn.Server(config).serve(sockets=[listener])
+
+
+def _bound(host: str, number: int) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((host, number))
+    except OSError as error:
+        listener.close()
+        raise OSError(error.errno, f"port {number} of {host} cannot be used: {error.strerror}") from None
+    return listener

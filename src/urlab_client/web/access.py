@@ -1,0 +1,187 @@
+"""Who may reach the console: one-time tokens, and checks of what a browser says where a request comes from."""
+
+from __future__ import annotations
+
+import hmac
+import html
+import secrets
+from collections.abc import Collection
+from http.cookies import CookieError, SimpleCookie
+from typing import TypeAlias
+from urllib.parse import parse_qs, urlsplit
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+__all__ = ["LOOPBACK", "Access", "Guarded"]
+
+LOOPBACK = ("localhost", "127.0.0.1", "::1")
+"""Names of this machine for itself."""
+
+_SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
+_HEADERS = {
+    "content-security-policy": "default-src 'self'; img-src 'self' blob: data:; frame-ancestors 'none'; "
+    "base-uri 'none'; form-action 'self'",
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cache-control": "no-store",
+}
+_PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
+<title>URLab console</title><body><h1>{title}</h1><p>{text}</p></body></html>"""
+
+_Refusal: TypeAlias = tuple[int, str, str]
+
+
+class Access:
+    """What a request must bring.
+
+    A token is spent by the first browser or program that shows it, and gives that one a key: a cookie, or what
+    `POST /api/session` answers for use as `Authorization: Bearer KEY`.
+
+    Args:
+        hosts: Host names under which the application is reached, in lower case. Others are refused, so that a page
+            elsewhere cannot reach it under a name of its own (DNS rebinding).
+        tokens: Whether a key is needed. False is for applications that let in only whom they know anyway.
+    """
+
+    def __init__(self, *, hosts: Collection[str] = LOOPBACK, tokens: bool = True) -> None:
+        self.hosts = frozenset(hosts)
+        self.tokens = tokens
+        self.cookie = f"urlab_{secrets.token_hex(4)}"  # cookies of a host go to all its ports
+        self._tokens: set[str] = set()
+        self._keys: set[str] = set()
+
+    def invite(self) -> str:
+        """Return a new token, good for one use."""
+        token = secrets.token_urlsafe(24)
+        self._tokens.add(token)
+        return token
+
+    def admit(self, token: str) -> str | None:
+        """Spend a token: return a key, or None for one that is unknown or spent."""
+        found = _among(token, self._tokens)
+        if found is None:
+            return None
+        self._tokens.discard(found)
+        key = secrets.token_urlsafe(32)
+        self._keys.add(key)
+        return key
+
+    def key_of(self, headers: Headers) -> str | None:
+        """Return the valid key that came with a request, or None."""
+        scheme, _, value = headers.get("authorization", "").partition(" ")
+        if scheme.lower() == "bearer":
+            return _among(value.strip(), self._keys)
+        try:
+            cookie = SimpleCookie(headers.get("cookie", "")).get(self.cookie)
+        except CookieError:
+            return None
+        return None if cookie is None else _among(cookie.value, self._keys)
+
+    def refusal(self, scope: Scope) -> _Refusal | None:
+        """Return status, code and reason for refusing a request whatever its key, or None."""
+        headers = Headers(scope=scope)
+        host = headers.get("host", "")
+        if _name(host) not in self.hosts:
+            return 403, "bad_host", f"This console is not reached as {host!r}, only as {', '.join(sorted(self.hosts))}."
+        origin = headers.get("origin")
+        changes = scope["type"] == "websocket" or scope["method"] not in _SAFE
+        if origin is not None and changes and urlsplit(origin).netloc.lower() != host.lower():
+            return 403, "bad_origin", f"A page of {origin!r} may not use this console."
+        return None
+
+
+class Guarded:
+    """Lets through to an application what `Access` allows.
+
+    Args:
+        app: The application.
+        access: What a request must bring.
+    """
+
+    def __init__(self, app: ASGIApp, access: Access) -> None:
+        self._app = app
+        self._access = access
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one request, or let the application do so."""
+        if scope["type"] not in {"http", "websocket"}:
+            await self._app(scope, receive, send)
+            return
+        refused = self._access.refusal(scope)
+        if refused is None and self._access.tokens:
+            entered = self._enter(scope)
+            if entered is not None:
+                await entered(scope, receive, _with_headers(send))
+                return
+            key = self._access.key_of(Headers(scope=scope))
+            scope["urlab_key"] = key
+            if key is None and not _is_entrance(scope):
+                refused = 401, "no_key", "Open the link that `urlab console` printed; it is good for one browser."
+        if refused is None:
+            await self._app(scope, receive, _with_headers(send))
+        elif scope["type"] == "websocket":
+            await _close(receive, send)
+        else:
+            await _said(scope, refused)(scope, receive, _with_headers(send))
+
+    def _enter(self, scope: Scope) -> Response | None:
+        """Return what a browser that shows a token gets, None for any other request."""
+        if scope["type"] != "http" or scope["method"] != "GET" or _path(scope) not in {"", "/"}:
+            return None
+        token = parse_qs(scope.get("query_string", b"").decode("latin-1")).get("token")
+        if token is None:
+            return None
+        key = self._access.admit(token[0])
+        if key is None and self._access.key_of(Headers(scope=scope)) is None:
+            return _said(scope, (401, "bad_token", "This link was used before. Ask for another one."))
+        response = RedirectResponse(f"{scope.get('root_path', '')}/", status_code=303)
+        if key is not None:
+            response.set_cookie(
+                self._access.cookie, key, httponly=True, samesite="strict", secure=scope["scheme"] == "https"
+            )
+        return response
+
+
+def _among(value: str, values: set[str]) -> str | None:
+    given = value.encode()
+    return next((known for known in values if hmac.compare_digest(known.encode(), given)), None)
+
+
+def _name(host: str) -> str:
+    try:
+        return urlsplit(f"//{host}").hostname or ""
+    except ValueError:
+        return ""
+
+
+def _path(scope: Scope) -> str:
+    return str(scope["path"]).removeprefix(scope.get("root_path", ""))
+
+
+def _is_entrance(scope: Scope) -> bool:
+    return scope["type"] == "http" and scope["method"] == "POST" and _path(scope) == "/api/session"
+
+
+def _said(scope: Scope, refusal: _Refusal) -> Response:
+    status, code, text = refusal
+    if "text/html" in Headers(scope=scope).get("accept", ""):
+        return HTMLResponse(_PAGE.format(title="The door is closed", text=html.escape(text)), status)
+    return JSONResponse({"error": {"code": code, "message": text}}, status)
+
+
+async def _close(receive: Receive, send: Send) -> None:
+    await receive()
+    await send({"type": "websocket.close", "code": 4403, "reason": "refused"})
+
+
+def _with_headers(send: Send) -> Send:
+    async def guarded(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            headers = MutableHeaders(scope=message)
+            for name, value in _HEADERS.items():
+                headers.setdefault(name, value)
+        await send(message)
+
+    return guarded

@@ -1,0 +1,372 @@
+"""The Starlette application: the page, the HTTP API and the WebSockets."""
+
+from __future__ import annotations
+
+import contextlib
+import secrets
+import time
+from collections.abc import AsyncGenerator, Awaitable, Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import anyio
+import msgspec
+from msgspec import Struct
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.requests import HTTPConnection, Request
+from starlette.responses import FileResponse, Response
+from starlette.routing import Mount, Route, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from urlab_client.protocol.errors import (
+    OutcomeUnknown,
+    URLabConnectionError,
+    URLabError,
+    URLabRPCError,
+    URLabTimeoutError,
+)
+from urlab_client.web.access import Access, Guarded
+from urlab_client.web.desk import Audience, Desk
+from urlab_client.web.lease import Lease, NotDriving, Viewer
+from urlab_client.web.ops import encode, openapi, parse, served
+
+if TYPE_CHECKING:
+    from urlab_client.aio import URLabClient
+
+__all__ = ["app"]
+
+_STATIC = Path(__file__).parent / "static"
+_LARGEST_BODY = 1024 * 1024
+_PICTURE_S = 5.0
+_AHEAD = 2  # states or pictures on their way to a browser that has not said that they came
+_VIEWER = "x-urlab-viewer"
+
+_Handler: TypeAlias = Callable[[Request], Awaitable[Response]]
+
+
+def app(client: URLabClient, *, access: Access | None = None, lease_seconds: float = 20.0) -> Starlette:
+    """Make the application. It opens the client's session while its lifespan runs, and closes nothing at its end.
+
+    To mount it in another application, enter `site.router.lifespan_context(site)` in that one's lifespan.
+
+    Args:
+        client: An async client of the loop that serves. The application reads set-points and state from it as any
+            other part of a program may.
+        access: Who may come in; default: whoever brings a token of `site.state.access.invite()`, on this machine.
+        lease_seconds: How long a viewer keeps the controls without using them.
+    """
+    access = access or Access()
+    site = _Site(Desk(client, Lease(lease_seconds)), access)
+
+    @contextlib.asynccontextmanager
+    async def lifespan(_: Starlette) -> AsyncGenerator[None]:
+        async with site.desk.open():
+            yield
+
+    application = Starlette(routes=site.routes(), middleware=[Middleware(Guarded, access=access)], lifespan=lifespan)
+    application.state.access = access
+    application.state.desk = site.desk
+    return application
+
+
+class _Run(Struct):
+    running: bool
+
+
+class _Steps(Struct):
+    n_steps: int = 1
+
+
+class _Token(Struct):
+    token: str
+
+
+class _Message(Struct):
+    """What a browser says over its WebSocket."""
+
+    type: str
+    seq: int = 0
+    at: float = 0.0
+    name: str = ""
+    values: dict[str, dict[str, float]] = {}
+
+
+class _Site:
+    def __init__(self, desk: Desk, access: Access) -> None:
+        self.desk = desk
+        self._access = access
+        self._viewers: dict[str, Viewer] = {}
+
+    def routes(self) -> list[Route | WebSocketRoute | Mount]:
+        def route(path: str, handler: _Handler, *methods: str) -> Route:
+            return Route(path, _answering(handler), methods=list(methods or ["GET"]))
+
+        return [
+            route("/", self._page),
+            route("/api/openapi.json", self._openapi),
+            route("/api/world", self._world),
+            route("/api/status", self._status),
+            route("/api/state", self._state),
+            route("/api/log", self._log),
+            route("/api/ops/{op}", self._op, "POST"),
+            route("/api/ctrl", self._ctrl, "POST"),
+            route("/api/run", self._run, "POST"),
+            route("/api/step", self._step, "POST"),
+            route("/api/lease", self._lease, "POST", "DELETE"),
+            route("/api/connection", self._connection, "POST"),
+            route("/api/invitations", self._invite, "POST"),
+            route("/api/session", self._enter, "POST"),
+            route("/api/cameras/{path:path}.jpg", self._picture),
+            WebSocketRoute("/api/live", self._live),
+            WebSocketRoute("/api/cameras/{path:path}/live", self._pictures),
+            Mount("/static", StaticFiles(directory=_STATIC)),
+        ]
+
+    async def _page(self, request: Request) -> Response:
+        return FileResponse(_STATIC / "index.html")
+
+    async def _openapi(self, request: Request) -> Response:
+        return _json(openapi())
+
+    async def _world(self, request: Request) -> Response:
+        return _json(encode(self.desk.world))
+
+    async def _status(self, request: Request) -> Response:
+        return _json(encode(self.desk.status(self._viewer(request))))
+
+    async def _state(self, request: Request) -> Response:
+        if self.desk.state_json is None:
+            return _error(503, "no_state", "No state has arrived yet.", "Is play running?")
+        return _json(self.desk.state_json)
+
+    async def _log(self, request: Request) -> Response:
+        return _json(encode(list(self.desk.entries)))
+
+    async def _op(self, request: Request) -> Response:
+        op = served(request.path_params["op"])
+        if op is None:
+            return _error(404, "unknown_op", f"There is no op {request.path_params['op']!r} here.", "See openapi.json.")
+        body = await _body(request)
+        return _json(encode(await self.desk.do(self._viewer(request), parse(op, body))))
+
+    async def _ctrl(self, request: Request) -> Response:
+        values = msgspec.json.decode(await _body(request), type=dict[str, dict[str, float]])
+        self.desk.set_points(self._viewer(request), values)
+        return _json(b"{}")
+
+    async def _run(self, request: Request) -> Response:
+        await self.desk.run(self._viewer(request), msgspec.json.decode(await _body(request), type=_Run).running)
+        return _json(b"{}")
+
+    async def _step(self, request: Request) -> Response:
+        steps = msgspec.json.decode(await _body(request) or b"{}", type=_Steps)
+        return _json(encode(await self.desk.step(self._viewer(request), steps.n_steps)))
+
+    async def _lease(self, request: Request) -> Response:
+        viewer = self._viewer(request)
+        if request.method == "POST":
+            self.desk.lease.use(viewer)
+        else:
+            self.desk.lease.release(viewer)
+        self.desk.tell()
+        return _json(encode(self.desk.status(viewer)))
+
+    async def _connection(self, request: Request) -> Response:
+        self.desk.lease.use(self._viewer(request))
+        self.desk.take_back()
+        return _json(b"{}")
+
+    async def _invite(self, request: Request) -> Response:
+        token = self._access.invite()
+        return _json(encode({"token": token, "path": f"{request.scope.get('root_path', '')}/?token={token}"}))
+
+    async def _enter(self, request: Request) -> Response:
+        key = self._access.admit(msgspec.json.decode(await _body(request), type=_Token).token)
+        if key is None:
+            return _error(401, "bad_token", "This token is unknown, or was used before.")
+        return _json(encode({"key": key}))
+
+    async def _picture(self, request: Request) -> Response:
+        feed = self.desk.feed(request.path_params["path"])
+        if feed is None:
+            return _error(404, "unknown_camera", f"There is no camera {request.path_params['path']!r}.")
+        async with feed.watch():
+            with anyio.move_on_after(_PICTURE_S):
+                picture = await feed.after(0)
+                return Response(picture.jpeg, media_type="image/jpeg")
+        return _error(503, "no_picture", "The camera has sent no picture yet.", "Cameras send while physics runs live.")
+
+    # WebSockets
+
+    async def _live(self, socket: WebSocket) -> None:
+        await socket.accept()
+        viewer = Viewer(secrets.token_urlsafe(16), self._new_name())
+        self._viewers[viewer.key] = viewer
+        one = Audience(viewer)
+        flow = _Flow()
+        self.desk.audience.add(one)
+        self.desk.tell()
+        try:
+            await socket.send_json({"type": "you", "viewer": viewer.key, "name": viewer.name})
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(self._send, socket, one, flow)
+                with contextlib.suppress(WebSocketDisconnect):
+                    await self._listen(socket, one, flow)
+                tasks.cancel_scope.cancel()
+        finally:
+            self.desk.audience.discard(one)
+            self.desk.lease.release(viewer)
+            del self._viewers[viewer.key]
+            self.desk.tell()
+
+    async def _send(self, socket: WebSocket, one: Audience, flow: _Flow) -> None:
+        desk = self.desk
+        world = state = line = -1
+        status = b""
+        with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # gone; the listener ends the rest
+            while True:
+                one.changed.clear()
+                if world != desk.world.version:
+                    world = desk.world.version
+                    await socket.send_text(desk.world_json.decode())
+                now = encode(desk.status(one.viewer))
+                if now != status:
+                    status = now
+                    await socket.send_text(now.decode())
+                news = [entry for entry in desk.entries if entry.n > line]
+                if news:
+                    line = news[-1].n
+                    await socket.send_text(encode({"type": "log", "entries": news}).decode())
+                if desk.state_json is not None and state != desk.state_seq and flow.sent - flow.acknowledged < _AHEAD:
+                    state = desk.state_seq
+                    flow.sent += 1
+                    await socket.send_text(desk.state_json.decode())
+                await one.changed.wait()
+
+    async def _listen(self, socket: WebSocket, one: Audience, flow: _Flow) -> None:
+        while True:
+            text = await socket.receive_text()
+            try:
+                message = msgspec.json.decode(text, type=_Message)
+                match message.type:
+                    case "ack":
+                        flow.acknowledged += 1
+                        one.changed.set()
+                    case "ping":
+                        await socket.send_json({"type": "pong", "at": message.at, "now": _now_ms()})
+                    case "name":
+                        one.viewer.name = " ".join(message.name.split())[:24] or one.viewer.name
+                        self.desk.tell()
+                    case "ctrl":
+                        self.desk.set_points(one.viewer, message.values)
+                    case _:
+                        raise ValueError(f"there is no message of type {message.type!r}")  # noqa: TRY301 - answered
+            except (NotDriving, ValueError, KeyError, msgspec.MsgspecError) as error:
+                await socket.send_text(encode({"type": "refused", "error": _explain(error)[1]}).decode())
+
+    async def _pictures(self, socket: WebSocket) -> None:
+        feed = self.desk.feed(socket.path_params["path"])
+        await socket.accept()
+        if feed is None:
+            await socket.close(4404, "no such camera")
+            return
+        flow = _Flow()
+        async with feed.watch(), anyio.create_task_group() as tasks:
+
+            async def send() -> None:
+                seq = 0
+                with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+                    while True:
+                        while flow.sent - flow.acknowledged >= _AHEAD:
+                            flow.changed = anyio.Event()
+                            await flow.changed.wait()
+                        picture = await feed.after(seq)
+                        seq = picture.seq
+                        flow.sent += 1
+                        await socket.send_bytes(picture.frame())
+
+            tasks.start_soon(send)
+            with contextlib.suppress(WebSocketDisconnect):
+                while True:
+                    await socket.receive_text()
+                    flow.acknowledged += 1
+                    flow.changed.set()
+            tasks.cancel_scope.cancel()
+
+    # Viewers
+
+    def _viewer(self, request: HTTPConnection) -> Viewer:
+        """Return who asks: a page that watches, or whoever has the key."""
+        found = self._viewers.get(request.headers.get(_VIEWER, ""))
+        return found or Viewer(f"key:{request.scope.get('urlab_key')}", "a program")
+
+    def _new_name(self) -> str:
+        taken = {viewer.name for viewer in self._viewers.values()}
+        return next(name for n in range(1, len(taken) + 2) if (name := f"Viewer {n}") not in taken)
+
+
+class _Flow:
+    """How much is on its way to a browser."""
+
+    def __init__(self) -> None:
+        self.sent = self.acknowledged = 0
+        self.changed = anyio.Event()
+
+
+def _now_ms() -> float:
+    return time.time() * 1e3
+
+
+def _answering(handler: _Handler) -> _Handler:
+    """Turn what a handler raises into an answer."""
+
+    async def answer(request: Request) -> Response:
+        try:
+            return await handler(request)
+        except (NotDriving, URLabError, ValueError, TypeError, KeyError) as error:
+            status, said = _explain(error)
+            return _json(encode({"error": said}), status)
+
+    return answer
+
+
+def _explain(error: Exception) -> tuple[int, dict[str, Any]]:
+    """Return the status and what is said of an error."""
+    hint = (getattr(error, "hint", None) or "") if isinstance(error, URLabError) else ""
+    text = error.args[0] if isinstance(error, URLabError) and error.args else str(error)
+    match error:
+        case NotDriving():
+            status, code = 423, "not_driving"
+        case URLabRPCError():
+            status, code = 409, error.code
+            text = error.message
+        case URLabTimeoutError():
+            status, code = 504, "timeout"
+        case OutcomeUnknown():
+            status, code = 502, "outcome_unknown"
+        case URLabConnectionError():
+            status, code = 503, "unreachable"
+        case URLabError():
+            status, code = 502, "failed"
+        case _:
+            status, code = 400, "bad_request"
+    return status, {"code": code, "message": str(text), "hint": hint}
+
+
+async def _body(request: Request) -> bytes:
+    body = bytearray()
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > _LARGEST_BODY:
+            raise ValueError(f"a body is at most {_LARGEST_BODY} bytes")
+    return bytes(body)
+
+
+def _json(body: bytes, status: int = 200) -> Response:
+    return Response(body, status, media_type="application/json")
+
+
+def _error(status: int, code: str, message: str, hint: str = "") -> Response:
+    return _json(encode({"error": {"code": code, "message": message, "hint": hint}}), status)

@@ -1,0 +1,204 @@
+"""The registry's ops over HTTP: requests from JSON, and the OpenAPI document that describes them."""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any, cast
+
+import msgspec
+import numpy as np
+
+from urlab_client.protocol.base import Op, Request, Timing
+from urlab_client.protocol.codec import from_wire_array
+from urlab_client.protocol.messages.runtime import (
+    ConfigureController,
+    ConfigureControllerOk,
+    SetMode,
+    SetModeOk,
+    SetSimOptions,
+    SetSimOptionsOk,
+)
+from urlab_client.protocol.messages.session import Forward, Hello, Reset
+from urlab_client.protocol.messages.sim import BeginPie, BeginPieOk, StopPie, StopPieOk
+from urlab_client.protocol.registry import OPS
+
+if TYPE_CHECKING:
+    from urlab_client.aio import URLabClient, URLabController
+
+__all__ = ["encode", "openapi", "parse", "perform", "served"]
+
+_UNSERVED = frozenset({Hello})  # the application holds the session
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return cast("np.ndarray[Any, Any]", value).tolist()
+    if isinstance(value, np.generic):
+        return cast("np.generic[Any]", value).item()
+    raise TypeError(f"{type(value).__name__} has no JSON form")
+
+
+_encoder = msgspec.json.Encoder(enc_hook=_plain)
+
+
+def encode(value: object) -> bytes:
+    """Return JSON; arrays become lists, binary values base64 text."""
+    return _encoder.encode(value)
+
+
+def served(name: str) -> Op | None:
+    """Return the op of that name, None if it is not served."""
+    op = OPS.get(name)
+    return None if op is None or op.request in _UNSERVED else op
+
+
+def parse(op: Op, body: bytes) -> Request[Any]:
+    """Make a request of its JSON.
+
+    Raises:
+        ValueError: It does not fit the op's declaration.
+    """
+    try:
+        request = msgspec.json.decode(body or b"{}", type=op.request, dec_hook=from_wire_array)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise ValueError(f"{op.name}: {error}") from None
+    request.session_id = ""
+    return request
+
+
+async def perform(client: URLabClient, request: Request[Any]) -> object:
+    """Send a request, through the client's own method where that also takes over what follows from the reply."""
+    reply: object
+    match request:
+        case SetMode(mode=mode):
+            previous = client.step_mode
+            reply = SetModeOk(previous_mode=previous, current_mode=await client.runtime.set_mode(mode))
+        case BeginPie(level_path=level, timeout_s=limit):
+            result = await client.sim.start(level, timeout_s=limit, raise_on_failure=False)
+            reply = BeginPieOk(state=result.state, compile_error=result.compile_error)
+        case StopPie():
+            await client.sim.stop()
+            reply = StopPieOk()
+        case ConfigureController(articulation=key, params=params) if controller := _controller(client, key):
+            reply = ConfigureControllerOk(articulation=key, params=await controller.configure(**params))
+        case SetSimOptions(options=options):
+            given = msgspec.to_builtins(options)
+            reply = SetSimOptionsOk(options=await client.runtime.set_sim_options(**given))
+        case Reset(keyframe_name=name, seed=seed, per_articulation_qpos=overrides):
+            reply = await client.reset(name, seed, overrides)
+        case Forward():
+            reply = await client.runtime.forward()
+        case _:
+            reply = await client.call(request)
+    return reply
+
+
+def _controller(client: URLabClient, key: str) -> URLabController | None:
+    art = client.articulations.get(key)
+    return None if art is None else art.controller
+
+
+@cache
+def openapi() -> bytes:
+    """Return the OpenAPI 3.1 document of the whole HTTP API."""
+    ops = [op for op in OPS.values() if op.request not in _UNSERVED]
+    structs = [struct for op in ops for struct in (op.request, op.reply)]
+    _, components = msgspec.json.schema_components(
+        structs, schema_hook=_array_schema, ref_template="#/components/schemas/{name}"
+    )
+    for op in ops:
+        properties = components[op.request.__name__]["properties"]
+        for name in ("op", "session_id"):
+            properties.pop(name, None)
+        components[op.request.__name__].pop("required", None)
+        if op.required:
+            components[op.request.__name__]["required"] = list(op.required)
+    components["Error"] = _ERROR
+    security: list[dict[str, list[str]]] = [{"key": []}]
+    return encode(
+        {
+            "openapi": "3.1.0",
+            "info": {"title": "URLab console", "version": version("urlab-client")},
+            "components": {
+                "schemas": components,
+                "securitySchemes": {"key": {"type": "http", "scheme": "bearer"}},
+            },
+            "security": security,
+            "paths": {**_PATHS, **{f"/api/ops/{op.name}": {"post": _operation(op)} for op in ops}},
+        }
+    )
+
+
+def _operation(op: Op) -> dict[str, Any]:
+    doc = (op.request.__doc__ or "").strip()
+    drives = op.effect is not Timing.READ
+    note = "\n\nNeeds the controls: 423 while another viewer has them." if drives else ""
+    return {
+        "operationId": op.name,
+        "tags": [op.ns or "client"],
+        "summary": doc.partition("\n")[0],
+        "description": doc + note + (f"\n\nOwn error codes: {', '.join(op.errors)}." if op.errors else ""),
+        "requestBody": {"content": {"application/json": {"schema": _ref(op.request.__name__)}}},
+        "responses": {"200": _answer(op.reply.__name__, "Success."), "default": _answer("Error", "What went wrong.")},
+    }
+
+
+def _ref(name: str) -> dict[str, str]:
+    return {"$ref": f"#/components/schemas/{name}"}
+
+
+def _answer(schema: str, text: str) -> dict[str, Any]:
+    return {"description": text, "content": {"application/json": {"schema": _ref(schema)}}}
+
+
+def _array_schema(kind: type) -> dict[str, Any]:
+    return {"type": "array", "items": {"type": "number"}}  # arrays are the one type that msgspec does not know
+
+
+_ERROR = {
+    "type": "object",
+    "properties": {
+        "error": {
+            "type": "object",
+            "properties": {
+                "code": {"type": "string", "description": "The server's code, or one of this application."},
+                "message": {"type": "string"},
+                "hint": {"type": "string"},
+            },
+            "required": ["code", "message"],
+        }
+    },
+    "required": ["error"],
+}
+
+
+def _path(method: str, name: str, summary: str, **more: Any) -> dict[str, Any]:
+    return {
+        method: {
+            "operationId": name,
+            "tags": ["console"],
+            "summary": summary,
+            "responses": {"200": {"description": "Success."}, "default": _answer("Error", "What went wrong.")},
+            **more,
+        }
+    }
+
+
+_PATHS: dict[str, Any] = {
+    "/api/world": _path("get", "world", "Articulations, joints with ranges, actuators, sensors, cameras."),
+    "/api/status": _path("get", "status", "Connection, play, modes, who drives."),
+    "/api/state": _path("get", "state", "The newest state."),
+    "/api/log": _path("get", "log", "The latest calls, errors and events."),
+    "/api/ctrl": _path("post", "ctrl", "Set set-points: `{articulation: {actuator: value}}`. Needs the controls."),
+    "/api/run": _path("post", "run", "Let physics run or stop it: `{running: bool}`. Everybody may stop it."),
+    "/api/step": _path("post", "step_many", "Step in direct mode: `{n_steps: int}`. Needs the controls."),
+    "/api/lease": {
+        **_path("post", "take_controls", "Take the controls, or keep them."),
+        **_path("delete", "release_controls", "Give the controls back."),
+    },
+    "/api/connection": _path("post", "connect", "Open a session again, after another program took the server over."),
+    "/api/invitations": _path("post", "invite", "Make a token for one more browser or program."),
+    "/api/session": _path("post", "enter", "Spend a token for a key: `{token: str}`.", security=[]),
+    "/api/cameras/{articulation}/{camera}.jpg": _path("get", "picture", "The newest picture of a camera."),
+}

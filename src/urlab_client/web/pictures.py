@@ -1,0 +1,158 @@
+"""Pictures of the cameras for browsers: one stream and one encoder per camera, however many watch."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import io
+import time
+from collections.abc import AsyncGenerator
+from typing import TYPE_CHECKING, Any
+
+import anyio
+import anyio.to_thread
+import msgspec
+import numpy as np
+from PIL import Image
+
+from urlab_client.protocol.enums import CameraMode, StepMode
+from urlab_client.protocol.errors import URLabError, URLabTimeoutError
+from urlab_client.protocol.messages.streams import CameraSample
+
+if TYPE_CHECKING:
+    from urlab_client.aio import URLabCameraView, URLabClient
+
+__all__ = ["Feed", "Picture", "jpeg"]
+
+_FASTEST_S = 1 / 30
+_LOOK_S = 0.5
+_QUALITY = 80
+
+
+class Picture:
+    """One encoded picture.
+
+    Attributes:
+        seq: Number among the pictures of its feed.
+        received_ns: When it reached this process, UTC in nanoseconds.
+        jpeg: The encoded bytes.
+        head: What the browser is told about it.
+    """
+
+    def __init__(self, seq: int, received_ns: int, sim_time: float | None, mode: str, encoded: bytes) -> None:
+        self.seq = seq
+        self.received_ns = received_ns
+        self.jpeg = encoded
+        self.head = msgspec.json.encode({"seq": seq, "received": received_ns / 1e6, "sim_time": sim_time, "mode": mode})
+
+    def frame(self) -> bytes:
+        """Return length of the head (4 bytes, little-endian), head, and JPEG."""
+        return len(self.head).to_bytes(4, "little") + self.head + self.jpeg
+
+
+class Feed:
+    """The newest picture of one camera, encoded once; receives only while somebody watches.
+
+    Args:
+        client: The client.
+        view: The camera.
+
+    Attributes:
+        newest: The newest picture, or None.
+        view: The camera.
+    """
+
+    def __init__(self, client: URLabClient, view: URLabCameraView) -> None:
+        self.newest: Picture | None = None
+        self._client = client
+        self.view = view
+        self._watchers = 0
+        self._changed = asyncio.Condition()
+        self._task: asyncio.Task[None] | None = None
+        self._seq = 0
+        self._last: Any = None
+
+    @property
+    def watched(self) -> bool:
+        """Whether somebody watches."""
+        return self._watchers > 0
+
+    @contextlib.asynccontextmanager
+    async def watch(self) -> AsyncGenerator[Feed]:
+        """Keep it going while somebody watches."""
+        self._watchers += 1
+        if self._task is None:
+            self._task = asyncio.create_task(self._run(), name="urlab-web-camera")
+        try:
+            yield self
+        finally:
+            self._watchers -= 1
+            if not self._watchers:
+                await self._stop()
+
+    async def _stop(self) -> None:
+        task, self._task = self._task, None
+        if task is not None:
+            task.cancel()
+            await asyncio.wait((task,))
+
+    async def after(self, seq: int) -> Picture:
+        """Return the newest picture once it is newer than number `seq`."""
+        async with self._changed:
+            while self.newest is None or self.newest.seq <= seq:
+                await self._changed.wait()
+            return self.newest
+
+    async def _run(self) -> None:
+        while True:
+            try:
+                async with self.view.frames("latest") as frames:
+                    while True:
+                        began = time.monotonic()
+                        if self._client.step_mode is StepMode.LIVE:
+                            with contextlib.suppress(URLabTimeoutError):
+                                await self._take(await frames.receive(timeout=_LOOK_S))
+                        else:
+                            await self._take_from_replies()
+                        await anyio.sleep(max(0.0, began + _FASTEST_S - time.monotonic()))
+            except URLabError:
+                await anyio.sleep(_LOOK_S)  # the connection is being restored; the log says so
+
+    async def _take(self, sample: CameraSample) -> None:
+        await self._publish(sample.pixels, sample.recv_wall_time_ns, sample.sim_time)
+
+    async def _take_from_replies(self) -> None:
+        pixels = self.view.latest_frame
+        if pixels is not None and pixels is not self._last:
+            self._last = pixels
+            await self._publish(pixels, time.time_ns(), self.view.sim_time)
+
+    async def _publish(self, pixels: Any, received_ns: int, sim_time: float | None) -> None:
+        mode = str(self.view.mode)
+        encoded = await anyio.to_thread.run_sync(jpeg, pixels, mode, abandon_on_cancel=True)
+        self._seq += 1
+        async with self._changed:
+            self.newest = Picture(self._seq, received_ns, sim_time, mode, encoded)
+            self._changed.notify_all()
+
+
+def jpeg(pixels: Any, mode: str) -> bytes:
+    """Encode a camera's pixels; depth becomes grey, near is bright."""
+    if mode == CameraMode.DEPTH:
+        image = Image.fromarray(_grey(np.asarray(pixels)))
+    elif mode == CameraMode.REAL:
+        image = Image.fromarray(np.ascontiguousarray(pixels[..., :3]))
+    else:
+        image = Image.fromarray(np.ascontiguousarray(pixels[..., 2::-1]))
+    buffer = io.BytesIO()
+    image.save(buffer, "JPEG", quality=_QUALITY)
+    return buffer.getvalue()
+
+
+def _grey(depth: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    seen = depth[np.isfinite(depth)]
+    if not seen.size:
+        return np.zeros(depth.shape, np.uint8)
+    near, far = np.percentile(seen, [1, 95])
+    share = np.clip((far - np.nan_to_num(depth, posinf=far, neginf=near)) / max(far - near, 1e-6), 0, 1)
+    return (share * 255).astype(np.uint8)
