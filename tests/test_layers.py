@@ -20,7 +20,8 @@ ALLOWED: dict[str, frozenset[str]] = {
     "enums": frozenset({"protocol"}),
     "": frozenset({"sync", "enums", "protocol"}),
     "integrations": frozenset({"", "aio", "enums", "keys", "protocol", "server", "sync"}),
-    "cli": frozenset({"", "aio", "enums", "integrations", "keys", "protocol", "server", "sync"}),
+    "web": frozenset({"aio", "protocol"}),
+    "cli": frozenset({"", "aio", "enums", "integrations", "keys", "protocol", "server", "sync", "web"}),
     "__main__": frozenset({"cli"}),
 }
 

@@ -1,0 +1,161 @@
+// The bar at the top: connection, age, time, play and stop, modes, who drives.
+
+import { $, duration, h, number, text, toast } from "./dom.js";
+import { ask, clock, on, op } from "./link.js";
+
+export const now = { status: null, state: null, socket: false };
+const ui = {};
+
+const LINKS = {
+  connected: "Connected",
+  connecting: "Connecting",
+  lost: "Server lost",
+  silent: "No reply",
+  taken_over: "Taken over",
+};
+
+export const run = (running) => ask("POST", "api/run", { running });
+export const step = (n) => ask("POST", "api/step", { n_steps: n });
+export const reset = (keyframe) => op("reset", keyframe ? { keyframe_name: keyframe } : {});
+export const drive = () =>
+  now.status?.mine ? ask("DELETE", "api/lease") : ask("POST", "api/lease");
+
+export function toggleRun() {
+  if (now.status) run(!now.status.running);
+}
+
+async function restartPlay() {
+  await op("stop_pie");
+  const answer = await op("begin_pie");
+  if (answer?.compile_error) toast(answer.compile_error);
+}
+
+async function invite() {
+  const answer = await ask("POST", "api/invitations", {});
+  if (!answer) return;
+  const link = new URL(answer.path, location.href).href;
+  try {
+    await navigator.clipboard.writeText(link);
+    toast("A link for one more browser is on the clipboard.", "good");
+  } catch {
+    toast(`For one more browser: ${link}`, "good");
+  }
+}
+
+export function makeBar() {
+  ui.link = h("span", { class: "pill link", id: "link" }, "Connecting");
+  ui.address = h("span", { class: "address" });
+  ui.age = h("b", { id: "age" }, "–");
+  ui.time = h("b", { id: "time" }, "–");
+  ui.rate = h("b", {}, "–");
+  ui.play = h("button", { class: "primary", id: "play", title: "Let physics run or stop it (space)", onclick: toggleRun }, "▶ Play");
+  ui.stop = h("button", { class: "danger", id: "stop", title: "Stop physics; everybody may (escape)", onclick: () => run(false) }, "■ Stop");
+  ui.steps = h("input", { id: "steps", type: "number", min: 1, max: 10000, value: 10, title: "Steps at a time", "aria-label": "Steps at a time" });
+  ui.step = h("button", { id: "step", title: "Step, in mode direct (.)", onclick: () => step(+ui.steps.value || 1) }, "Step");
+  ui.keyframe = h("select", { id: "keyframe", "aria-label": "Keyframe" }, h("option", { value: "" }, "start"));
+  ui.reset = h("button", { id: "reset", title: "Reset to the start or a keyframe (r)", onclick: () => reset(ui.keyframe.value) }, "Reset to");
+  ui.mode = h("select", { id: "mode", "aria-label": "Step mode", onchange: () => op("set_mode", { mode: ui.mode.value }) },
+    ...["live", "direct", "puppet"].map((mode) => h("option", {}, mode)));
+  ui.source = h("select", { id: "source", "aria-label": "Control source", title: "Whose set-points drive: those of this protocol, or of the editor's panel",
+    onchange: () => ui.source.value && op("set_control_source", { source: ui.source.value }) },
+    h("option", { value: "", hidden: true }, "–"), h("option", { value: "zmq" }, "zmq"), h("option", { value: "ui" }, "ui"));
+  ui.speed = h("input", { id: "speed", type: "range", min: 5, max: 100, step: 5, value: 100, "aria-label": "Speed, percent of real time",
+    onchange: () => op("set_sim_speed", { percent: +ui.speed.value }), oninput: () => text(ui.speedText, `${ui.speed.value} %`) });
+  ui.speedText = h("span", { class: "num" }, "100 %");
+  ui.driver = h("span", { id: "driver", class: "pill" });
+  ui.drive = h("button", { id: "drive", title: "Take the controls, or give them back (d)", onclick: drive }, "Take the controls");
+  ui.restart = h("button", { title: "Begin play, or begin again", onclick: restartPlay }, "Restart play");
+
+  $("bar").append(
+    h("div", { class: "row" },
+      h("span", { class: "brand" }, h("img", { src: "static/icon.svg", alt: "", width: 24, height: 24 }), "URLab"),
+      ui.link, ui.address,
+      h("span", { class: "facts" },
+        h("span", { title: "How old what you see is" }, "age ", ui.age),
+        h("span", { title: "Simulation time" }, "time ", ui.time),
+        h("span", { title: "Simulation time per real time" }, "pace ", ui.rate)),
+      h("span", { class: "space" }),
+      ui.driver, ui.drive,
+      h("button", { class: "quiet", title: "A link for one more browser", onclick: invite }, "Invite"),
+      h("button", { class: "quiet", title: "Keys (?)", "aria-label": "Keys", onclick: () => $("help").showModal() }, "?")),
+    h("div", { class: "row controls" },
+      ui.play, ui.stop,
+      h("span", { class: "group" }, ui.step, ui.steps),
+      h("span", { class: "group" }, ui.reset, ui.keyframe),
+      h("label", {}, "mode ", ui.mode),
+      h("label", {}, "control ", ui.source),
+      h("label", { class: "speed" }, "speed ", ui.speed, ui.speedText),
+      ui.restart));
+
+  on("open", () => { now.socket = true; });
+  on("closed", () => { now.socket = false; banner(); });
+  on("status", (status) => { now.status = status; show(status); banner(); });
+  on("state", (state) => { now.state = state; });
+  on("world", async ({ world }) => {
+    const answer = world.playing ? await op("list_keyframes", {}, { quiet: true }) : null;
+    ui.keyframe.replaceChildren(h("option", { value: "" }, "start"),
+      ...(answer?.keyframes ?? []).filter((key) => key.name).map((key) => h("option", {}, key.name)));
+  });
+  setInterval(() => {
+    if (now.state) {
+      const age = Date.now() + clock.offset - now.state.made;
+      text(ui.age, duration(age));
+      ui.age.classList.toggle("old", age > 1000);
+      text(ui.time, `${now.state.time.toFixed(2)} s`);
+    }
+    if (!now.socket || now.status?.link.state !== "connected") banner();
+  }, 200);
+}
+
+function show(status) {
+  document.body.dataset.link = status.link.state;
+  document.body.classList.toggle("watching", !status.mine && status.driver !== null);
+  text(ui.link, LINKS[status.link.state]);
+  text(ui.address, status.address);
+  text(ui.rate, status.moving ? `${status.rate.toFixed(2)}×` : "stopped");
+  text(ui.play, status.running ? "❚❚ Pause" : "▶ Play");
+  ui.play.disabled = !status.playing;
+  ui.step.disabled = ui.steps.disabled = status.mode !== "direct";
+  if (document.activeElement !== ui.mode) ui.mode.value = status.mode;
+  if (document.activeElement !== ui.source) ui.source.value = status.source ?? "";
+  if (document.activeElement !== ui.speed && status.speed !== null) {
+    ui.speed.value = status.speed;
+    text(ui.speedText, `${Math.round(status.speed)} %`);
+  }
+  const others = status.viewers > 1 ? ` · ${status.viewers} watch` : "";
+  text(ui.driver, status.driver === null ? `nobody drives${others}`
+    : status.mine ? `you drive · ${Math.ceil(status.lease_left)} s${others}`
+    : `${status.driver} drives · ${Math.ceil(status.lease_left)} s${others}`);
+  ui.driver.dataset.who = status.mine ? "me" : status.driver === null ? "free" : "other";
+  text(ui.drive, status.mine ? "Release" : "Take the controls");
+  ui.drive.disabled = !status.mine && status.driver !== null;
+  text(ui.restart, status.playing ? "Restart play" : "Begin play");
+}
+
+function banner() {
+  const link = now.status?.link;
+  const box = $("banner");
+  let said = null;
+  let button = null;
+  if (!now.socket) {
+    said = "The console itself does not answer. Trying again.";
+  } else if (link && link.state !== "connected") {
+    const since = duration(Date.now() + clock.offset - link.since * 1000);
+    const shown = now.state ? " What you see is the last that came." : "";
+    if (link.state === "taken_over") {
+      said = `Another program has taken the server over, ${since} ago. You still see what it does.`;
+      button = h("button", { onclick: () => ask("POST", "api/connection", {}) }, "Take it back");
+    } else {
+      said = `No connection to the server for ${since}: ${link.reason || "trying"}. Trying again.${shown}`;
+    }
+  } else if (now.status && !now.status.playing) {
+    said = "No play session runs.";
+    button = h("button", { onclick: restartPlay }, "Begin play");
+  }
+  document.body.classList.toggle("stale", !now.socket || (link && !["connected", "taken_over"].includes(link.state)));
+  box.hidden = said === null;
+  if (said !== null && box.dataset.said !== said) {
+    box.dataset.said = said;
+    box.replaceChildren(h("span", {}, said), ...(button ? [button] : []));
+  } else if (said === null) delete box.dataset.said;
+}

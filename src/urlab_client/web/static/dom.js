@@ -1,0 +1,41 @@
+// Making and finding elements, and writing numbers.
+
+/** Make an element: attributes, listeners (`onclick`), properties (`.value`), children. */
+export function h(tag, attributes = {}, ...children) {
+  const element = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
+    else if (name.startsWith(".")) element[name.slice(1)] = value;
+    else if (value === true) element.setAttribute(name, "");
+    else if (value !== false && value != null) element.setAttribute(name, value);
+  }
+  element.append(...children.flat().filter((child) => child != null));
+  return element;
+}
+
+export const $ = (id) => document.getElementById(id);
+
+/** Change text only when it differs: the page is written to sixty times a second. */
+export function text(element, value) {
+  if (element.textContent !== value) element.textContent = value;
+}
+
+/** A number in at most `width` characters, with the sign's place kept. */
+export function number(value, digits = 3) {
+  if (value == null || !Number.isFinite(value)) return "–";
+  const shown = Math.abs(value) < 0.5 * 10 ** -digits ? 0 : value;
+  return (shown < 0 ? "−" : "\u2007") + Math.abs(shown).toFixed(digits);
+}
+
+export function duration(ms) {
+  if (ms < 1000) return `${Math.max(0, Math.round(ms))} ms`;
+  if (ms < 60000) return `${(ms / 1000).toFixed(1)} s`;
+  return `${Math.floor(ms / 60000)} min ${Math.round((ms % 60000) / 1000)} s`;
+}
+
+export function toast(message, kind = "error") {
+  const box = h("div", { class: `toast ${kind}` }, message);
+  $("toasts").append(box);
+  setTimeout(() => box.remove(), 6000);
+  while ($("toasts").children.length > 4) $("toasts").firstChild.remove();
+}

@@ -1,0 +1,105 @@
+// The connection to the console: one WebSocket that comes back by itself, and calls over HTTP.
+
+import { toast } from "./dom.js";
+
+const base = new URL(".", document.baseURI);
+const listeners = new Map();
+
+export const me = { viewer: "", name: "" };
+export const clock = { offset: 0, best: Infinity };
+let socket = null;
+let pause = 250;
+
+/** Call `listener` with each message of that type; `open` and `closed` are the connection's own. */
+export function on(type, listener) {
+  if (!listeners.has(type)) listeners.set(type, []);
+  listeners.get(type).push(listener);
+}
+
+function tell(type, message) {
+  for (const listener of listeners.get(type) ?? []) listener(message);
+}
+
+export function socketAt(path) {
+  const url = new URL(path, base);
+  url.protocol = url.protocol.replace("http", "ws");
+  return new WebSocket(url);
+}
+
+export function connect() {
+  socket = socketAt("api/live");
+  socket.onopen = () => {
+    pause = 250;
+    clock.best = Infinity;
+    ping();
+    tell("open");
+  };
+  socket.onmessage = (event) => {
+    const message = JSON.parse(event.data);
+    if (message.type === "state") {
+      // The console sends the next state once this one was drawn: a slow browser sees fewer, not older ones.
+      requestAnimationFrame(() => send({ type: "ack" }));
+    } else if (message.type === "you") {
+      me.viewer = message.viewer;
+      me.name = message.name;
+    } else if (message.type === "pong") {
+      const now = Date.now();
+      const trip = now - message.at;
+      if (trip <= clock.best) Object.assign(clock, { best: trip, offset: message.now - (now - trip / 2) });
+    } else if (message.type === "refused") {
+      toast(message.error.message);
+    }
+    tell(message.type, message);
+  };
+  socket.onclose = () => {
+    tell("closed");
+    setTimeout(connect, pause);
+    pause = Math.min(pause * 1.7, 4000);
+  };
+}
+
+export function send(message) {
+  if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message));
+}
+
+function ping() {
+  send({ type: "ping", at: Date.now() });
+}
+setInterval(ping, 5000);
+
+/** Ask over HTTP; a failure becomes a toast and null. */
+export async function ask(method, path, body, { quiet = false } = {}) {
+  let answer;
+  try {
+    answer = await fetch(new URL(path, base), {
+      method,
+      headers: { "x-urlab-viewer": me.viewer, "content-type": "application/json" },
+      body: body === undefined ? undefined : JSON.stringify(body),
+    });
+  } catch {
+    if (!quiet) toast("The console does not answer.");
+    return null;
+  }
+  const said = await answer.json().catch(() => ({}));
+  if (answer.ok) return said;
+  if (!quiet) toast([said.error?.message ?? answer.statusText, said.error?.hint].filter(Boolean).join(" "));
+  return null;
+}
+
+export const op = (name, body = {}, options) => ask("POST", `api/ops/${name}`, body, options);
+
+const pending = new Map();
+let scheduled = false;
+
+/** Set a set-point; the newest of each goes out with the next picture of the screen. */
+export function setPoint(articulation, actuator, value) {
+  if (!pending.has(articulation)) pending.set(articulation, {});
+  pending.get(articulation)[actuator] = value;
+  if (scheduled) return;
+  scheduled = true;
+  requestAnimationFrame(() => {
+    scheduled = false;
+    send({ type: "ctrl", values: Object.fromEntries(pending) });
+    pending.clear();
+  });
+}

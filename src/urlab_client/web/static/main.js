@@ -1,0 +1,41 @@
+// The console: puts the page together and listens to the keyboard.
+
+import { drive, makeBar, now, reset, run, step, toggleRun } from "./bar.js";
+import { makeCameras } from "./cameras.js";
+import { $, h } from "./dom.js";
+import { connect } from "./link.js";
+import { makeLog } from "./log.js";
+import { makeRecording } from "./recording.js";
+import { makeRobots } from "./robots.js";
+import { makeContacts, makeScene } from "./scene.js";
+import { makeSensors } from "./sensors.js";
+
+const KEYS = [
+  [" ", "space", "play or pause", toggleRun],
+  ["Escape", "esc", "stop", () => run(false)],
+  [".", ".", "step (mode direct)", () => now.status?.mode === "direct" && step(+$("steps").value || 1)],
+  ["r", "r", "reset", () => reset($("keyframe").value)],
+  ["d", "d", "take the controls, or give them back", drive],
+  ["?", "?", "this", () => $("help").showModal()],
+];
+
+for (const make of [makeBar, makeCameras, makeSensors, makeRobots, makeScene, makeRecording, makeContacts, makeLog]) make();
+
+$("help").append(h("h2", {}, "Keys"),
+  h("dl", {}, ...KEYS.flatMap(([, shown, what]) => [h("dt", {}, h("kbd", {}, shown)), h("dd", {}, what)]),
+    h("dt", {}, h("kbd", {}, "← →")), h("dd", {}, "move the slider that has the focus"),
+    h("dt", {}, h("kbd", {}, "w a s d")), h("dd", {}, "twist, while the pad has the focus")),
+  h("form", { method: "dialog" }, h("button", {}, "Close")));
+
+document.addEventListener("keydown", (event) => {
+  if (event.ctrlKey || event.metaKey || event.altKey || event.repeat || $("help").open) return;
+  const field = event.target.closest("input:not([type=range]), select, textarea");
+  const button = event.key === " " && event.target.closest("button, summary");
+  if ((field || button) && event.key !== "Escape") return;
+  const found = KEYS.find(([key]) => key === event.key);
+  if (!found) return;
+  event.preventDefault();
+  found[3]();
+});
+
+connect();

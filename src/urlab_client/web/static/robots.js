@@ -1,0 +1,144 @@
+// Articulations: joint positions against their ranges, actuator sliders, gains, commanded twist.
+
+import { $, h, number, text } from "./dom.js";
+import { on, op, setPoint } from "./link.js";
+
+let robots = [];
+const GAINS = ["kp", "kv", "torque_limit"];
+const UNITS = { hinge: "rad", slide: "m" };
+
+function share(value, [low, high]) {
+  return Math.min(1, Math.max(0, (value - low) / (high - low || 1)));
+}
+
+class Robot {
+  constructor(art) {
+    this.key = art.key;
+    this.rows = [];
+    const joints = art.joints.filter((joint) => joint.kind === "hinge" || joint.kind === "slide");
+    const driven = new Set(art.actuators.map((actuator) => actuator.joint));
+    this.element = h("section", { class: "card robot", "data-robot": art.key },
+      h("h2", {}, art.key, h("span", { class: "tag" }, `${art.joints.length} joints · ${art.actuators.length} actuators`)),
+      art.actuators.length ? h("div", { class: "table actuators" }, art.actuators.map((actuator) => this.actuator(actuator, art))) : null,
+      fold("Joints", joints.some((joint) => !driven.has(joint.name)) && !art.actuators.length,
+        h("div", { class: "table" }, joints.map((joint) => this.joint(joint)))),
+      art.controller && GAINS.some((gain) => gain in art.controller.params) ? fold("Gains", false, this.gains(art)) : null,
+      art.joints.some((joint) => joint.kind === "free") ? fold("Commanded twist", false, this.twist()) : null);
+  }
+
+  actuator(actuator, art) {
+    const range = actuator.range ?? [-1, 1];
+    const joint = art.joints.find((one) => one.name === actuator.joint);
+    const follows = joint && (actuator.kind === "position" || art.controller);
+    const step = (range[1] - range[0]) / 1000;
+    const slider = h("input", { type: "range", min: range[0], max: range[1], step, value: 0, "data-actuator": actuator.name,
+      "aria-label": `${actuator.name} set-point`, title: "Set-point; double-click: middle of the range" });
+    const mark = h("i", { class: "mark", title: "Where the joint is" });
+    const shown = h("span", { class: "num", "data-value": actuator.name });
+    let held = 0;
+    const set = () => {
+      held = performance.now();
+      setPoint(this.key, actuator.name, +slider.value);
+    };
+    slider.addEventListener("input", set);
+    slider.addEventListener("dblclick", () => { slider.value = (range[0] + range[1]) / 2; set(); });
+    this.rows.push((state) => {
+      const target = state.targets?.[actuator.index] ?? state.ctrl?.[actuator.index];
+      if (target != null && performance.now() - held > 700 && document.activeElement !== slider) slider.value = target;
+      if (held && performance.now() - held > 700 && target != null && !slider.matches(":active")) slider.value = target;
+      const where = follows ? state.qpos?.[joint.index] : state.ctrl?.[actuator.index];
+      mark.style.left = `${100 * share(where ?? 0, range)}%`;
+      text(shown, number(where));
+    });
+    return h("label", { class: "line" }, h("span", { class: "name", title: actuator.kind ?? "" }, actuator.name),
+      h("span", { class: "track" }, slider, mark), shown);
+  }
+
+  joint(joint) {
+    const range = joint.range;
+    const bar = h("i", { class: "mark" });
+    const shown = h("span", { class: "num", "data-joint": joint.name });
+    this.rows.push((state) => {
+      const value = state.qpos?.[joint.index];
+      text(shown, number(value));
+      if (!range || value == null) return;
+      const at = share(value, range);
+      bar.style.left = `${100 * at}%`;
+      bar.classList.toggle("limit", at < 0.02 || at > 0.98);
+    });
+    return h("div", { class: "line", title: range ? `${range[0].toFixed(3)} … ${range[1].toFixed(3)} ${UNITS[joint.kind]}` : "no limits" },
+      h("span", { class: "name" }, joint.name),
+      h("span", { class: range ? "track bar" : "track" }, range ? bar : h("small", {}, "no limits")), shown);
+  }
+
+  gains(art) {
+    const head = h("tr", {}, h("th", {}), ...GAINS.map((gain) => h("th", {}, gain.replace("_", " "))));
+    const rows = art.actuators.map((actuator) => h("tr", {}, h("th", {}, actuator.name), ...GAINS.map((gain) => {
+      const value = art.controller.params[gain]?.[actuator.name];
+      const box = h("input", { type: "number", min: 0, step: "any", value: value ?? "", "aria-label": `${gain} of ${actuator.name}`,
+        disabled: value === undefined, "data-gain": `${gain}/${actuator.name}` });
+      box.addEventListener("change", () => op("configure_controller",
+        { articulation: this.key, params: { [gain]: { [actuator.name]: +box.value } } }));
+      return h("td", {}, box);
+    })));
+    return h("table", { class: "gains" }, head, ...rows);
+  }
+
+  twist() {
+    const knob = h("i", {});
+    const pad = h("div", { class: "pad", tabindex: 0, title: "Drag: forward and turn. W A S D while it has the focus" }, knob);
+    const shown = h("span", { class: "num" }, "0 m/s · 0 rad/s");
+    let waiting = false;
+    let next = null;
+    const push = async (vx, yaw) => {
+      knob.style.left = `${50 - 45 * yaw}%`;
+      knob.style.top = `${50 - 45 * vx}%`;
+      text(shown, `${vx.toFixed(2)} m/s · ${yaw.toFixed(2)} rad/s`);
+      next = { articulation: this.key, linear: [vx, 0, 0], angular: [0, 0, yaw] };
+      if (waiting) return;
+      waiting = true;
+      while (next) {
+        const body = next;
+        next = null;
+        if ((await op("set_twist", body)) === null) next = null;
+      }
+      waiting = false;
+    };
+    const drag = (event) => {
+      const box = pad.getBoundingClientRect();
+      const clamp = (value) => Math.max(-1, Math.min(1, value));
+      push(clamp(1 - (2 * (event.clientY - box.top)) / box.height), clamp(1 - (2 * (event.clientX - box.left)) / box.width));
+    };
+    pad.addEventListener("pointerdown", (event) => { pad.setPointerCapture(event.pointerId); drag(event); });
+    pad.addEventListener("pointermove", (event) => pad.hasPointerCapture(event.pointerId) && drag(event));
+    pad.addEventListener("lostpointercapture", () => push(0, 0));
+    const keys = { w: [0.5, 0], s: [-0.5, 0], a: [0, 0.5], d: [0, -0.5] };
+    pad.addEventListener("keydown", (event) => { if (keys[event.key] && !event.repeat) { event.stopPropagation(); push(...keys[event.key]); } });
+    pad.addEventListener("keyup", (event) => keys[event.key] && push(0, 0));
+    return h("div", { class: "twist" }, pad, h("div", {}, shown, h("p", { class: "hint" },
+      "What a policy on the server reads as its command. It moves nothing by itself.")));
+  }
+
+  draw(state) {
+    for (const row of this.rows) row(state);
+  }
+}
+
+export function fold(title, open, ...content) {
+  return h("details", { open }, h("summary", {}, title), ...content);
+}
+
+export function makeRobots() {
+  on("world", ({ world }) => {
+    const open = new Set([...document.querySelectorAll(".robot details[open]")].map(place));
+    const before = document.querySelector(".robot") !== null;
+    robots = world.articulations.map((art) => new Robot(art));
+    $("robots").replaceChildren(...robots.map((robot) => robot.element));
+    if (before) for (const details of document.querySelectorAll(".robot details")) details.open = open.has(place(details));
+  });
+  on("state", (state) => {
+    for (const robot of robots) if (state.articulations[robot.key]) robot.draw(state.articulations[robot.key]);
+  });
+}
+
+const place = (details) => `${details.closest(".robot").dataset.robot}/${details.firstChild.textContent}`;

@@ -1,0 +1,85 @@
+// The level: what stands in it, spawning, moving, removing; and what touches what.
+
+import { $, h, number, text, toast } from "./dom.js";
+import { on, op } from "./link.js";
+import { fold } from "./robots.js";
+
+const actors = h("div", { class: "actors" });
+const blueprint = h("select", { "aria-label": "Blueprint", id: "blueprint" });
+const id = h("input", { placeholder: "id", "aria-label": "Actor id", id: "actor-id", size: 8 });
+const place = xyz([0, 0, 0]);
+
+function xyz(values) {
+  return values.map((value, i) => h("input", { type: "number", step: 0.1, value: +value.toFixed(3), "aria-label": "xyz"[i] }));
+}
+
+const read = (inputs) => inputs.map((input) => +input.value || 0);
+
+function done(answer) {
+  if (answer?.requires_pie_restart) toast("Done in the level. It shows after “Restart play”.", "good");
+  if (answer) refresh();
+}
+
+async function refresh() {
+  const [list, blueprints] = await Promise.all([
+    op("list_actors", {}, { quiet: true }),
+    op("list_blueprints", {}, { quiet: true }),
+  ]);
+  $("scene").classList.toggle("empty", !list);
+  if (!list) return;
+  actors.replaceChildren(...list.actors.map(row));
+  const chosen = blueprint.value;
+  blueprint.replaceChildren(...(blueprints?.blueprints ?? []).map((one) => h("option", { value: one.class_path }, one.short_name)));
+  if (chosen) blueprint.value = chosen;
+}
+
+function row(actor) {
+  const target = actor.actor_id ? { target: actor.actor_id } : { target: actor.name, target_by: "actor_name" };
+  const where = xyz(actor.location);
+  return h("div", { class: "actor", "data-actor": actor.actor_id || actor.name },
+    h("span", { class: "name", title: actor.name }, actor.actor_id || actor.name,
+      h("span", { class: "tag" }, actor.is_light ? "light" : actor.is_articulation ? "robot" : "mesh")),
+    h("span", { class: "group" }, ...where,
+      h("button", { class: "quiet", title: "Move there", onclick: async () => done(await op("set_actor_transform", { ...target, location: read(where) })) }, "move"),
+      h("button", { class: "quiet", title: "Remove from the level", onclick: async () => done(await op("destroy_actor", target)) }, "remove")));
+}
+
+async function spawn() {
+  if (!id.value) {
+    toast("Give the actor an id first.");
+    id.focus();
+    return;
+  }
+  done(await op("spawn_actor", { blueprint: blueprint.value, actor_id: id.value, location: read(place) }));
+}
+
+export function makeScene() {
+  $("scene").append(h("h2", {}, "Scene"), actors,
+    h("div", { class: "line spawn" }, blueprint, id, h("span", { class: "group" }, ...place),
+      h("button", { id: "spawn", onclick: spawn }, "Spawn")));
+  on("world", refresh);
+  on("log", ({ entries }) => {
+    if (entries.some((entry) => /^(spawn|destroy|set_actor|duplicate|load_level|create_level|import)/.test(entry.what))) refresh();
+  });
+}
+
+export function makeContacts() {
+  const list = h("div", { class: "contacts" });
+  const count = h("span", { class: "tag" });
+  const box = fold("Contacts", false, list);
+  box.firstChild.append(count);
+  $("contacts").append(box);
+  const look = async () => {
+    if (box.open && !document.hidden && !document.body.classList.contains("stale")) {
+      const answer = await op("get_contacts", { max_contacts: 32 }, { quiet: true });
+      text(count, answer ? `${answer.n_contacts}${answer.truncated ? "+" : ""}` : "");
+      list.replaceChildren(...(answer?.contacts ?? []).map((contact) => h("div", { class: "line" },
+        h("span", { class: "name" }, `${contact.geom1 || contact.body1} – ${contact.geom2 || contact.body2}`),
+        h("span", { class: "num" }, `${number(contact.force[0], 1)} N`))));
+      if (answer && !answer.n_contacts) list.replaceChildren(h("p", { class: "hint" }, "Nothing touches anything."));
+    }
+    setTimeout(look, 400);
+  };
+  box.addEventListener("toggle", () => box.open && list.childElementCount === 0 && list.append(h("p", { class: "hint" }, "Looking …")));
+  look();
+}
