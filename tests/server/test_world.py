@@ -348,7 +348,6 @@ def load(desk: Desk, level: object) -> World:
         (HEAD | {"actors": [BOX | {"mesh": {"shape": "sphere", "size": [-1]}}]}, "positive"),
         (HEAD | {"actors": [BOX | {"mesh": {"shape": "file"}}]}, "'file'"),
         (HEAD | {"actors": [BOX | {"mesh": {"shape": "plane", "size": [1, 1]}, "quick_convert": {}}]}, "static"),
-        (HEAD | {"actors": [BOX | {"quick_convert": {"complex_mesh": True}}]}, "convex decomposition"),
         (HEAD | {"actors": [{"name": "m", "kind": "manager", "quick_convert": {}}]}, "only a static mesh"),
     ],
 )
@@ -786,7 +785,6 @@ def test_only_meshes_are_converted(desk: Desk, bot: str) -> None:
 
     assert refusal(world.add_quick_convert, "a").code == code
     assert refusal(world.add_quick_convert, "nobody").code == code
-    assert refusal(world.add_quick_convert, "crate", complex_mesh=True).code == code
     assert refusal(world.add_quick_convert, "crate", friction=(math.nan, 0, 0)).code == code
     assert refusal(world.add_quick_convert, "ground").code == code
     assert world.add_quick_convert("ground", static=True).quick_convert is not None

@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, cast
 from urlab_client.cli._arguments import Commands, port
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._mujoco import import_mujoco
-from urlab_client.protocol.enums import CameraMode, ControllerKind, StepMode
+from urlab_client.protocol.controller_text import ControllerText
+from urlab_client.protocol.enums import CameraMode, StepMode
 
 if TYPE_CHECKING:
     from urlab_client.server.guard import CurveServer
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 __all__ = ["add_parser", "run"]
 
 _PORTS = {"step": 5559, "state": 5555, "ctrl": 5556, "info": 5557, "camera": 5558}
-_GAINS = ("kp", "kv", "torque_limit")
 _LARGEST_IMAGE = 16384
 
 # A lock wait on Windows does not see Ctrl-C, so there it is taken in slices.
@@ -40,8 +40,7 @@ class ControllerOption(NamedTuple):
     """`--controller ACTOR=KIND[,gain=…]`."""
 
     actor: str
-    kind: ControllerKind
-    gains: dict[str, float]
+    controller: ControllerText
 
 
 class CameraOption(NamedTuple):
@@ -323,7 +322,7 @@ def _server(arguments: ServeArguments, saved_dir: Path) -> SimulatedServer:
             camera_port=arguments.camera_port,
             saved_dir=saved_dir,
             model_roots=arguments.model_root,
-            controllers={item.actor: ControllerConfig(item.kind, **item.gains) for item in arguments.controller},
+            controllers={item.actor: ControllerConfig.of(item.controller) for item in arguments.controller},
             camera_modes={item.camera: item.mode for item in arguments.camera_mode},
             camera_size=arguments.camera_size,
             render_quality=arguments.render_quality,
@@ -391,27 +390,12 @@ def _check_paths(arguments: ServeArguments) -> None:
 
 def _controller(text: str) -> ControllerOption:
     actor, equals, value = text.partition("=")
-    kind, *gains = value.split(",")
     if not actor or not equals:
         raise argparse.ArgumentTypeError(f"{text!r}: write ACTOR=pd or ACTOR=passthrough ('*' for all actors)")
-    if kind not in [*ControllerKind]:
-        raise argparse.ArgumentTypeError(f"{text!r}: {kind!r} is no controller; there are {_names(ControllerKind)}")
-    if gains and kind != ControllerKind.PD:
-        raise argparse.ArgumentTypeError(f"{text!r}: {gains[0]!r}: a {kind} controller has no gains")
-    return ControllerOption(actor, ControllerKind(kind), dict(_gain(text, gain) for gain in gains))
-
-
-def _gain(text: str, gain: str) -> tuple[str, float]:
-    name, _, number = gain.partition("=")
-    if name not in _GAINS:
-        raise argparse.ArgumentTypeError(f"{text!r}: {gain!r} is no gain; write {', '.join(f'{n}=N' for n in _GAINS)}")
     try:
-        value = float(number)
-    except ValueError:
-        value = -1.0
-    if not 0 <= value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r}: {gain!r}: {name} is a number from 0")
-    return name, value
+        return ControllerOption(actor, ControllerText.parse(value))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r}: {error}") from None
 
 
 def _camera_mode(text: str) -> CameraOption:
@@ -433,5 +417,5 @@ def _camera_size(text: str) -> tuple[int, int]:
     raise argparse.ArgumentTypeError(f"{text!r}: write WIDTHxHEIGHT in pixels, 1 to {_LARGEST_IMAGE}, as in 640x480")
 
 
-def _names(kinds: type[ControllerKind | CameraMode]) -> str:
+def _names(kinds: type[CameraMode]) -> str:
     return ", ".join(kinds)

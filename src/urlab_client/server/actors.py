@@ -108,6 +108,7 @@ class Actor:
         mesh: Shape of a static mesh.
         quick_convert: Settings that make a static mesh a body, or None.
         parent: Name of the actor this one is attached to; may be empty.
+        controller: An articulation's controller as text, `pd,kp=80`; empty for that of its MJCF.
     """
 
     name: str
@@ -123,6 +124,7 @@ class Actor:
     mesh: Mesh | None = None
     quick_convert: QuickConvert | None = None
     parent: str = ""
+    controller: str = ""
 
     @property
     def prefix(self) -> str:

@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client.protocol.controller_text import ControllerText
 from urlab_client.protocol.enums import ControllerKind
 from urlab_client.server.scene import ArticulationIndex
 
@@ -155,6 +156,15 @@ class ControllerConfig:
     kp: float = 100.0
     kv: float = 5.0
     torque_limit: float = 200.0
+
+    def __post_init__(self) -> None:
+        # A plain string, too, is the kind of its name; anything else is a ValueError here.
+        object.__setattr__(self, "kind", ControllerKind(self.kind))
+
+    @classmethod
+    def of(cls, text: ControllerText) -> ControllerConfig:
+        """Return what a line of text describes."""
+        return cls(text.kind, **text.gains)
 
 
 @dataclass(frozen=True, slots=True)

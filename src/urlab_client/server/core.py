@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import copy
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,7 @@ from urlab_client.server.session import Session
 from urlab_client.server.viewport import Viewport
 from urlab_client.server.world import World
 
-__all__ = ["PhysicsConfig", "ServerCore"]
+__all__ = ["PhysicsConfig", "ServerCore", "strangers"]
 
 logger = logging.getLogger("urlab_client.server")
 
@@ -44,7 +44,8 @@ class PhysicsConfig:
     Attributes:
         step_mode: The mode every session is pinned to; `auto` starts live and lets clients choose.
         unpaused: Let physics run from the start.
-        controllers: Controller by actor id or articulation key; `*` stands for all others.
+        controllers: Controller by actor id or articulation key; `*` stands for all others. Before what the level or
+            the MJCF says.
         camera_modes: What a camera's pixels mean, by `ACTOR/CAMERA`, where the actor is an id or a key.
         camera_size: Width and height of cameras whose MJCF gives none, pixels.
         mjcf_options: Honour the `<option>` of the first model.
@@ -60,11 +61,11 @@ class PhysicsConfig:
     render_quality: RenderQuality = "auto"
 
     def controller(self, index: ArticulationIndex) -> ControllerConfig | None:
-        """Return the controller an articulation is to get."""
+        """Return the controller an articulation is to get: configured here, or else by the level or its MJCF."""
         for name in (index.actor_id, index.key, "*"):
             if name and name in self.controllers:
                 return self.controllers[name]
-        return None
+        return None if index.controller is None else ControllerConfig.of(index.controller)
 
     def camera_mode(self, index: ArticulationIndex, camera: str) -> CameraMode:
         """Return what the pixels of an articulation's camera mean."""
@@ -167,7 +168,8 @@ class ServerCore:
         physics = self.physics
         files = recordings(replay_folder(self.world.content.root))
         controllers = {index.key: config for index in scene.articulations if (config := physics.controller(index))}
-        _warn_of_strangers(scene, physics)
+        for problem in strangers(scene, physics):
+            logger.warning("%s", problem)
         engine = Engine(scene, pinned_mode=physics.step_mode, paused=not physics.unpaused, controllers=controllers)
         modes = {
             (index.key, camera.name): physics.camera_mode(index, camera.name)
@@ -219,16 +221,27 @@ def _kind(actor: Actor) -> str:
     return actor.class_name if mesh is None else Path(mesh.file).stem or mesh.shape
 
 
-def _warn_of_strangers(scene: Scene, physics: PhysicsConfig) -> None:
-    """Say which of the configured names fit nothing: most likely they are misspelt."""
-    names = {name for index in scene.articulations for name in (index.actor_id, index.key)}
+def strangers(scene: Scene, physics: PhysicsConfig) -> list[str]:
+    """Return what is wrong with configured names that fit nothing in a scene: most likely they are misspelt."""
+    actors = {name for index in scene.articulations for name in (index.actor_id, index.key) if name}
     cameras = {
         f"{name}/{camera.name}"
         for index in scene.articulations
         for name in (index.actor_id, index.key)
+        if name
         for camera in index.cameras
     }
-    for unknown in sorted(physics.controllers.keys() - names - {"*"}):
-        logger.warning("a controller is configured for '%s', but no articulation has that id or key", unknown)
-    for unknown in sorted(physics.camera_modes.keys() - cameras):
-        logger.warning("a camera mode is configured for '%s', but no articulation has such a camera", unknown)
+    return [
+        *(
+            f"a controller is configured for '{unknown}', but the articulations are {_listed(actors)}"
+            for unknown in sorted(physics.controllers.keys() - actors - {"*"})
+        ),
+        *(
+            f"a camera mode is configured for '{unknown}', but the cameras are {_listed(cameras)}"
+            for unknown in sorted(physics.camera_modes.keys() - cameras)
+        ),
+    ]
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(sorted(names)) or "none"

@@ -17,10 +17,12 @@ import msgspec
 from msgspec import Struct
 
 from urlab_client.protocol.base import Quat, Vec3
+from urlab_client.protocol.controller_text import ControllerText
 from urlab_client.protocol.rotation import IDENTITY, normalized
 from urlab_client.server.actors import ORIGIN, UNIT_SCALE, Actor, ActorKind, Light, Mesh, QuickConvert
 from urlab_client.server.bundled import BUNDLED_PREFIX
 from urlab_client.server.content import Blueprint, ContentRoot, sanitized, write_atomic
+from urlab_client.server.decomposition import ADVICE, is_available
 from urlab_client.server.refusal import Refusal
 
 __all__ = ["LevelError", "read_level", "write_level"]
@@ -64,6 +66,7 @@ class _Actor(Struct, forbid_unknown_fields=True, omit_defaults=True, kw_only=Tru
     mesh: Mesh | None = None
     quick_convert: QuickConvert | None = None
     parent: str = ""
+    controller: str = ""
 
 
 class _Level(Struct, forbid_unknown_fields=True):
@@ -116,6 +119,7 @@ def write_level(path: Path, actors: Iterable[Actor], content: ContentRoot) -> No
                 mesh=mesh,
                 quick_convert=actor.quick_convert,
                 parent=actor.parent,
+                controller=actor.controller,
             )
         )
     level = _Level(format=FORMAT, version=VERSION, blueprints=blueprints, actors=entries)
@@ -259,6 +263,7 @@ def _actor(entry: _Actor, folder: Path, blueprints: Mapping[str, Blueprint], con
         mesh=mesh,
         quick_convert=entry.quick_convert,
         parent=entry.parent,
+        controller=entry.controller,
     )
 
 
@@ -275,6 +280,10 @@ def _check_settings(entry: _Actor) -> None:
             raise ValueError(f"kind '{entry.kind}' {verb} a '{name}'")
     if entry.quick_convert is not None and entry.kind is not ActorKind.STATIC_MESH:
         raise ValueError("only a static mesh can have 'quick_convert'")
+    if entry.controller:
+        if entry.kind is not ActorKind.ARTICULATION:
+            raise ValueError("only an articulation can have a 'controller'")
+        ControllerText.parse(entry.controller)
     if entry.kind is ActorKind.ARTICULATION and entry.scale != UNIT_SCALE:
         raise ValueError("an articulation cannot be scaled")
     if 0.0 in entry.scale:
@@ -288,8 +297,8 @@ def _check_mesh(mesh: Mesh, convert: QuickConvert | None) -> None:
         raise ValueError("shape 'file', and no other, takes a 'file'")
     if mesh.shape == "plane" and convert is not None and not convert.static:
         raise ValueError("a plane cannot move: its 'quick_convert' must be static")
-    if convert is not None and convert.complex_mesh:
-        raise ValueError("this server has no convex decomposition: 'complex_mesh' must be false")
+    if convert is not None and convert.complex_mesh and not is_available():
+        raise ValueError(ADVICE)
 
 
 def _check_parents(path: Path, actor: Actor, actors: Mapping[str, Actor]) -> None:

@@ -22,9 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client.protocol.base import Vec3
+from urlab_client.protocol.controller_text import CUSTOM_TEXT, ControllerText
 from urlab_client.protocol.rotation import rotate, wxyz
 from urlab_client.server.actors import Actor, Mesh
 from urlab_client.server.content import Blueprint, mujoco_messages, one_line
+from urlab_client.server.decomposition import convex_parts
 
 __all__ = [
     "ArticulationIndex",
@@ -110,6 +112,7 @@ class ArticulationIndex:
         force_adr: Index into `mjData.actuator_force` of every output, in actuator order; an actuator may have several.
         actuator_types: Actuator name to MJCF element; `motor` for `<general>`.
         cameras: The cameras.
+        controller: The controller that the level or the MJCF gives it; None for none.
         original_names: Kind to (name in the model, name in the MJCF), where the two differ. They never do here.
     """
 
@@ -133,6 +136,7 @@ class ArticulationIndex:
     force_adr: Ints
     actuator_types: Mapping[str, str]
     cameras: tuple[CameraInfo, ...]
+    controller: ControllerText | None = None
     original_names: Mapping[str, Mapping[str, str]] = field(
         default_factory=lambda: {kind: {} for kind in ("actuators", "joints", "sensors", "bodies")}
     )
@@ -460,8 +464,26 @@ def _add_static_mesh(spec: mujoco.MjSpec, actor: Actor, mesh: Mesh) -> tuple[str
         body.add_freejoint(name=joint)
     name = _unique("Geom_0_0", {geom.name for geom in spec.geoms}, separator="_")
     settings = {"solref": [0.02, 1.0], "solimp": [0.9, 0.95, 0.001, 0.5, 2.0], "friction": convert.friction}
-    _add_mesh(spec, body, actor, mesh, name=name, **settings)
+    if convert.complex_mesh and mesh.shape == "file":
+        _add_parts(spec, body, actor, mesh, convert.coacd_threshold, name=name, **settings)
+    else:  # MuJoCo makes one convex hull of a mesh, and the primitives are convex
+        _add_mesh(spec, body, actor, mesh, name=name, **settings)
     return body.name, joint
+
+
+def _add_parts(
+    spec: mujoco.MjSpec, body: Any, actor: Actor, mesh: Mesh, threshold: float, *, name: str, **settings: Any
+) -> None:
+    for vertices, faces in convex_parts(Path(mesh.file), threshold):
+        part = _unique(name, {geom.name for geom in spec.geoms}, separator="_")
+        asset = spec.add_mesh(
+            name=f"{actor.prefix}{part}",
+            uservert=vertices.ravel().tolist(),
+            userface=faces.ravel().tolist(),
+            scale=actor.scale,
+        )
+        shape = {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": asset.name}
+        body.add_geom(name=part, rgba=mesh.rgba, **shape, **settings)
 
 
 def _add_mesh(spec: mujoco.MjSpec, body: Any, actor: Actor, mesh: Mesh, *, name: str, **settings: Any) -> None:
@@ -634,7 +656,18 @@ def _index(
         cameras=tuple(
             _camera(model, int(index), name, camera_size) for index, name in zip(cameras, camera_names, strict=True)
         ),
+        controller=_controller(actor, blueprint),
     )
+
+
+def _controller(actor: Actor, blueprint: Blueprint) -> ControllerText | None:
+    """Return the controller that the level gives an articulation, or else its MJCF."""
+    authored = [text.data for text in blueprint.spec.texts if text.name == CUSTOM_TEXT]
+    text = actor.controller or next(iter(authored), "")
+    try:
+        return ControllerText.parse(text) if text else None
+    except ValueError as error:
+        raise CompileFailed(f"{blueprint.stem}: custom text '{CUSTOM_TEXT}': {error}") from None
 
 
 def _joint_widths(model: mujoco.MjModel, joints: Ints) -> tuple[Ints, Ints]:

@@ -28,7 +28,7 @@ from urlab_client.server.bundled import bundled_models
 from urlab_client.server.camera_streams import CameraStreams
 from urlab_client.server.content import ContentRoot
 from urlab_client.server.controllers import ControllerConfig
-from urlab_client.server.core import PhysicsConfig, ServerCore
+from urlab_client.server.core import PhysicsConfig, ServerCore, strangers
 from urlab_client.server.dispatch import Dispatcher
 from urlab_client.server.endpoint import RpcEndpoint, connect_host, numeric_host, tcp
 from urlab_client.server.faults import Faults, FaultyEndpoint, Injector
@@ -158,7 +158,9 @@ class SimulatedServer:
             saved_dir: Folder of levels and imported models; None for a temporary one that goes when the server closes.
             model_roots: Folders below which clients may import MJCF files. None for the folders of `models`, or the
                 current folder where those name none.
-            controllers: Controller by actor id or articulation key; `*` stands for all others.
+            controllers: Controller by actor id or articulation key; `*` stands for all others. They come before the
+                level's and the MJCF's. With `play` a name that fits nothing is refused, else it is logged when play
+                starts: the actor may be spawned until then.
             camera_modes: What a camera's pixels mean, by `ACTOR/CAMERA`.
             camera_size: Width and height of cameras whose MJCF gives none, pixels; default 640 by 480.
             render_quality: `fast`, without shadows, reflections and smooth edges; `high`, with them; or `auto`: `fast`
@@ -528,6 +530,9 @@ class _Opened:
             core.begin_play()
             if core.play.wait(_NO_LIMIT) is not PIEState.READY:
                 raise ModelError(f"play cannot start: {core.play.compile_error}")
+            # Whoever starts play with the server means what is there; actors to come are for a later begin_pie.
+            for problem in strangers(core.play.running().scene, config.physics):
+                raise ModelError(problem)
         self._authored = self._mark(core)
         self._endpoint.start()
         if memory is not None:

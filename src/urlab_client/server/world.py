@@ -21,6 +21,7 @@ from urlab_client.protocol.base import Quat, Vec3
 from urlab_client.protocol.rotation import IDENTITY, euler_to_quat, normalized, swap_frame
 from urlab_client.server.actors import ORIGIN, UNIT_SCALE, Actor, ActorKind, Light, Mesh, QuickConvert
 from urlab_client.server.content import PARENT_CLASS, Blueprint, ContentRoot, level_package, sanitized
+from urlab_client.server.decomposition import ADVICE, is_available
 from urlab_client.server.level import LevelError, read_level, write_level
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.scene import CompileFailed, actor_bounds
@@ -702,21 +703,21 @@ class World:
         Args:
             target: Actor id or name.
             static: No free joint.
-            complex_mesh: Not available here.
-            coacd_threshold: Kept for listings.
+            complex_mesh: Several convex parts of a mesh file instead of one hull; needs CoACD.
+            coacd_threshold: Concavity that a part may keep.
             driven_by_unreal: Mocap body.
             friction: Sliding, torsional, rolling.
 
         Raises:
             Refusal: `missing_field`; `add_quick_convert_failed` for an unknown actor, one without a mesh, a plane that
-                is not static, a number that is not finite, or `complex_mesh`.
+                is not static, a number that is not finite, or `complex_mesh` without CoACD.
         """
         code = "add_quick_convert_failed"
         actor = self._find(target, code)
         if actor.mesh is None:
             raise Refusal(code, f"'{actor.name}' is a {actor.class_name} without a mesh of its own")
-        if complex_mesh:
-            raise Refusal(code, "this server has no convex decomposition: leave out complex_mesh for one convex hull")
+        if complex_mesh and not is_available():
+            raise Refusal(code, ADVICE)
         if actor.mesh.shape == "plane" and not static:
             raise Refusal(code, f"'{actor.name}' is a plane, which cannot move: pass static")
         _refuse_infinite((coacd_threshold, *friction), "coacd_threshold and friction", code)
