@@ -264,15 +264,16 @@ def test_without_opengl_frames_are_left_out(
 
 
 def test_a_machine_without_opengl_is_told_what_to_install(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    play: Play, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(rendering.sys, "platform", "linux")
     monkeypatch.setattr(rendering, "_PROBE", "raise SystemExit('no {name} today')")
+    monkeypatch.setattr(rendering, "_find", rendering._find.__wrapped__)
+    wire = play("drop")
     with caplog.at_level(logging.WARNING, logger="urlab_client.server"):
-        reason = rendering._find.__wrapped__("")
-    assert isinstance(reason, str)
-    (message,) = [record.message for record in caplog.records]
-    assert reason in message
+        assert "cameras" not in wire.ask("step", include_cameras={"above": "sync"})
+        assert "cameras" not in wire.ask("step", include_cameras={"above": "sync"})
+    (message,) = [record.message for record in caplog.records if "camera images" in record.message]
     assert "apt install libegl1" in message
     assert "egl: no egl today; osmesa: no osmesa today" in message
 

@@ -182,6 +182,15 @@ def test_editor_14_transform_finds_by_name_without_being_told(editor: Wire, mode
     assert editor.refused("set_actor_transform", target="") == "missing_field"
 
 
+def test_editor_14_framing_does_not(editor: Wire, models: Path) -> None:
+    name = spawn(editor, models / "bot.xml", "a")["actor_name"]
+    for key in (name, ""):
+        assert editor.refused("frame_actor", target=key) == ("unknown_actor" if key else "missing_field")
+    reply = editor.ask("frame_actor", target=name, target_by="ACTOR_NAME")
+    assert reply == editor.ask("frame_actor", target="a")
+    assert set(reply) == {"op", "location", "rotation_quat", "rotation_euler", "fov"}
+
+
 def test_editor_15_grids(editor: Wire, models: Path) -> None:
     editor.ask("import_xml", path=str(models / "bot.xml"))
     grid = {"blueprint": "/Game/MuJoCoImports/bot", "base_actor_id": "g"}
@@ -332,6 +341,51 @@ def test_editor_26_stopping_twice(editor: Wire, models: Path) -> None:
         assert editor.ask("stop_pie") == {"op": "stop_pie_ok"}
         assert editor.ask("pie_status") == {"op": "pie_status_ok", "state": "off", "compile_error": ""}
     assert editor.ask("list_actors")["in_pie"] is False
+
+
+def test_editor_27_markers(editor: Wire) -> None:
+    assert editor.refused("draw_marker", location=[0, 0, 0]) == "missing_field"
+    assert editor.ask("draw_marker", location=[0, 0, 0], color=[1]) == {"op": "draw_marker_ok"}
+    assert editor.refused("draw_marker", location=[0, 0], color=[1, 0, 0]) == "missing_field"
+
+
+def test_editor_28_overlay_text(editor: Wire) -> None:
+    assert editor.refused("set_overlay_text") == "missing_field"
+    assert editor.ask("set_overlay_text", text="") == {"op": "set_overlay_text_ok"}
+
+
+def test_editor_29_view_modes(editor: Wire) -> None:
+    assert editor.ask("set_viewport_mode", mode="WireFrame") == {"op": "set_mode_ok", "mode": "WireFrame"}
+    assert editor.refused("set_viewport_mode", mode="x") == "invalid_mode"
+    assert editor.refused("set_viewport_mode", mode="") == "missing_field"
+
+
+def test_editor_30_euler_angles_of_the_camera(editor: Wire) -> None:
+    editor.ask("set_camera", location=[1, 2, 3], rotation_euler=[0, -30, 45])
+    view = editor.ask("get_camera")
+    assert view["rotation_euler"] == pytest.approx([0, -30, 45])
+    expected = np.array([0.0990, 0.2391, -0.3696, 0.8924])
+    quat = np.array(view["rotation_quat"])
+    assert min(np.abs(quat - expected).max(), np.abs(quat + expected).max()) < 1e-4
+
+
+def test_editor_31_quaternions_of_the_camera(editor: Wire) -> None:
+    quat = [0.5, 0.1, 0.7, 0.5]
+    reply = editor.ask("set_camera", location=[0, 0, 0], rotation_quat=quat)
+    assert same_rotation(reply["rotation_quat"], [-0.5, 0.1, -0.7, 0.5])
+
+
+def test_editor_32_the_camera_needs_a_place(editor: Wire) -> None:
+    assert editor.refused("set_camera", fov=50) == "missing_field"
+    assert editor.ask("set_camera", location=[0, 0, 0], fov=50)["fov"] == 50.0
+    assert editor.ask("set_camera", location=[0, 0, 0], fov=0)["fov"] == 50.0
+
+
+def test_editor_33_untracking(editor: Wire, models: Path) -> None:
+    spawn(editor, models / "bot.xml", "a")
+    editor.ask("track_actor", target="a")
+    assert editor.ask("untrack") == {"op": "untrack_ok", "was_tracking": True}
+    assert editor.ask("untrack") == {"op": "untrack_ok", "was_tracking": False}
 
 
 @pytest.mark.parametrize("op", [op.name for op in OPS.values() if op.needs is not Needs.NOTHING])

@@ -6,7 +6,9 @@ import argparse
 from collections.abc import Callable
 from typing import Any, NoReturn, Protocol
 
-__all__ = ["Commands", "Parser", "add_keys", "count", "port", "seconds"]
+__all__ = ["Commands", "Parser", "add_keys", "count", "image_size", "port", "seconds"]
+
+_LARGEST_IMAGE = 16384
 
 
 class Parser(argparse.ArgumentParser):
@@ -50,6 +52,16 @@ def count(text: str) -> int:
 def seconds(text: str) -> float:
     """Parse a duration in seconds, above 0."""
     return _number(text, lambda value: 0 < value < 1e6, "give a number of seconds above 0")
+
+
+def image_size(text: str) -> tuple[int, int]:
+    """Parse width and height of an image, pixels."""
+    width, cross, height = text.lower().partition("x")
+    if cross and width.isdecimal() and height.isdecimal():
+        size = int(width), int(height)
+        if all(0 < side <= _LARGEST_IMAGE for side in size):
+            return size
+    raise argparse.ArgumentTypeError(f"{text!r}: write WIDTHxHEIGHT in pixels, 1 to {_LARGEST_IMAGE}, as in 640x480")
 
 
 def _whole(text: str, low: int, high: int, advice: str) -> int:

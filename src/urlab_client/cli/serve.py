@@ -15,7 +15,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, cast
 
-from urlab_client.cli._arguments import Commands, port
+from urlab_client.cli._arguments import Commands, image_size, port
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._mujoco import import_mujoco
 from urlab_client.protocol.controller_text import ControllerText
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 __all__ = ["add_parser", "run"]
 
 _PORTS = {"step": 5559, "state": 5555, "ctrl": 5556, "info": 5557, "camera": 5558}
-_LARGEST_IMAGE = 16384
 
 # A lock wait on Windows does not see Ctrl-C, so there it is taken in slices.
 _WAIT_S = 0.1 if sys.platform == "win32" else None
@@ -189,7 +188,7 @@ def add_parser(commands: Commands) -> None:
         metavar="ACTOR/CAMERA=MODE",
         help=f"{', '.join(CameraMode)}; repeatable (default: real)",
     )
-    cameras.add_argument("--camera-size", type=_camera_size, metavar="WxH", help="pixels, for cameras that give none")
+    cameras.add_argument("--camera-size", type=image_size, metavar="WxH", help="pixels, for cameras that give none")
     cameras.add_argument(
         "--render-quality",
         choices=("auto", "fast", "high"),
@@ -406,15 +405,6 @@ def _camera_mode(text: str) -> CameraOption:
     if mode not in [*CameraMode]:
         raise argparse.ArgumentTypeError(f"{text!r}: {mode!r} is no camera mode; there are {_names(CameraMode)}")
     return CameraOption(camera, CameraMode(mode))
-
-
-def _camera_size(text: str) -> tuple[int, int]:
-    width, cross, height = text.lower().partition("x")
-    if cross and width.isdecimal() and height.isdecimal():
-        size = int(width), int(height)
-        if all(0 < side <= _LARGEST_IMAGE for side in size):
-            return size
-    raise argparse.ArgumentTypeError(f"{text!r}: write WIDTHxHEIGHT in pixels, 1 to {_LARGEST_IMAGE}, as in 640x480")
 
 
 def _names(kinds: type[CameraMode]) -> str:

@@ -177,7 +177,7 @@ class _Stroke:
         mujoco.mjv_initGeom(geom, self.kind, np.array(self.size), np.array(self.at), turn, rgba)
         if self.end is not None:
             mujoco.mjv_connector(geom, self.kind, self.size[0], np.array(self.at), np.array(self.end))
-        geom.emission = 1.0  # in its own colour, whatever the lights
+        geom.emission, geom.specular = 0.6, 0.0  # about its own colour, whatever the lights
         geom.label = self.text
         geom.category = mujoco.mjtCatBit.mjCAT_DECOR
 

@@ -152,7 +152,7 @@ class Backend:
 
 
 def find_backend() -> Backend | None:
-    """Return what draws on this machine; None, with one warning in the log, when nothing does.
+    """Return what draws on this machine; None when nothing does.
 
     `MUJOCO_GL` names the only one to try, or disables drawing. The answer is looked for once per process.
     """
@@ -184,20 +184,16 @@ _probing = threading.Lock()
 @cache
 def _find(choice: str) -> Backend | str:
     if choice in _DISABLED:
-        reason = f"{_CHOICE}={choice} disables OpenGL; unset it"
-        logger.warning("camera images are left out: %s", reason)
-        return reason
+        return f"{_CHOICE}={choice} disables OpenGL; unset it"
     reasons: list[str] = []
     for name in _candidates(choice):
         found = _probe(name)
         if isinstance(found, Backend):
-            logger.info("camera images are drawn with %s by %s", found.name, found.renderer)
+            logger.info("pictures are drawn with %s by %s", found.name, found.renderer)
             return found
         reasons.append(f"{name}: {found}")
     advice = _PACKAGES if sys.platform == "linux" else "install a graphics driver"
-    reason = f"no OpenGL works here: {advice} ({'; '.join(reasons)})"
-    logger.warning("camera images are left out: %s", reason)
-    return reason
+    return f"no OpenGL works here: {advice} ({'; '.join(reasons)})"
 
 
 def _candidates(choice: str) -> Sequence[str]:
@@ -460,10 +456,13 @@ class CameraStudio:
 
     def _run(self) -> None:
         try:
-            backend = find_backend()
+            backend = _search()
+            if isinstance(backend, str):
+                logger.warning("camera images are left out: %s", backend)
+                return
             with self._lock:
-                self._drawing = backend is not None and not self._closed
-            if self._drawing and backend is not None and self._model is not None:
+                self._drawing = not self._closed
+            if self._drawing and self._model is not None:
                 with _Stage(self._model, backend, self._tints, self._quality) as stage:
                     atexit.register(self.close)  # after the driver's own hook, so before it at the end
                     self._draw(stage)

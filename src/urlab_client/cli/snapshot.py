@@ -1,0 +1,232 @@
+"""`urlab snapshot`: a picture of a model, of a saved level, or of what a camera of a running server sees."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from urlab_client.cli._arguments import Commands, add_keys, image_size, port, seconds
+from urlab_client.cli._failure import CommandError
+from urlab_client.cli._files import replaced
+from urlab_client.cli._mujoco import import_mujoco
+from urlab_client.protocol.enums import CameraMode
+from urlab_client.protocol.errors import URLabTimeoutError
+
+if TYPE_CHECKING:
+    from urlab_client import URLabCameraView, URLabClient
+
+__all__ = ["add_parser", "run"]
+
+_VIEW_MODES = ("lit", "unlit", "wireframe", "collision")
+_CHUNK = 100  # physics steps of one request, which the server gives 5 s
+_BEYOND_M = 1e5  # farther than what a ray can meet
+
+
+class SnapshotArguments(argparse.Namespace):
+    """What the command line says."""
+
+    sources: list[str]
+    output: Path
+    camera: str | None
+    mode: str | None
+    size: tuple[int, int]
+    seconds: float | None
+    keyframe: str | None
+    step_port: int
+    timeout: float
+    server_key: str | None
+    client_key: str | None
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command to the parser."""
+    parser = commands.add_parser(
+        "snapshot",
+        help="write a picture of a model, a level or a camera",
+        description="Write a PNG of models or of a saved level, in a server of its own; or of what a camera of a "
+        "running server in live mode sees, which opens a session and so takes the server over from the client that "
+        "drives it. Needs the extra 'urlab-client[demo]'.",
+    )
+    parser.add_argument(
+        "sources",
+        nargs="+",
+        metavar="SOURCE",
+        help="MJCF files, names of bundled robots and at most one saved level (.json), as for `urlab serve`; or the "
+        "address of a running server, tcp://HOST[:PORT] or ipc://PATH",
+    )
+    parser.add_argument(
+        "-o", "--output", type=Path, default=Path("snapshot.png"), metavar="FILE", help="default: %(default)s"
+    )
+    parser.add_argument(
+        "--camera", metavar="ARTICULATION/CAMERA", help="what this camera sees (default: everything, from outside)"
+    )
+    parser.add_argument(
+        "--mode",
+        choices=(*_VIEW_MODES, *CameraMode),
+        metavar="MODE",
+        help=f"{', '.join(_VIEW_MODES)}; with --camera {', '.join(CameraMode)} (default: lit, or real)",
+    )
+    parser.add_argument(
+        "--size",
+        type=image_size,
+        default=(1280, 720),
+        metavar="WxH",
+        help="pixels (default: 1280x720); for a camera that gives none itself",
+    )
+    parser.add_argument("--keyframe", metavar="NAME", help="start play at this keyframe")
+    parser.add_argument("--seconds", type=seconds, metavar="S", help="simulate for this long before")
+    parser.add_argument(
+        "--step-port", type=port, default=5559, metavar="PORT", help="RPC port, if an address has none (default: 5559)"
+    )
+    parser.add_argument(
+        "--timeout", type=seconds, default=5.0, metavar="S", help="to wait for a running server (default: %(default)s)"
+    )
+    add_keys(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: SnapshotArguments) -> int:
+    """Write the picture.
+
+    Raises:
+        CommandError: An option cannot be honoured, or a library is missing.
+        URLabError: A model is broken, nothing can be drawn here, or the server does not answer.
+        OSError: The file cannot be written.
+    """
+    if importlib.util.find_spec("matplotlib") is None:
+        raise CommandError("matplotlib not installed; run: pip install 'urlab-client[demo]'")
+    if not arguments.output.parent.is_dir():
+        raise CommandError(f"{arguments.output}: no such folder")
+    _check_mode(arguments)
+    import_mujoco()
+    if any("://" in source for source in arguments.sources):
+        image = _of_running_server(arguments)
+    else:
+        image = _of_models(arguments)
+    _write(arguments.output, image)
+    print(f"{arguments.output}: {image.shape[1]}x{image.shape[0]}")
+    return 0
+
+
+def _check_mode(arguments: SnapshotArguments) -> None:
+    if arguments.mode is None:
+        return
+    for_camera = arguments.mode in [*CameraMode]
+    if for_camera != (arguments.camera is not None):
+        fitting = _VIEW_MODES if for_camera else tuple(CameraMode)
+        where = "without --camera" if for_camera else "with --camera"
+        raise CommandError(f"--mode {arguments.mode}: {where} the modes are {', '.join(fitting)}")
+
+
+def _of_models(arguments: SnapshotArguments) -> NDArray[np.uint8]:
+    from urlab_client import URLabClient  # noqa: PLC0415
+    from urlab_client.server import SimulatedServer  # noqa: PLC0415
+    from urlab_client.server.rendering import need_backend  # noqa: PLC0415
+
+    need_backend()
+    camera = arguments.camera
+    play = bool(camera or arguments.keyframe or arguments.seconds)
+    with SimulatedServer(
+        *arguments.sources,
+        play=play,
+        camera_modes={camera: CameraMode(arguments.mode or CameraMode.REAL)} if camera else {},
+        camera_size=arguments.size,
+    ) as server:
+        with URLabClient(**server.client_options(), step_mode="direct") as client:
+            client.discover()
+            view = _camera(client, camera) if camera else None
+            if arguments.keyframe:
+                client.reset(arguments.keyframe)
+            _simulate(client, arguments.seconds or 0.0)
+            if camera and view is not None:
+                client.step(include_cameras={camera: "sync"})
+                return _pixels(view)
+            if arguments.mode:
+                client.viewport.set_mode(arguments.mode)
+        return server.snapshot(arguments.size, frame_all=True)
+
+
+def _simulate(client: URLabClient, duration: float) -> None:
+    model = client.model
+    remaining = round(duration / model.opt.timestep) if model is not None else 0
+    while remaining > 0:
+        client.step(min(remaining, _CHUNK))
+        remaining -= _CHUNK
+
+
+def _of_running_server(arguments: SnapshotArguments) -> NDArray[np.uint8]:
+    from urlab_client import URLabClient  # noqa: PLC0415
+
+    if len(arguments.sources) > 1:
+        raise CommandError("give one address and nothing else, or models and no address")
+    if arguments.keyframe or arguments.seconds:
+        raise CommandError("--keyframe and --seconds are for models: what a running server does is not changed")
+    (address,) = arguments.sources
+    with URLabClient(
+        address,
+        step_port=arguments.step_port,
+        rcv_timeout_ms=round(1e3 * arguments.timeout),
+        server_key=arguments.server_key,
+        client_key=arguments.client_key,
+    ) as client:
+        client.discover()
+        if arguments.camera is None:
+            raise CommandError(
+                f"{address}: no op asks for the viewport's picture; say --camera, one of {_names(client)}"
+            )
+        view = _camera(client, arguments.camera)
+        if arguments.mode not in (None, view.mode):
+            raise CommandError(f"--mode {arguments.mode}: {arguments.camera} is a camera of mode {view.mode}")
+        try:
+            with view.frames(timeout=arguments.timeout) as frames:
+                next(frames)
+        except URLabTimeoutError:
+            raise CommandError(
+                f"{address}: no picture of {arguments.camera} within {arguments.timeout:g} s; servers publish them in "
+                "live mode only, and where they can draw"
+            ) from None
+        return _pixels(view)
+
+
+def _camera(client: URLabClient, key: str) -> URLabCameraView:
+    articulation, _, camera = key.partition("/")
+    try:
+        return client.articulations[articulation].cameras[camera]
+    except KeyError:
+        raise CommandError(f"no camera '{key}'; there is {_names(client)}") from None
+
+
+def _names(client: URLabClient) -> str:
+    names = [f"{key}/{camera}" for key, robot in client.articulations.items() for camera in robot.cameras]
+    return ", ".join(names) or "none (is play running?)"
+
+
+def _pixels(view: URLabCameraView) -> NDArray[np.uint8]:
+    """Return red, green, blue and alpha of the newest frame; depth as grey, half as bright at twice the distance."""
+    frame: NDArray[Any] | None = view.latest_frame
+    if frame is None:
+        raise CommandError(f"the camera {view.name} gave no picture")
+    if view.mode == CameraMode.REAL:
+        return frame
+    if view.mode != CameraMode.DEPTH:
+        return frame[:, :, [2, 1, 0, 3]]
+    image = np.zeros((*frame.shape, 4), np.uint8)
+    image[:, :, 3] = 255
+    hit = frame < _BEYOND_M
+    if hit.any():
+        near = max(float(frame[hit].min()), 1e-6)
+        image[hit, :3] = (255.0 * near / frame[hit]).clip(1.0, 255.0).astype(np.uint8)[:, None]
+    return image
+
+
+def _write(path: Path, image: NDArray[np.uint8]) -> None:
+    # matplotlib leaves the type of a path open.
+    from matplotlib.image import imsave  # noqa: PLC0415  # pyright: ignore[reportUnknownVariableType]
+
+    with replaced(path) as temporary:
+        imsave(temporary, np.ascontiguousarray(image), format="png")

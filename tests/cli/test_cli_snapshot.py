@@ -1,0 +1,111 @@
+"""`urlab snapshot`: pictures of models and levels, of cameras of servers, and what it says when there is none."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from commands import refusal, urlab
+from matplotlib.image import imread
+
+from urlab_client import URLabClient
+from urlab_client.cli import main
+from urlab_client.server import SimulatedServer
+
+
+@pytest.fixture(autouse=True)
+def _in_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def picture(*arguments: str) -> np.ndarray[Any, Any]:
+    """Run the command and return its picture, channels in 0..1."""
+    assert main(["snapshot", *arguments, "-o", "out.png"]) == 0
+    return imread("out.png")
+
+
+def test_models_in_a_process_of_its_own(tmp_path: Path) -> None:
+    done = urlab("snapshot", "quadruped", "arm", "--size", "160x90", cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "snapshot.png: 160x90\n", "")
+    assert imread(tmp_path / "snapshot.png").shape == (90, 160, 4)
+
+
+def test_modes_and_moments_differ() -> None:
+    size = ["--size", "64x48"]
+    pictures = [
+        picture("quadruped", *size, "--keyframe", "home"),
+        picture("quadruped", *size, "--seconds", "0.4", "--mode", "lit"),
+        picture("quadruped", *size, "--mode", "wireframe"),
+    ]
+    assert len({image.tobytes() for image in pictures}) == len(pictures)
+
+
+def test_a_saved_level(tmp_path: Path) -> None:
+    with SimulatedServer(saved_dir=tmp_path) as server, URLabClient(**server.client_options()) as client:
+        client.discover()
+        client.scene.create_level("lab")
+        client.scene.spawn_actor(client.scene.import_xml("ball"), "ball", location=(0, 0, 1))
+        client.scene.save_level()
+    assert picture(str(tmp_path / "Levels" / "lab.json"), "--size", "64x64")[28:36, 28:36, :3].max() > 0.2
+
+
+def test_cameras_and_what_their_pixels_mean() -> None:
+    camera = ["arm", "--camera", "arm/overview", "--size", "64x48"]
+    real, depth, semantic = (picture(*camera, "--mode", mode) for mode in ("real", "depth", "semantic"))
+    assert real.shape == depth.shape == semantic.shape
+    assert (depth[:, :, 0] == depth[:, :, 1]).all()
+    assert depth[:, :, 0].max() > 0.99
+    assert len(np.unique(semantic.reshape(-1, 4), axis=0)) == 2
+
+
+def test_a_camera_of_a_running_server(capsys: pytest.CaptureFixture[str]) -> None:
+    with SimulatedServer("arm", play=True, unpaused=True) as server:
+        address = f"{server.address}:{server.step_port}"
+        assert main(["snapshot", address]) == 2
+        assert "--camera, one of arm/overview, arm/wrist" in capsys.readouterr().err
+        assert picture(address, "--camera", "arm/overview").shape == (480, 640, 4)
+        assert main(["snapshot", address, "--camera", "arm/overview", "--seconds", "1"]) == 2
+        assert "--seconds are for models" in capsys.readouterr().err
+
+
+def test_a_stepped_server_publishes_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    with SimulatedServer("arm", play=True, step_mode="direct") as server:
+        address = f"{server.address}:{server.step_port}"
+        assert main(["snapshot", address, "--camera", "arm/wrist", "--timeout", "0.3"]) == 2
+    assert "live mode only" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["nosuch"], ["nosuch", "quadruped"]),
+        (["arm", "--camera", "arm/tail"], ["arm/tail", "arm/wrist"]),
+        (["arm", "--keyframe", "nope"], ["nope", "arm_home"]),
+        (["arm", "--mode", "depth"], ["without --camera", "wireframe"]),
+        (["arm", "--mode", "unlit", "--camera", "arm/wrist"], ["with --camera", "semantic"]),
+        (["arm", "-o", "nowhere/x.png"], ["nowhere"]),
+        (["tcp://localhost:1", "arm"], ["one address"]),
+    ],
+)
+def test_refusals(arguments: list[str], words: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main(["snapshot", *arguments]) == 2
+    said = capsys.readouterr().err
+    for word in words:
+        assert word in said
+    assert not list(tmp_path.glob("*.png"))
+
+
+def test_no_opengl_is_one_line(tmp_path: Path) -> None:
+    line = refusal(urlab("snapshot", "arm", cwd=tmp_path, environment={"MUJOCO_GL": "disable"}))
+    assert "MUJOCO_GL=disable" in line
+
+
+def test_without_the_library_the_extra_is_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert main(["snapshot", "arm"]) == 2
+    assert "pip install 'urlab-client[demo]'" in capsys.readouterr().err
