@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 
 import msgspec
@@ -242,3 +243,15 @@ def test_an_oversize_request_is_refused() -> None:
     op: Op = OPS["set_overlay_text"]
     with pytest.raises(ValueError, match=r"set_overlay_text: a request of .* exceeds"):
         encode_request(op.request(text="x" * (65 * 1024 * 1024)), "sid")  # type: ignore[call-arg]
+
+
+@given(number=st.floats())
+def test_json_numbers_have_17_significant_digits(number: float) -> None:
+    frame = encode_reply(OPS["set_sim_speed"].reply(percent=number), json=True)  # type: ignore[call-arg]
+    spelled = b"%.17g" % number if math.isfinite(number) else b"null"
+    assert frame == b'{"op":"set_sim_speed_ok","percent":%s}' % spelled
+
+
+def test_json_numbers_that_are_whole_have_no_point() -> None:
+    assert b'"percent":42}' in encode_reply(OPS["set_sim_speed"].reply(percent=42.0), json=True)  # type: ignore[call-arg]
+    assert b"0.10000000000000001" in encode_reply(OPS["set_sim_speed"].reply(percent=0.1), json=True)  # type: ignore[call-arg]

@@ -257,6 +257,14 @@ def test_drawings_of_play_and_level_are_apart(stage: Stage) -> None:
     assert shade(edited, *CENTER) == shade(playing, *CENTER)
 
 
+def test_another_level_shows_nothing_of_what_was_drawn_before(stage: Stage) -> None:
+    stage.wire.ask("stop_pie")
+    stage.wire.ask("draw_marker", location=[-1, 0, 0], color=RED, ttl=-1)
+    drawn = stage.picture()
+    stage.wire.ask("create_level", name="Empty", force_overwrite=True)
+    assert shade(stage.picture(), *CENTER) != shade(drawn, *CENTER)
+
+
 def test_robot_cameras_show_no_drawing(stage: Stage, tmp_path: Path) -> None:
     path = tmp_path / "eye.xml"
     path.write_text(

@@ -8,6 +8,7 @@ key plus `__b64__`. Unknown fields are ignored, so that an old client can talk t
 from __future__ import annotations
 
 import base64
+import math
 import re
 from _thread import allocate_lock
 from collections.abc import Callable, Generator
@@ -212,20 +213,23 @@ def encode_reply(reply: Struct, *, json: bool = False) -> bytes:
     if not json:
         return _encoder.encode(reply)
     plain = msgspec.to_builtins(reply, builtin_types=(bytes,), enc_hook=_to_wire)
-    return msgspec.json.encode(_spell_binary(plain))
+    return msgspec.json.encode(_spelled(plain))
 
 
-def _spell_binary(value: Any) -> Any:
-    if isinstance(value, dict):
-        items = cast("dict[str, Any]", value).items()
-        return {
-            f"{key}{_BINARY_SUFFIX}" if isinstance(item, bytes) else key: _spell_binary(item) for key, item in items
-        }
-    if isinstance(value, list):
-        return [_spell_binary(item) for item in cast("list[Any]", value)]
-    if isinstance(value, bytes):
-        return base64.b64encode(value).decode("ascii")
-    return value
+def _spelled(value: Any) -> Any:
+    """Return a reply as the plugin spells it in JSON: bytes in base64 under a key of their own, numbers as `%.17g`."""
+    match value:
+        case dict():
+            items = cast("dict[str, Any]", value).items()
+            return {f"{key}{_BINARY_SUFFIX}" if isinstance(item, bytes) else key: _spelled(item) for key, item in items}
+        case list():
+            return [_spelled(item) for item in cast("list[Any]", value)]
+        case bytes():
+            return base64.b64encode(value).decode("ascii")
+        case float() if math.isfinite(value):
+            return msgspec.Raw(b"%.17g" % value)
+        case _:
+            return value  # what is not finite becomes null: the plugin's JSON would be invalid
 
 
 # Widening integers. Structs declare counters as `int` for the people who read them, the wire wants float64. Which

@@ -61,7 +61,9 @@ def import_xml(server: ServerCore, request: ImportXml) -> ImportXmlOk:
 @handles(CreateLevel)
 def create_level(server: ServerCore, request: CreateLevel) -> CreateLevelOk:
     name = need(request, request.name, "name")
-    return CreateLevelOk(level_path=server.world.create_level(name, force_overwrite=request.force_overwrite))
+    created = server.world.create_level(name, force_overwrite=request.force_overwrite)
+    server.drawings.clear(in_play=False)  # what is drawn into a level goes with it
+    return CreateLevelOk(level_path=created)
 
 
 class LoadLevelByName(LoadLevel, tag="load_level", kw_only=True):
@@ -73,7 +75,9 @@ class LoadLevelByName(LoadLevel, tag="load_level", kw_only=True):
 @handles(LoadLevelByName)
 def load_level(server: ServerCore, request: LoadLevelByName) -> LoadLevelOk:
     level = need(request, usable(request.name_or_path, "") or request.name, "level_path")
-    return LoadLevelOk(level_path=server.world.load_level(level))
+    loaded = server.world.load_level(level)
+    server.drawings.clear(in_play=False)
+    return LoadLevelOk(level_path=loaded)
 
 
 @handles(SaveLevel)
