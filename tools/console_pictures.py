@@ -74,8 +74,7 @@ def main() -> None:
         until("document.querySelectorAll('[data-robot]').length == 2")
         driver.execute_script(MOVE)
         driver.execute_script("document.querySelectorAll('#contacts details, .robot details')[0].open = true")
-        until("document.querySelectorAll('.frame .waiting:not([hidden])').length == 0")
-        until("window.moved > 6")
+        until("window.moved > 5")
         for name, (width, height, scheme) in SHOTS.items():
             driver.execute_cdp_cmd(
                 "Emulation.setEmulatedMedia", {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
@@ -85,6 +84,7 @@ def main() -> None:
             until(f"innerWidth == {json.dumps(width)}")
             before = driver.execute_script("return window.moved")
             until(f"window.moved > {before} + 2")
+            until("[...document.querySelectorAll('.camera')].some(one => /fps/.test(one.innerText))")
             driver.save_screenshot(str(folder / f"{name}.png"))
 
 

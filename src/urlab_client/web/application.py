@@ -7,7 +7,7 @@ import secrets
 import time
 from collections.abc import AsyncGenerator, Awaitable, Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import anyio
 import msgspec
@@ -76,7 +76,7 @@ class _Run(Struct):
 
 
 class _Steps(Struct):
-    n_steps: int = 1
+    n_steps: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] = 1
 
 
 class _Token(Struct):

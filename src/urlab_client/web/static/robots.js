@@ -27,9 +27,11 @@ class Robot {
   }
 
   actuator(actuator, art) {
-    const range = actuator.range ?? [-1, 1];
     const joint = art.joints.find((one) => one.name === actuator.joint);
-    const follows = joint && (actuator.kind === "position" || art.controller);
+    // A controller's set-points are joint positions, whatever its actuators take.
+    const controlled = joint && art.controller?.kind === "pd";
+    const follows = joint && (actuator.kind === "position" || controlled);
+    const range = (controlled ? joint.range : actuator.range) ?? (controlled ? [-Math.PI, Math.PI] : [-1, 1]);
     const step = (range[1] - range[0]) / 1000;
     const slider = h("input", { type: "range", min: range[0], max: range[1], step, value: 0, "data-actuator": actuator.name,
       "aria-label": `${actuator.name} set-point`, title: "Set-point; double-click: middle of the range" });
@@ -43,9 +45,9 @@ class Robot {
     slider.addEventListener("input", set);
     slider.addEventListener("dblclick", () => { slider.value = (range[0] + range[1]) / 2; set(); });
     this.rows.push((state) => {
-      const target = state.targets?.[actuator.index] ?? state.ctrl?.[actuator.index];
-      if (target != null && performance.now() - held > 700 && document.activeElement !== slider) slider.value = target;
-      if (held && performance.now() - held > 700 && target != null && !slider.matches(":active")) slider.value = target;
+      const target = state.targets?.[actuator.index] ?? (controlled ? state.qpos?.[joint.index] : state.ctrl?.[actuator.index]);
+      // Not while somebody moves it here: what comes is older than what they do.
+      if (target != null && performance.now() - held > 700 && !slider.matches(":active")) slider.value = target;
       const where = follows ? state.qpos?.[joint.index] : state.ctrl?.[actuator.index];
       mark.style.left = `${100 * share(where ?? 0, range)}%`;
       text(shown, number(where));

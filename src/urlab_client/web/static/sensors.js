@@ -6,6 +6,13 @@ import { on } from "./link.js";
 const SPAN = 8;
 const COLORS = ["--c1", "--c2", "--c3", "--c4", "--c5", "--c6"];
 let curves = [];
+const probe = h("i", { hidden: true });
+
+/** A custom property as a colour that a canvas understands: of light and dark the one in force. */
+function resolved(name) {
+  probe.style.color = `var(${name})`;
+  return getComputedStyle(probe).color;
+}
 
 class Curve {
   constructor(art, sensor) {
@@ -70,7 +77,7 @@ class Curve {
 
 export function makeSensors() {
   const grid = h("div", { class: "curves" });
-  $("sensors").append(h("h2", {}, "Sensors", h("span", { class: "tag" }, `last ${SPAN} s`)), grid);
+  $("sensors").append(h("h2", {}, "Sensors", h("span", { class: "tag" }, `last ${SPAN} s`)), grid, probe);
   on("world", ({ world }) => {
     const old = new Map(curves.map((curve) => [`${curve.art}/${curve.name}/${curve.dim}`, curve]));
     curves = world.articulations.flatMap((art) => art.sensors.map((sensor) =>
@@ -93,8 +100,7 @@ export function makeSensors() {
     requestAnimationFrame(paint);
     if (!changed) return;
     changed = false;
-    const style = getComputedStyle(document.body);
-    const colors = { grid: style.getPropertyValue("--line"), lines: COLORS.map((name) => style.getPropertyValue(name)) };
+    const colors = { grid: resolved("--line"), lines: COLORS.map(resolved) };
     for (const curve of curves) curve.draw(colors);
   };
   paint();

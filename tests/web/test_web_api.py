@@ -1,0 +1,247 @@
+"""The HTTP and WebSocket API against a simulated server over real sockets."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+from collections.abc import AsyncGenerator, Callable, Iterator
+from typing import Any
+
+import pytest
+from PIL import Image
+from starlette.applications import Starlette
+from starlette.routing import Mount
+from starlette.testclient import TestClient
+from starlette.websockets import WebSocketDisconnect
+
+from urlab_client.aio import URLabClient
+from urlab_client.protocol.registry import OPS
+from urlab_client.server import SimulatedServer
+from urlab_client.web import Access, app
+from urlab_client.web.lease import Lease, NotDriving, Viewer
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[SimulatedServer]:
+    with SimulatedServer("arm", play=True, unpaused=True, camera_size=(64, 48)) as running:
+        yield running
+
+
+def mounted(server: SimulatedServer, at: str, access: Access | None = None) -> Starlette:
+    """Mount the console in an application of one's own, which owns the client."""
+    client = URLabClient(**server.client_options())
+    inner = app(client, access=access, lease_seconds=30.0)
+
+    @contextlib.asynccontextmanager
+    async def lifespan(_: Starlette) -> AsyncGenerator[None]:
+        async with client, inner.router.lifespan_context(inner):
+            yield
+
+    outer = Starlette(routes=[Mount(at, inner)], lifespan=lifespan)
+    outer.state.access = inner.state.access
+    return outer
+
+
+@pytest.fixture
+def site(server: SimulatedServer) -> Starlette:
+    return mounted(server, "/")
+
+
+@pytest.fixture
+def http(site: Starlette) -> Iterator[TestClient]:
+    with TestClient(site, base_url="http://localhost") as client:
+        key = client.post("/api/session", json={"token": site.state.access.invite()}).json()["key"]
+        client.headers["authorization"] = f"Bearer {key}"
+        with client.websocket_connect("ws://localhost/api/live") as live:
+            heard(live, "world", lambda message: bool(message["world"]["articulations"]))
+        yield client
+
+
+def heard(live: Any, kind: str, wanted: Callable[[dict[str, Any]], bool] = lambda message: True) -> dict[str, Any]:
+    """Return the first message of that kind that is as wanted; messages come at least twice a second."""
+    for _ in range(2000):
+        message = live.receive_json()
+        if message["type"] == "state":
+            live.send_json({"type": "ack"})
+        if message["type"] == kind and wanted(message):
+            return dict(message)
+    raise AssertionError(f"no {kind} as wanted in 2000 messages")
+
+
+def test_nothing_is_shown_without_a_key(site: Starlette) -> None:
+    with TestClient(site, base_url="http://localhost") as client:
+        assert client.get("/api/world").status_code == 401
+        assert client.get("/").status_code == 401
+        with pytest.raises(WebSocketDisconnect), client.websocket_connect("ws://localhost/api/live"):
+            pass
+
+
+def test_a_token_lets_one_browser_in_once(site: Starlette) -> None:
+    token = site.state.access.invite()
+    with TestClient(site, base_url="http://localhost", follow_redirects=False) as client:
+        entered = client.get(f"/?token={token}")
+        assert (entered.status_code, entered.headers["location"]) == (303, "/")
+        assert "httponly" in entered.headers["set-cookie"].lower()
+        assert "samesite=strict" in entered.headers["set-cookie"].lower()
+        assert client.get("/").status_code == 200
+        client.cookies.clear()  # another browser
+        assert client.get(f"/?token={token}").status_code == 401
+        assert client.get("/").status_code == 401
+
+
+def test_other_hosts_and_origins_are_refused(http: TestClient) -> None:
+    assert http.get("/api/world", headers={"host": "evil.example"}).json()["error"]["code"] == "bad_host"
+    for origin in ("http://evil.example", "null", "http://localhost:1"):
+        refused = http.post("/api/ops/set_paused", json={"paused": True}, headers={"origin": origin})
+        assert refused.json()["error"]["code"] == "bad_origin"
+        with (
+            pytest.raises(WebSocketDisconnect),
+            http.websocket_connect("ws://localhost/api/live", headers={"origin": origin}),
+        ):
+            pass
+    assert http.post("/api/lease", headers={"origin": "http://localhost"}).status_code == 200
+
+
+def test_openapi_describes_every_op_that_is_served(http: TestClient) -> None:
+    document = http.get("/api/openapi.json").json()
+    described = {path.removeprefix("/api/ops/") for path in document["paths"] if path.startswith("/api/ops/")}
+    assert described == set(OPS) - {"hello"}
+    speed = document["components"]["schemas"]["SetSimSpeed"]
+    assert speed["required"] == ["percent"]
+    assert set(speed["properties"]) == {"percent"}
+    named = json.dumps(document).split('"#/components/schemas/')[1:]
+    assert {part.partition('"')[0] for part in named} <= set(document["components"]["schemas"])
+
+
+def test_an_op_is_done_and_a_refusal_is_said(http: TestClient) -> None:
+    assert http.post("/api/ops/set_sim_speed", json={"percent": 300}).json()["percent"] == 100
+    wrong = http.post("/api/ops/set_sim_speed", json={"percent": "fast"})
+    assert (wrong.status_code, wrong.json()["error"]["code"]) == (400, "bad_request")
+    assert "$.percent" in wrong.json()["error"]["message"]
+    refused = http.post("/api/ops/set_twist", json={"articulation": "nobody"})
+    assert (refused.status_code, refused.json()["error"]["code"]) == (409, "unknown_articulation")
+    assert http.post("/api/ops/hello", json={}).status_code == 404
+    logged = [(entry["kind"], entry["what"]) for entry in http.get("/api/log").json()]
+    assert ("call", "set_sim_speed") in logged
+    assert ("error", "set_twist") in logged
+
+
+def test_set_points_move_joints_and_stay_when_unknown(http: TestClient) -> None:
+    http.post("/api/run", json={"running": True})
+    assert http.post("/api/ctrl", json={"arm": {"elbow": 0.5, "no_such": 1.0}}).status_code == 400
+    assert http.post("/api/ctrl", json={"arm": {"elbow": 0.5}}).status_code == 200
+    with http.websocket_connect("ws://localhost/api/live") as live:
+        index = next(
+            joint["index"]
+            for joint in heard(live, "world")["world"]["articulations"][0]["joints"]
+            if joint["name"] == "elbow"
+        )
+        moved = heard(live, "state", lambda state: abs(state["articulations"]["arm"]["qpos"][index] - 0.5) < 0.02)
+        assert moved["articulations"]["arm"]["targets"][2] == 0.5
+
+
+def test_states_are_dropped_and_not_queued_for_a_viewer_that_is_busy(http: TestClient) -> None:
+    http.post("/api/run", json={"running": True})
+    with (
+        http.websocket_connect("ws://localhost/api/live") as busy,
+        http.websocket_connect("ws://localhost/api/live") as quick,
+    ):
+        seen: list[int] = []
+        while len(seen) < 2:  # takes two, and says nothing of having shown them
+            message = busy.receive_json()
+            if message["type"] == "state":
+                seen.append(message["seq"])
+        ahead = heard(quick, "state", lambda state: state["seq"] > seen[-1] + 30)["seq"]
+        busy.send_json({"type": "ack"})
+        while (message := busy.receive_json())["type"] != "state":
+            pass
+        assert message["seq"] >= ahead
+
+
+def test_one_drives_and_the_others_wait(http: TestClient) -> None:
+    with (
+        http.websocket_connect("ws://localhost/api/live") as one,
+        http.websocket_connect("ws://localhost/api/live") as two,
+    ):
+        first, second = ({"x-urlab-viewer": heard(live, "you")["viewer"]} for live in (one, two))
+        assert http.post("/api/lease", headers=first).json()["mine"]
+        refused = http.post("/api/ops/reset", json={}, headers=second)
+        assert (refused.status_code, refused.json()["error"]["code"]) == (423, "not_driving")
+        two.send_json({"type": "ctrl", "values": {"arm": {"elbow": 1.0}}})
+        assert heard(two, "refused")["error"]["code"] == "not_driving"
+        status = heard(two, "status", lambda status: status["driver"] is not None)
+        assert not status["mine"]
+        assert http.post("/api/ops/list_keyframes", json={}, headers=second).status_code == 200
+        assert http.post("/api/run", json={"running": False}, headers=second).status_code == 200, "everybody may stop"
+        http.delete("/api/lease", headers=first)
+        assert http.post("/api/ops/reset", json={}, headers=second).status_code == 200
+
+
+def test_direct_mode_steps_and_shows_what_cameras_see(http: TestClient) -> None:
+    try:
+        assert http.post("/api/ops/set_mode", json={"mode": "direct"}).json()["current_mode"] == "direct"
+        assert http.post("/api/step", json={"n_steps": 7}).json()["step"] == 7
+        assert http.post("/api/step", json={"n_steps": 3}).json()["step"] == 10
+        http.post("/api/run", json={"running": True})
+        with http.websocket_connect("ws://localhost/api/live") as live:
+            heard(live, "state", lambda state: state["step"] > 30)
+        with http.websocket_connect("ws://localhost/api/cameras/arm/wrist/live") as camera:
+            frame = camera.receive_bytes()
+        length = int.from_bytes(frame[:4], "little")
+        assert json.loads(frame[4 : 4 + length])["mode"] == "real"
+        assert Image.open(io.BytesIO(frame[4 + length :])).size == (64, 48)
+        http.post("/api/run", json={"running": False})
+        assert http.post("/api/step", json={"n_steps": -1}).status_code == 400
+    finally:
+        http.post("/api/ops/set_mode", json={"mode": "live"})
+    refused = http.post("/api/step", json={"n_steps": 1})
+    assert "direct" in refused.json()["error"]["message"]
+
+
+def test_live_pictures_come_as_files_too(http: TestClient) -> None:
+    http.post("/api/run", json={"running": True})
+    picture = http.get("/api/cameras/arm/overview.jpg")
+    assert Image.open(io.BytesIO(picture.content)).size == (64, 48)
+    assert http.get("/api/cameras/arm/nothing.jpg").status_code == 404
+
+
+def test_another_program_takes_over_and_the_console_takes_it_back(http: TestClient, server: SimulatedServer) -> None:
+    from urlab_client import URLabClient as Blocking
+
+    with http.websocket_connect("ws://localhost/api/live") as live:
+        heard(live, "status", lambda status: status["link"]["state"] == "connected")
+        with Blocking(**server.client_options()) as other:
+            other.discover()
+            http.post("/api/ops/list_keyframes", json={})
+            heard(live, "status", lambda status: status["link"]["state"] == "taken_over")
+            heard(live, "state")
+        http.post("/api/connection", json={})
+        heard(live, "status", lambda status: status["link"]["state"] == "connected")
+
+
+def test_it_can_be_mounted_in_a_backend_that_has_its_own_door(server: SimulatedServer) -> None:
+    outer = mounted(server, "/lab", Access(hosts=["robots.example"], tokens=False))
+    with TestClient(outer, base_url="http://robots.example") as client:
+        page = client.get("/lab/")
+        assert page.status_code == 200
+        assert client.get("/lab/static/main.js").status_code == 200
+        assert client.get("/lab/api/status").json()["address"] == server.address
+
+
+def test_the_controls_are_lost_by_not_using_them() -> None:
+    now = 0.0
+    lease = Lease(10.0, clock=lambda: now)
+    ann, bob = Viewer("a", "Ann"), Viewer("b", "Bob")
+    lease.use(ann)
+    now = 9.0
+    with pytest.raises(NotDriving, match="Ann"):
+        lease.use(bob)
+    lease.use(ann)
+    now = 18.9
+    lease.release(bob)
+    assert lease.holder is ann
+    now = 19.0
+    assert lease.holder is None
+    lease.use(bob)
+    assert lease.holder is bob
