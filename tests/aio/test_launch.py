@@ -68,6 +68,11 @@ async def test_a_killed_server_is_noticed() -> None:
         with pytest.raises((OutcomeUnknown, ServerUnreachable)):
             await client.step(timeout=2)
         assert not client.connected
+        await client._transport._process.wait()  # type: ignore[attr-defined]  # until the event loop knows, too
+        with pytest.raises(ServerUnreachable, match=r"ended with code -9.*discover\(\)"):
+            await client.step()
+        await client.discover()
+        assert (await client.step()).step == 1
 
 
 async def test_cancelling_the_first_call_leaves_no_server_behind() -> None:

@@ -84,6 +84,14 @@ class Relay:
             self._changed.clear()
             await self._changed.wait()
 
+    async def pass_on(self, data: bytes, writer: asyncio.StreamWriter, *, up: bool) -> bool:
+        """Write what arrived; return whether the connection goes on."""
+        if not up and self._garble is not None:
+            data, self._garble = self._garble, None
+        writer.write(data)
+        await writer.drain()
+        return True
+
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if self.refusing:
             writer.transport.abort()
@@ -112,8 +120,6 @@ class Relay:
                     await gate.wait()
                 if writer.transport.is_closing():
                     break
-                if not up and self._garble is not None:
-                    data, self._garble = self._garble, None
-                writer.write(data)
-                await writer.drain()
+                if not await self.pass_on(data, writer, up=up):
+                    break
         writer.transport.abort()

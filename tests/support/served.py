@@ -1,0 +1,69 @@
+"""`urlab serve` in a child process, to be killed, stopped and started again on the same ports."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Any, Self
+
+PORTS = ("step", "state", "ctrl", "info", "camera")
+
+
+class Served:
+    """A server, in play with the bundled arm.
+
+    Attributes:
+        address: Of its host.
+        ports: By name.
+    """
+
+    def __init__(self, shm_dir: Path | None = None) -> None:
+        self.address = ""
+        self.ports = dict.fromkeys(PORTS, 0)
+        self._memory = ["--no-shm"] if shm_dir is None else [f"--shm-dir={shm_dir}"]
+        self._process: asyncio.subprocess.Process | None = None
+
+    async def __aenter__(self) -> Self:
+        await self.start()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.kill()
+
+    async def start(self) -> None:
+        """Start it, on the ports it had, and wait until it serves."""
+        command = [sys.executable, "-m", "urlab_client", "serve", "arm", "--json", "--until-eof", "--play"]
+        command += [f"--{name}-port={number}" for name, number in self.ports.items()]
+        pipe = asyncio.subprocess.PIPE
+        process = await asyncio.create_subprocess_exec(*command, *self._memory, stdin=pipe, stdout=pipe)
+        self._process = process
+        assert process.stdout is not None
+        ready = json.loads(await process.stdout.readline())
+        self.address = ready["address"]
+        self.ports = {name: ready[f"{name}_port"] for name in PORTS}
+
+    def send(self, number: signal.Signals) -> None:
+        """Signal it."""
+        assert self._process is not None
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(self._process.pid, number)
+
+    async def kill(self) -> None:
+        """Kill it and wait until it is gone."""
+        process, self._process = self._process, None
+        if process is not None:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(process.pid, signal.SIGKILL)
+            await process.wait()
+            assert process.stdin is not None
+            process.stdin.close()
+            process._transport.close()  # type: ignore[attr-defined]  # or its pipes stay until they are collected
+
+    def options(self) -> dict[str, Any]:
+        """Options of a client of it."""
+        return {"address": self.address, **{f"{name}_port": self.ports[name] for name in PORTS[:-1]}}
