@@ -7,8 +7,10 @@ standard input closes: it cannot outlive the client, however that dies.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import os
+import signal
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
@@ -145,7 +147,7 @@ class LaunchedTransport:
                 await process.wait()
         except TimeoutError:
             log.warning("%s: the server did not end within %g s and was killed", self._address, _STOP_S)
-            process.kill()
+            _kill(process)
             await process.wait()
         if drain is not None:
             await drain
@@ -161,8 +163,7 @@ class LaunchedTransport:
         try:
             line = await self._first_line(process, op)
         except BaseException:  # cancelled, too: the next call starts afresh
-            if process.returncode is None:
-                process.kill()
+            _kill(process)
             raise
         ready = msgspec.json.decode(line, type=_Ready)
         if process.stderr is not None:
@@ -203,6 +204,17 @@ _DEFAULTS: Sequence[str] = (
     "--json", "--until-eof", "--play",
     "--step-port=0", "--state-port=0", "--ctrl-port=0", "--info-port=0", "--camera-port=0",
 )  # fmt: skip
+
+
+def _kill(process: asyncio.subprocess.Process) -> None:
+    if process.returncode is not None:
+        return
+    if sys.platform == "win32":
+        process.kill()
+        return
+    # Not `process.kill()`: of a child that has just ended it would take the status that asyncio's watcher waits for.
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(process.pid, signal.SIGKILL)
 
 
 async def _log_lines(stream: asyncio.StreamReader) -> None:
