@@ -89,10 +89,16 @@ class Server:
         command = [sys.executable, "-m", "urlab_client", "serve", "arm", "--json", "--until-eof", "--play"]
         command += [f"--{name}-port={number}" for name, number in self._ports.items()]
         command += [f"--shm-dir={SHM}"] if self._shm else ["--no-shm"]
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)  # noqa: S603
-        if self._process.stdout is None:
-            raise TypeError("the server's output must be a pipe")
-        ready = json.loads(self._process.stdout.readline())
+        deadline = time.monotonic() + PATIENCE_S
+        while True:
+            self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)  # noqa: S603
+            if self._process.stdout is None:
+                raise TypeError("the server's output must be a pipe")
+            line = self._process.stdout.readline()
+            if line or time.monotonic() > deadline:
+                break
+            self._process.wait()  # for a moment some other connection has one of its ports
+        ready = json.loads(line)
         self._ports = {name: ready[f"{name}_port"] for name in PORTS}
         self.address = ready["address"]
         self.starts += 1

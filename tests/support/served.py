@@ -48,10 +48,13 @@ class Served:
         self.ports = {name: ready[f"{name}_port"] for name in PORTS}
 
     def send(self, number: signal.Signals) -> None:
-        """Signal it."""
+        """Signal it; return once a signal to stop has stopped it, which on a busy machine takes a moment."""
         assert self._process is not None
-        with contextlib.suppress(ProcessLookupError):
+        stat = Path(f"/proc/{self._process.pid}/stat")
+        with contextlib.suppress(OSError):
             os.kill(self._process.pid, number)
+            while number is signal.SIGSTOP and stat.read_text().rpartition(")")[2].split()[0] not in "TZX":
+                os.sched_yield()
 
     async def kill(self) -> None:
         """Kill it and wait until it is gone."""
