@@ -1,0 +1,131 @@
+"""`urlab convert`: a recording as a table, arrays, a video or a LeRobot dataset."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from urlab_client.cli._arguments import Commands, count
+from urlab_client.cli._failure import CommandError
+from urlab_client.cli._files import replaced
+from urlab_client.cli._progress import progress_bar
+
+if TYPE_CHECKING:
+    from urlab_client.integrations.record import Run
+
+__all__ = ["add_parser", "run"]
+
+_FORMATS = ("csv", "npz", "parquet", "mp4", "lerobot")
+
+
+class ConvertArguments(argparse.Namespace):
+    """What the command line says."""
+
+    recording: Path
+    output: Path
+    format: str | None
+    camera: list[str]
+    fps: int
+    task: str
+    python: str | None
+    overwrite: bool
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command to the parser."""
+    parser = commands.add_parser(
+        "convert",
+        help="turn a recording into CSV, NumPy, Parquet, MP4 or a LeRobot dataset",
+        description="Convert a recording made by `urlab record` or record(). CSV, NumPy and Parquet hold the states, "
+        "one row each; MP4 the pictures of one camera. Needs the extra 'urlab-client[mcap]'; Parquet 'dataset', MP4 "
+        "'video', besides.",
+    )
+    parser.add_argument("recording", type=Path, metavar="FILE", help="the recording, a .mcap file")
+    parser.add_argument("output", type=Path, metavar="OUTPUT", help="the file to write; its ending says the format")
+    parser.add_argument("--format", choices=_FORMATS, help="the format, where the ending does not say it")
+    parser.add_argument(
+        "--camera",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="a camera, as ARTICULATION/CAMERA: for mp4 the one to show, for npz and lerobot those to add; may be "
+        "repeated",
+    )
+    parser.add_argument("--fps", type=count, default=30, metavar="N", help="frames per second of a LeRobot dataset")
+    parser.add_argument("--task", default="", metavar="TEXT", help="what the robot does, for a LeRobot dataset")
+    parser.add_argument(
+        "--python", metavar="PATH", help="an interpreter that has LeRobot; it is not needed in this one"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace OUTPUT if it exists")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: ConvertArguments) -> int:
+    """Convert.
+
+    Raises:
+        CommandError: The recording, the output or an option cannot be used, or a library is missing.
+    """
+    kind = arguments.format or arguments.output.suffix[1:].lower()
+    if kind not in _FORMATS:
+        raise CommandError(f"{arguments.output}: name the format with --format {'|'.join(_FORMATS)}, or by the ending")
+    if arguments.output.exists() and (kind == "lerobot" or not arguments.overwrite):
+        advice = "name a folder that does not" if kind == "lerobot" else "--overwrite replaces it"
+        raise CommandError(f"{arguments.output} exists; {advice}")
+    try:
+        from urlab_client.integrations.record import read_run  # noqa: PLC0415
+
+        recording = read_run(arguments.recording)
+        write, what = _writer(kind, recording, arguments)
+        with progress_bar(f"{arguments.recording.name} → {kind}", recording.path.stat().st_size) as progress:
+            if kind == "lerobot":
+                written = write(arguments.output, progress=progress)
+            else:
+                with replaced(arguments.output) as temporary:
+                    written = write(temporary, progress=progress)
+    except ImportError as error:
+        raise CommandError(str(error)) from None
+    except KeyError as error:
+        raise CommandError(str(error.args[0])) from None
+    print(f"{arguments.output}  {written} {what}")
+    if recording.damage:
+        print(f"{arguments.recording} was not finished: it holds what was written before ({recording.damage})")
+    return 0
+
+
+def _writer(kind: str, recording: Run, arguments: ConvertArguments) -> tuple[Callable[..., int], str]:
+    from urlab_client.integrations.record import export  # noqa: PLC0415
+
+    cameras = arguments.camera
+    match kind:
+        case "csv":
+            return partial(export.write_csv, recording), "states"
+        case "parquet":
+            return partial(export.write_parquet, recording), "states"
+        case "npz":
+            return partial(export.write_npz, recording, cameras=cameras), "states"
+        case "mp4":
+            if len(cameras) != 1:
+                there = cameras or recording.cameras()
+                if cameras or len(there) != 1:
+                    raise CommandError(
+                        f"a video shows one camera: give one --camera; there are {', '.join(there) or 'none'}"
+                    )
+                cameras = there
+            return partial(export.write_mp4, recording, camera=cameras[0]), "pictures"
+        case _:
+            if not arguments.task or not arguments.python:
+                raise CommandError(
+                    "a LeRobot dataset needs --task TEXT, and --python PATH of an interpreter that has LeRobot"
+                )
+            return partial(
+                export.write_lerobot,
+                recording,
+                python=arguments.python,
+                fps=arguments.fps,
+                task=arguments.task,
+                cameras=cameras or None,
+            ), "frames"

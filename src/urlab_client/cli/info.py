@@ -1,0 +1,102 @@
+"""`urlab info`: what is in a recording."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from urlab_client.cli._arguments import Commands
+from urlab_client.cli._failure import CommandError
+from urlab_client.cli._progress import progress_bar
+
+if TYPE_CHECKING:
+    from urlab_client.integrations.record import Summary
+
+__all__ = ["add_parser", "run"]
+
+_UNFINISHED = 1
+
+
+class InfoArguments(argparse.Namespace):
+    """What the command line says."""
+
+    recording: Path
+    json: bool
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command to the parser."""
+    parser = commands.add_parser(
+        "info",
+        help="show what is in a recording",
+        description="Show duration, topics, rates and gaps of a recording. Exit code 0, or 1 when the file was not "
+        "finished or states were dropped. Needs the extra 'urlab-client[mcap]'.",
+    )
+    parser.add_argument("recording", type=Path, metavar="FILE", help="the recording, a .mcap file")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: InfoArguments) -> int:
+    """Print the summary; return 0 for a whole recording, else 1.
+
+    Raises:
+        CommandError: A library is missing.
+    """
+    try:
+        from urlab_client.integrations.record import read_run  # noqa: PLC0415
+    except ImportError as error:
+        raise CommandError(str(error)) from None
+    recording = read_run(arguments.recording)
+    with progress_bar(arguments.recording.name, recording.path.stat().st_size) as progress:
+        summary = recording.summary(progress)
+    if arguments.json:
+        sys.stdout.write(f"{msgspec.json.encode(summary, enc_hook=str).decode()}\n")
+    else:
+        _print(summary)
+    return 0 if summary.complete and not (summary.dropped_states or summary.dropped_frames) else _UNFINISHED
+
+
+def _print(summary: Summary) -> None:
+    from rich import box  # noqa: PLC0415
+    from rich.console import Console  # noqa: PLC0415
+    from rich.table import Table  # noqa: PLC0415
+
+    about = summary.about
+    print(f"{summary.path}  {summary.path.stat().st_size / 2**20:.1f} MiB")
+    print(
+        f"{about.get('started', '?')}  {about.get('address', '?')}  {about.get('step_mode', '?')} mode  "
+        f"server {about.get('urlab_version', '?')}, MuJoCo {about.get('mujoco_version', '?')}"
+    )
+    print(f"{summary.duration_s:.3f} s simulated in {summary.wall_s:.3f} s, {_counted(summary.episodes, 'episode')}")
+    if not summary.complete:
+        print(f"not finished: {summary.damage or 'the end of the file is missing'}")
+    if summary.dropped_states or summary.dropped_frames:
+        print(
+            f"dropped: {_counted(summary.dropped_states, 'state')}, {_counted(summary.dropped_frames, 'picture')}, "
+            "which came faster than the file could be written"
+        )
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
+    table.add_column("topic", overflow="fold")
+    table.add_column("schema", overflow="fold")
+    for heading in ("messages", "rate (Hz)", "gaps", "longest (s)"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for topic in summary.topics.values():
+        table.add_row(
+            topic.name,
+            topic.schema,
+            str(topic.messages),
+            f"{topic.rate_hz:.1f}" if topic.rate_hz else "",
+            str(topic.gaps),
+            f"{topic.longest_gap_s:.3f}" if topic.longest_gap_s else "",
+        )
+    console = Console()
+    (console if console.is_terminal else Console(width=120)).print(table)
+
+
+def _counted(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"

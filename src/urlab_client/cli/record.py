@@ -1,0 +1,168 @@
+"""`urlab record`: a run into a file."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import signal
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from urlab_client.cli._arguments import Commands, add_keys, port, seconds
+from urlab_client.cli._failure import CommandError
+from urlab_client.cli._mujoco import import_mujoco
+from urlab_client.cli._progress import progress_bar
+from urlab_client.protocol.enums import StepMode
+
+if TYPE_CHECKING:
+    from urlab_client.aio import URLabClient
+    from urlab_client.integrations.record import AsyncRecorder
+
+__all__ = ["add_parser", "run"]
+
+_LOOK_S = 0.05
+_DROPPED = 1
+
+
+class RecordArguments(argparse.Namespace):
+    """What the command line says."""
+
+    address: str
+    output: Path
+    step_port: int
+    state_port: int
+    step_mode: StepMode
+    duration: float
+    keyframe: str | None
+    camera: list[str]
+    camera_hz: float
+    contacts: bool
+    overwrite: bool
+    server_key: str | None
+    client_key: str | None
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command to the parser."""
+    parser = commands.add_parser(
+        "record",
+        help="record a running simulation into an MCAP file",
+        description="Record states, poses and pictures of a play session into a file that Foxglove opens. In live mode "
+        "physics runs by itself and is watched; in direct mode this command resets and steps it, with all set-points "
+        "zero or those of the keyframe. Opens a session, which takes the server over from the client that drives it; a "
+        "program of your own can call record(client, FILE). Ctrl-C ends the recording early. Exit code 1 when states "
+        "were dropped. Needs the extra 'urlab-client[mcap]'.",
+    )
+    parser.add_argument("address", help="tcp://HOST, tcp://HOST:PORT or sim://MODEL")
+    parser.add_argument("output", type=Path, metavar="FILE", help="the file to write, a .mcap file")
+    parser.add_argument("--step-port", type=port, default=5559, metavar="PORT", help="RPC port (default: %(default)s)")
+    parser.add_argument(
+        "--state-port", type=port, default=5555, metavar="PORT", help="state stream (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--step-mode",
+        type=StepMode,
+        choices=[StepMode.LIVE, StepMode.DIRECT],
+        default=StepMode.LIVE,
+        help="live or direct (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--duration", type=seconds, default=10.0, metavar="S", help="simulated seconds (default: %(default)s)"
+    )
+    parser.add_argument("--keyframe", metavar="NAME", help="keyframe to start from, in direct mode")
+    parser.add_argument(
+        "--camera",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="a camera to keep, as ARTICULATION/CAMERA, or 'all'; may be repeated",
+    )
+    parser.add_argument(
+        "--camera-hz", type=seconds, default=30.0, metavar="HZ", help="pictures per second (default: %(default)s)"
+    )
+    parser.add_argument("--contacts", action="store_true", help="keep contacts, too")
+    parser.add_argument("--overwrite", action="store_true", help="replace FILE if it exists")
+    add_keys(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: RecordArguments) -> int:
+    """Record; return 1 if states were dropped, else 0.
+
+    Raises:
+        CommandError: The file or an option cannot be used, or a library is missing.
+    """
+    import_mujoco()
+    if arguments.output.exists() and not arguments.overwrite:
+        raise CommandError(f"{arguments.output} exists; --overwrite replaces it")
+    if arguments.keyframe is not None and arguments.step_mode is not StepMode.DIRECT:
+        raise CommandError("--keyframe resets the simulation, which needs --step-mode direct")
+    try:
+        import urlab_client.integrations.record  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]
+    except ImportError as error:
+        raise CommandError(str(error)) from None
+    try:
+        recorder = asyncio.run(_record(arguments))
+    except KeyError as error:
+        raise CommandError(str(error.args[0])) from None
+    stats = recorder.stats
+    print(
+        f"{arguments.output}  {stats.states} states, {stats.frames} pictures, {stats.file_bytes / 2**20:.1f} MiB"
+        + (
+            f"; dropped {stats.dropped_states} and {stats.dropped_frames}"
+            if stats.dropped_states or stats.dropped_frames
+            else ""
+        )
+    )
+    return _DROPPED if stats.dropped_states else 0
+
+
+async def _record(arguments: RecordArguments) -> AsyncRecorder:
+    from urlab_client.aio import URLabClient  # noqa: PLC0415
+    from urlab_client.integrations.record import record  # noqa: PLC0415
+
+    client = URLabClient(
+        arguments.address,
+        step_port=arguments.step_port,
+        state_port=arguments.state_port,
+        step_mode=arguments.step_mode,
+        server_key=arguments.server_key,
+        client_key=arguments.client_key,
+    )
+    async with client:
+        await client.discover()
+        recorder = record(
+            client,
+            arguments.output,
+            cameras="all" if "all" in arguments.camera else arguments.camera,
+            camera_hz=arguments.camera_hz,
+            contacts=arguments.contacts,
+            overwrite=arguments.overwrite,
+        )
+        stop = asyncio.Event()
+        loop = asyncio.get_running_loop()
+        loop.add_signal_handler(signal.SIGINT, stop.set)
+        try:
+            if arguments.step_mode is StepMode.DIRECT:
+                await client.reset(arguments.keyframe)
+            async with recorder:
+                await _until_done(client, recorder, arguments, stop)
+        finally:
+            loop.remove_signal_handler(signal.SIGINT)
+    return recorder
+
+
+async def _until_done(
+    client: URLabClient, recorder: AsyncRecorder, arguments: RecordArguments, stop: asyncio.Event
+) -> None:
+    direct = arguments.step_mode is StepMode.DIRECT
+    if not direct:
+        await client.runtime.set_paused(False)
+    start = client.sim_time
+    with progress_bar(f"recording {arguments.output.name}", arguments.duration) as progress:
+        while (done := client.sim_time - start) < arguments.duration - 1e-9 and not (stop.is_set() or recorder.failed):
+            progress(done)
+            if direct:
+                await client.step()
+            else:
+                await asyncio.sleep(_LOOK_S)

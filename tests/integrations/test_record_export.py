@@ -1,0 +1,246 @@
+"""Recordings turned into other files, read back and compared with the recording."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+from pyarrow import parquet
+
+import urlab_client
+from urlab_client.cli import main
+from urlab_client.integrations.record import RecordingError, Run, export, read_run, record
+from urlab_client.server import SimulatedServer
+
+# Stands in for LeRobot, which the tests do not install: keeps what it is given.
+LEROBOT = """
+import json
+from pathlib import Path
+class LeRobotDataset:
+    @classmethod
+    def create(cls, repo_id, fps, features, root, use_videos):
+        made = cls()
+        made.root, made.frames, made.log = Path(root), [], {"fps": fps, "repo_id": repo_id, "episodes": []}
+        made.log["features"] = {k: [v["dtype"], list(v["shape"]), v["names"]] for k, v in features.items()}
+        return made
+    def add_frame(self, frame):
+        for name, (dtype, shape, _) in self.log["features"].items():
+            assert list(frame[name].shape) == shape
+            assert str(frame[name].dtype) == ("uint8" if dtype == "image" else dtype)
+        self.frames.append({k: v if isinstance(v, str) else v.ravel()[:20].tolist() for k, v in frame.items()})
+    def save_episode(self):
+        self.log["episodes"].append(self.frames)
+        self.frames = []
+    def finalize(self):
+        self.root.mkdir()
+        (self.root / "log.json").write_text(json.dumps(self.log))
+"""
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Two episodes of two arms, with pictures of odd size and depths."""
+    folder = tmp_path_factory.mktemp("recorded")
+    mjcf = folder / "eye.xml"
+    mjcf.write_text(
+        "<mujoco><visual><global offwidth='64' offheight='64'/></visual><worldbody><light pos='0 0 3'/>"
+        "<body name='base'><geom type='box' size='.1 .2 .1' rgba='1 0 0 1' mass='1'/>"
+        "<joint name='spin' axis='0 0 1'/>"
+        "<camera name='up' pos='0 0 1' resolution='33 21'/></body></worldbody>"
+        "<actuator><motor name='spin' joint='spin'/></actuator></mujoco>",
+        encoding="utf-8",
+    )
+    rng = np.random.default_rng(2)
+    with (
+        SimulatedServer("arm", str(mjcf), play=True, model_roots=[folder]) as server,
+        urlab_client.URLabClient(**server.client_options(), step_mode="direct") as client,
+    ):
+        client.discover()
+        client.reset()
+        with record(client, folder / "run.mcap", cameras=["eye/up"], camera_hz=25, image_format="png"):
+            for i in range(100):
+                for art in client.articulations.values():
+                    art.ctrl_array[:] = rng.uniform(-0.3, 0.3, len(art.ctrl_array))
+                if i == 60:
+                    client.reset()
+                else:
+                    client.step(n_steps=2)
+    return read_run(folder / "run.mcap")
+
+
+def test_csv_and_parquet_hold_every_value_to_the_bit(recorded: Run, tmp_path: Path) -> None:
+    flat = recorded.table().flat()
+    assert export.write_csv(recorded, tmp_path / "run.csv") == 100
+    assert export.write_parquet(recorded, tmp_path / "run.parquet") == 100
+    with (tmp_path / "run.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    table = parquet.read_table(tmp_path / "run.parquet")
+    assert list(rows[0]) == table.column_names == list(flat)
+    assert {"time", "episode", "arm/qpos/shoulder_pan", "arm/sensors/grip_position.0", "eye/ctrl/spin"} <= flat.keys()
+    for name, column in flat.items():
+        assert np.array([type(column[0].item())(row[name]) for row in rows], column.dtype).tobytes() == column.tobytes()
+        assert table[name].to_numpy().tobytes() == column.tobytes()
+
+
+def test_npz_holds_arrays_names_and_pictures(recorded: Run, tmp_path: Path) -> None:
+    export.write_npz(recorded, tmp_path / "run.npz", cameras=["eye/up"])
+    table, pictures = recorded.table(), list(recorded.frames("eye/up"))
+    with np.load(tmp_path / "run.npz", allow_pickle=False) as arrays:
+        for key, column in table.columns.items():
+            assert arrays[key].tobytes() == column.values.tobytes()
+            assert arrays[f"{key}.names"].tolist() == column.names
+        assert arrays["camera/eye/up"].shape == (len(pictures), 21, 33, 3)
+        assert np.array_equal(arrays["camera/eye/up"][-1], pictures[-1].pixels)
+        assert arrays["camera/eye/up.time"].tolist() == [picture.time for picture in pictures]
+
+
+def test_mp4_shows_each_picture_at_its_time(recorded: Run, tmp_path: Path) -> None:
+    pictures = list(recorded.frames("eye/up"))
+    assert export.write_mp4(recorded, tmp_path / "run.mp4", "eye/up") == len(pictures) > 8
+    with av.open(tmp_path / "run.mp4") as container:
+        frames = [(float(frame.time), frame.to_ndarray(format="rgb24")) for frame in container.decode(video=0)]
+    assert len(frames) == len(pictures)
+    for (time, shown), picture in zip(frames, pictures, strict=True):
+        assert time == pytest.approx(picture.time - pictures[0].time, abs=1e-4)
+        assert shown.shape == (22, 34, 3)
+        assert np.abs(shown[:21, :33].astype(int) - picture.pixels).mean() < 12
+    with pytest.raises(KeyError, match="eye/up"):
+        export.write_mp4(recorded, tmp_path / "none.mp4", "eye/down")
+
+
+def test_depth_becomes_grey() -> None:
+    depths = np.array([[0.0, 1.0], [2.0, np.inf]], dtype=np.float32)
+    assert export._visible(depths, 2.0)[..., 0].tolist() == [[255, 128], [0, 0]]
+
+
+@pytest.fixture
+def lerobot(tmp_path: Path) -> str:
+    """An interpreter that has something called LeRobot."""
+    package = tmp_path / "site" / "lerobot" / "datasets"
+    package.mkdir(parents=True)
+    for folder in (package, package.parent):
+        (folder / "__init__.py").touch()
+    (package / "lerobot_dataset.py").write_text(LEROBOT, encoding="utf-8")
+    script = tmp_path / "python"
+    script.write_text(f'#!/bin/sh\nPYTHONPATH="{tmp_path / "site"}" exec "{sys.executable}" "$@"\n', encoding="utf-8")
+    script.chmod(0o755)
+    return str(script)
+
+
+def test_a_lerobot_dataset_is_written_by_the_other_interpreter(recorded: Run, tmp_path: Path, lerobot: str) -> None:
+    written = export.write_lerobot(recorded, tmp_path / "spins", python=lerobot, fps=50, task="spin")
+    log: dict[str, Any] = json.loads((tmp_path / "spins" / "log.json").read_text())
+    table = recorded.table()
+    assert (log["fps"], log["repo_id"]) == (50, "local/spins")
+    assert log["features"]["observation.state"][1:] == [
+        [9],
+        [f"arm.{n}" for n in table.columns["arm/qpos"].names] + ["eye.spin"],
+    ]
+    assert log["features"]["observation.images.eye.up"][:2] == ["image", [21, 33, 3]]
+    assert [len(episode) for episode in log["episodes"]] == [12, 8]
+    assert sum(map(len, log["episodes"])) == written
+    row = 60 + 5 * 5  # the sixth frame of the second episode: 0.02 s are five samples
+    frame = log["episodes"][1][5]
+    assert frame["task"] == "spin"
+    state = np.concatenate([table.columns[f"{key}/qpos"].values[row] for key in ("arm", "eye")])
+    assert frame["observation.state"] == state.astype(np.float32).tolist()
+    with pytest.raises(FileExistsError):
+        export.write_lerobot(recorded, tmp_path / "spins", python=lerobot, fps=50, task="spin")
+
+
+def test_a_missing_lerobot_is_told(recorded: Run, tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"has no LeRobot: .*No module named 'lerobot'.*--python"):
+        export.write_lerobot(recorded, tmp_path / "data", python=sys.executable, fps=50, task="x")
+    with pytest.raises(RecordingError, match="cannot be run"):
+        export.write_lerobot(recorded, tmp_path / "data", python=str(tmp_path / "nothing"), fps=50, task="x")
+    assert not (tmp_path / "data").exists()
+
+
+# The commands
+
+
+def run(*arguments: object) -> int:
+    return main([str(argument) for argument in arguments])
+
+
+def test_info_tells_what_is_there(recorded: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("info", recorded.path) == 0
+    shown = capsys.readouterr().out
+    for part in ("2 episodes", "/state/arm", "foxglove.CompressedImage", "250.0", "direct mode"):
+        assert part in shown
+    assert run("info", recorded.path, "--json") == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["topics"]["/state/arm"]["messages"] == 100
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(recorded.path.read_bytes()[:-100])
+    assert run("info", cut) == 1
+    assert "not finished" in capsys.readouterr().out
+    cut.write_bytes(b"nonsense" * 10)
+    assert run("info", cut) == 2
+    assert "no MCAP file" in capsys.readouterr().err
+    assert run("info", tmp_path / "none.mcap") == 2
+    assert "No such file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", ["csv", "npz", "parquet", "mp4"])
+def test_convert_writes_whole_files_and_overwrites_only_when_told(
+    recorded: Run, tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target = tmp_path / f"run.{kind}"
+    target.write_text("precious", encoding="utf-8")
+    assert run("convert", recorded.path, target) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert target.read_text(encoding="utf-8") == "precious"
+    assert run("convert", recorded.path, target, "--overwrite") == 0
+    assert target.stat().st_size > 500
+    assert os.listdir(tmp_path) == [target.name]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["out"], "--format"),
+        (["out.mp4", "--camera", "nose"], "no pictures of 'nose'"),
+        (["out", "--format", "lerobot"], "--task"),
+        (["out", "--format", "lerobot", "--task", "x", "--python", sys.executable], "has no LeRobot"),
+    ],
+)
+def test_convert_says_what_is_wrong(
+    recorded: Run, tmp_path: Path, arguments: list[str], complaint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, *rest = arguments
+    assert run("convert", recorded.path, tmp_path / out, *rest) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert complaint in line
+    assert os.listdir(tmp_path) == []
+
+
+def test_plot_draws_the_joints_that_are_named(
+    recorded: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("plot", recorded.path, "--joints", "arm/shoulder*", "spin", "-o", tmp_path / "a.png") == 0
+    assert "3 curves, 100 states" in capsys.readouterr().out
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+    assert run("plot", recorded.path, "--joints", "nose", "-o", tmp_path / "b.png") == 2
+    assert "arm/shoulder_pan" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("mode", ["direct", "live"])
+def test_record_steps_or_watches(mode: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "run.mcap"
+    with SimulatedServer("arm", play=True) as server:
+        ports = ["--step-port", server.step_port, "--state-port", server.state_port]
+        command = ["record", server.address, path, *ports, "--step-mode", mode, "--duration", "0.3"]
+        assert run(*command) == 0
+        assert run(*command) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    table = read_run(path).table()
+    assert table.sim_time[-1] - table.sim_time[0] >= 0.29
+    assert np.allclose(np.diff(table.sim_time), 0.002)
