@@ -18,7 +18,7 @@ from urlab_client.aio.state import SimState
 from urlab_client.integrations.record.scene import Scene
 from urlab_client.integrations.record.writer import Picture, RecorderStats, Schedule, State, WriterOptions, WriterThread
 from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.errors import ClientClosed, ForkedError, StreamOverflow, URLabError
+from urlab_client.protocol.errors import ClientClosed, StreamOverflow, URLabError
 from urlab_client.protocol.messages.session import ResetOk, StateReply, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.sync._portal import Portal, aio_of
@@ -57,7 +57,8 @@ class AsyncRecorder:
         self._path = path
         self._writer: WriterThread | None = None
         self._scene: Scene | None = None
-        self._model: object = None
+        self._described: object = None
+        self._expected = False
         self._tasks: list[asyncio.Task[None]] = []
         self._live = False
 
@@ -85,7 +86,7 @@ class AsyncRecorder:
             raise URLabError(
                 "record: what there is to record is not known yet.", hint="Call discover() first, during play."
             )
-        self._scene = self._describe()
+        self._current()
         self._writer = WriterThread(self._path, self._options())
         await anyio.to_thread.run_sync(self._writer.open)
         self._state.observers.append(self)
@@ -97,13 +98,13 @@ class AsyncRecorder:
         self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self._detach()
-        if self._tasks:
-            await asyncio.wait(self._tasks)
+        for outcome in await asyncio.gather(*self._tasks, return_exceptions=True):
+            if isinstance(outcome, Exception):
+                log.warning("%s: a stream was not recorded to its end: %s", self._path, outcome)
         writer = self._writer
         if writer is None:
             return
         try:
-            # Cancelled or not, the thread finishes the file.
             await anyio.to_thread.run_sync(writer.close, abandon_on_cancel=True)
         except URLabError:
             if exc is None:
@@ -132,11 +133,12 @@ class AsyncRecorder:
     def wanted_pictures(self, asked: bool | dict[str, str | None], n_steps: int) -> bool | dict[str, str | None]:
         """Add the cameras to a step when their next picture is due; see `StateObserver`."""
         state = self._state
-        if asked is True or state.mode is StepMode.LIVE or self._wanted_cameras == ():
+        if state.mode is StepMode.LIVE or not self._wanted_cameras:
             return asked
         timestep = 0.0 if state.mirror.model is None else state.mirror.model.opt.timestep
         then = round((state.sim_time + max(n_steps, 1) * timestep) * _NS)
-        if not self._pictures.due(then):
+        self._expected = self._pictures.due(then)
+        if asked is True or not self._expected:
             return asked
         chosen = dict(asked or {})
         known = {id(state.camera(name)) for name in chosen}
@@ -149,8 +151,16 @@ class AsyncRecorder:
 
     def _current(self) -> Scene:
         """Return the scene, described anew when there was another handshake."""
-        if self._scene is None or self._state.mirror.model is not self._scene.model:
-            self._scene = self._describe()
+        model = self._state.mirror.model
+        if self._scene is None or model is not self._described:
+            self._described = model
+            try:
+                self._scene = self._describe()
+            except (KeyError, URLabError) as error:
+                if self._scene is None:
+                    raise
+                # The client goes on, and so does the recording, with what it knows.
+                log.warning("%s: the new scene lacks what is recorded: %s", self._path, error)
         return self._scene
 
     def _describe(self) -> Scene:
@@ -183,21 +193,14 @@ class AsyncRecorder:
         writer = self._writer
         if writer is None:
             return
-        state = self._state
-        try:
-            scene = self._current()
-        except (KeyError, URLabError) as error:
-            # Another handshake, for a world that lacks what is recorded: the old names go on.
-            if self._scene is None:
-                return
-            log.debug("the scene of %s is not described anew: %s", self._path, error)
-            scene = self._scene
+        state, scene = self._state, self._current()
         clock, wall = reply.sim_time, reply.wall_time
         nanoseconds = round(reply.time * _NS) if clock is None else clock.sec * _NS + clock.nsec
         wall_ns = state.recv_wall_time_ns if wall is None else wall.sec * _NS + wall.nsec
         set_points = {key: record.ctrl.tolist() for key, record in state.records.items()}
         writer.put(State(scene, reply, set_points, nanoseconds, isinstance(reply, ResetOk), wall_ns))
-        if isinstance(reply, StepOk) and reply.cameras:
+        if isinstance(reply, StepOk) and reply.cameras and self._expected:
+            self._expected = False
             for name, frame in reply.cameras.items():
                 camera = scene.cameras.get(id(state.camera(name)))
                 if camera is not None:
@@ -219,6 +222,8 @@ class AsyncRecorder:
         if self in self._state.observers:
             self._state.observers.remove(self)
         self._ignore()
+        if self._writer is not None:
+            self._writer.end()  # from here on it finishes the file, whatever becomes of the caller
 
     async def _follow_states(self) -> None:
         last: float | None = None
@@ -282,7 +287,7 @@ class Recorder:
     ) -> None:
         try:
             self._portal.call(self._aio.__aexit__(exc_type, exc, traceback))
-        except (ClientClosed, ForkedError):
+        except ClientClosed:
             self._aio.finish()
 
 

@@ -12,8 +12,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import version
-from io import BufferedWriter
 from pathlib import Path
+from typing import IO, cast
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
@@ -179,7 +179,7 @@ class WriterThread:
         # Each number has one writer, so no lock: the producer adds, the thread takes away.
         self._put_bytes = self._taken_bytes = 0
         self._dropped_states = self._dropped_frames = 0
-        self._file: _Counted | None = None
+        self._file: _File | None = None
         self._sink: _Sink | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="urlab-record", daemon=True)
@@ -190,12 +190,11 @@ class WriterThread:
         Raises:
             OSError: The file cannot be made, or exists already.
         """
-        raw = io.FileIO(self.path, "wb" if self._options.overwrite else "xb")
-        self._file = _Counted(raw)
+        self._file = _File(self.path, "wb" if self._options.overwrite else "xb")
         try:
             self._sink = _Sink(self._file, self._options)
         except BaseException:
-            raw.close()
+            self._file.close()
             raise
         self._thread.start()
 
@@ -226,13 +225,17 @@ class WriterThread:
         self._put_bytes += size
         self._queue.append((item, size))
 
+    def end(self) -> None:
+        """Let the thread write what waits and finish the file, without waiting for that."""
+        self._stop.set()
+
     def close(self) -> None:
         """Write what waits, finish the file, and wait for that. Idempotent.
 
         Raises:
             RecordingError: Something could not be written.
         """
-        self._stop.set()
+        self.end()
         self._thread.join()
         if self.error is not None:
             stats = self.stats
@@ -258,7 +261,7 @@ class WriterThread:
         except Exception as error:  # noqa: BLE001  # whatever it was, the simulation goes on and `close` tells
             self._fail(RecordingError(f"{self.path}: the recording broke off: {error!r}"))
         finally:
-            with contextlib.suppress(OSError):  # a buffer that cannot be written: told already
+            with contextlib.suppress(OSError):  # told already, if it could not be written
                 file.close()
 
     def _drain(self, sink: _Sink) -> None:
@@ -279,17 +282,32 @@ class WriterThread:
                 self._dropped_frames += 1
 
 
-class _Counted(BufferedWriter):
-    """A buffered file that knows how much went through it."""
+class _File:
+    """A file without a buffer in this process, which a forked child would write a second time."""
 
-    def __init__(self, raw: io.FileIO) -> None:
-        super().__init__(raw)
+    def __init__(self, path: Path, mode: str) -> None:
         self.written = 0
+        self._raw = io.FileIO(path, mode)
 
-    def write(self, data: bytes) -> int:  # type: ignore[override]  # the writer passes bytes only
-        """Count and write."""
-        self.written += len(data)
-        return super().write(data)
+    def write(self, data: bytes) -> int:
+        """Write all of it."""
+        rest = memoryview(data)
+        while rest:
+            count = self._raw.write(rest) or 0
+            self.written += count
+            rest = rest[count:]
+        return len(data)
+
+    def tell(self) -> int:
+        """Return the position, which is the end."""
+        return self.written
+
+    def flush(self) -> None:
+        """Do nothing: what was written is with the operating system."""
+
+    def close(self) -> None:
+        """Close it."""
+        self._raw.close()
 
 
 @dataclass(slots=True)
@@ -302,7 +320,7 @@ class _Topic:
 class _Sink:
     """Encodes items and writes them. All of it happens in the writing thread, apart from making it."""
 
-    file: _Counted
+    file: _File
     options: WriterOptions
     states: int = 0
     frames: int = 0
@@ -316,11 +334,10 @@ class _Sink:
 
     def __post_init__(self) -> None:
         self._poses = Schedule(self.options.pose_ns)
-        self._writer = Writer(self.file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._writer = Writer(cast("IO[bytes]", self.file), chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._writer.start(profile="", library=f"urlab-client {version('urlab-client')}")
         started = datetime.now(UTC).isoformat(timespec="milliseconds")
         self._writer.add_metadata("urlab", {"format": FORMAT, "started": started, **self.options.about})
-        self.file.flush()
 
     def write(self, item: State | Picture) -> None:
         """Write one item."""
@@ -349,7 +366,6 @@ class _Sink:
         self._writer.flush()  # metadata stands outside of chunks, and would come before the last one
         self._writer.add_metadata("urlab.end", {name: str(count) for name, count in totals.items()})
         self._writer.finish()
-        self.file.flush()
 
     def _write_state(self, item: State) -> None:
         reply = item.reply
