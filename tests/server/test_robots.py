@@ -60,7 +60,7 @@ def test_the_models_are_found_by_name() -> None:
 def test_the_models_are_packaged() -> None:
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
 
-    assert project["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"] == ["src/urlab_client"]
+    assert project["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"] == ["src/urlab_client", "src/pytest_urlab"]
     assert all(path.is_relative_to(Path(__file__).parents[2] / "src") for path in bundled_models().values())
 
 

@@ -24,6 +24,7 @@ from urlab_client import URLabClient
 from urlab_client.protocol.enums import CameraMode, StepMode
 from urlab_client.server import ControllerConfig, ModelError, PortInUse, SimulatedServer, bundled_models
 from urlab_client.server import core as core_module
+from urlab_client.server.limits import Limits
 from urlab_client.server.scene import compile_scene
 from urlab_client.server.world import World
 
@@ -215,7 +216,7 @@ def test_close_during_a_long_step(models: Path, connect: Connect) -> None:
         wire = connect(server)
         wire.hello()
         wire.ask("set_mode", mode="direct")
-        reply = ask_later(wire, "step", n_steps=2**31 - 1)
+        reply = ask_later(wire, "step", n_steps=Limits().n_steps)
         running = server._opened._core.play.running()
         while running.engine.time == 0.0:
             pass
@@ -299,7 +300,7 @@ def test_a_released_port_can_be_taken_again(models: Path, connect: Connect) -> N
     ("host", "address"), [("localhost", "tcp://127.0.0.1"), ("0.0.0.0", "tcp://127.0.0.1"), ("*", "tcp://127.0.0.1")]
 )
 def test_hosts(host: str, address: str, connect: Connect) -> None:
-    with SimulatedServer(host=host) as server:
+    with SimulatedServer(host=host, insecure_no_auth=host != "localhost") as server:
         assert server.address == address
         connect(server).hello()
 
@@ -307,7 +308,7 @@ def test_hosts(host: str, address: str, connect: Connect) -> None:
 @pytest.mark.parametrize("host", ["no-such-host.invalid", "203.0.113.1"])
 def test_a_host_of_another_machine(host: str) -> None:
     with pytest.raises(OSError, match=host):
-        SimulatedServer(host=host).start()
+        SimulatedServer(host=host, insecure_no_auth=True).start()
 
 
 def test_a_client_that_goes_away_disturbs_nobody(connect: Connect) -> None:
@@ -514,7 +515,8 @@ def test_cameras_as_configured(serve: Serve) -> None:
 
 def test_configured_names_that_fit_nothing(serve: Serve, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING, "urlab_client.server"):
-        serve("bot", play=True, controllers={"bto": ControllerConfig()}, camera_modes={"bot/eye": "depth"})
+        wire = serve("bot", controllers={"bto": ControllerConfig()}, camera_modes={"bot/eye": "depth"})
+        assert wire.ask("begin_pie", timeout_s=60)["state"] == "ready"
     assert "'bto'" in caplog.text
     assert "'bot/eye'" in caplog.text
 
