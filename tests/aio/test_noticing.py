@@ -207,6 +207,23 @@ async def test_garbage_on_the_line_is_a_typed_error_and_the_next_call_works(
         await client.step()
 
 
+@pytest.mark.parametrize(
+    "junk", [b"HTTP/1.1 400 Bad Request\r\n\r\n", b"\xff" * 4096, b"\xff" + bytes(8) + b"\x7f\x03"]
+)
+async def test_garbage_in_the_handshake_of_a_reconnection_does_not_end_it_for_good(
+    server: SimulatedServer, junk: bytes
+) -> None:
+    options = server.client_options() | {"step_mode": "direct"}
+    async with Relay(options["step_port"]) as relay, URLabClient(**(options | {"step_port": relay.port})) as client:
+        await client.discover()
+        events = client.events()
+        relay.garble(junk)
+        relay.cut()
+        await until(events, ServerLost)
+        await until(events, ServerReconnected)
+        await client.step()
+
+
 async def test_a_probe_gives_way_to_a_call(client: Any, scripted: Any) -> None:
     """A server that leaves the client's own question unanswered must not delay the user's."""
     scripted.on("hello", scripted.answers["hello"]({}) | {"manager_present": True, "entities": {}})

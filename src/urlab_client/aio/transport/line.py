@@ -12,7 +12,17 @@ from typing import Final
 
 import zmq
 
-__all__ = ["FAILED_HANDSHAKES", "NOTICED_S", "OBSTACLES", "RETRYING", "REVIVE_S", "WATCHED", "configure", "reconnect"]
+__all__ = [
+    "FAILED_HANDSHAKES",
+    "NOTICED_S",
+    "OBSTACLES",
+    "RETRYING",
+    "RETRY_S",
+    "REVIVE_S",
+    "WATCHED",
+    "configure",
+    "reconnect",
+]
 
 HEARTBEAT_MS = 1000
 SILENCE_MS = 3000
@@ -55,6 +65,9 @@ RETRYING: Final = (zmq.Event.CONNECT_RETRIED, zmq.Event.CONNECTED, zmq.Event.HAN
 REVIVE_S: Final = 0.1
 """Seconds after a loss by which one of those has come, or never will: ZeroMQ gives up a connection over which garbage
 came."""
+
+RETRY_S: Final = 2 * RECONNECT_MAX_MS / 1000
+"""The same after a handshake that failed, where ZeroMQ itself may be waiting before it tries again."""
 
 
 def reconnect(socket: zmq.Socket[bytes], endpoint: str) -> None:
