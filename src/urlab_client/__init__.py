@@ -184,7 +184,13 @@ def _load(name: str) -> Any:
     if name == "__version__":
         # Reading the installed metadata costs milliseconds that most programs need not pay.
         return import_module("importlib.metadata").version("urlab-client")
-    return next(getattr(module, name) for module in map(import_module, _HOMES) if hasattr(module, name))
+    try:
+        return next(getattr(module, name) for module in map(import_module, _HOMES) if hasattr(module, name))
+    except (ImportError, StopIteration) as error:
+        # A file is missing or is somebody else's; the message of a dependency's own failure stands.
+        if found := import_module("urlab_client._installation").conflict():
+            raise ImportError(f"cannot load urlab_client.{name}: {found}") from error
+        raise
 
 
 def __dir__() -> list[str]:

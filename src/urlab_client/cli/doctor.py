@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import logging
 import sys
 
 import msgspec
 
+from urlab_client._installation import conflict
 from urlab_client.cli._arguments import Commands, add_keys, port, seconds
 from urlab_client.cli._mujoco import import_mujoco
 from urlab_client.protocol.enums import StepMode
@@ -18,6 +20,8 @@ from urlab_client.protocol.types import Diagnosis
 __all__ = ["add_parser", "run"]
 
 _UNHEALTHY = 1
+
+logger = logging.getLogger("urlab_client.cli")
 
 
 class DoctorArguments(argparse.Namespace):
@@ -67,6 +71,8 @@ def add_parser(commands: Commands) -> None:
 
 def run(arguments: DoctorArguments) -> int:
     """Print the diagnosis and return 0 when nothing keeps robots from moving, else 1."""
+    if found := conflict():
+        logger.warning("%s", found)
     import_mujoco()
     diagnosis = asyncio.run(_diagnose(arguments))
     sys.stdout.write(f"{msgspec.json.encode(diagnosis).decode() if arguments.json else diagnosis}\n")

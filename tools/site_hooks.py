@@ -1,0 +1,78 @@
+"""What the site adds to the pages in `docs/`, as hooks of MkDocs.
+
+The pages at the root of the repository belong to the site, too, and links between the two work in both places. Files
+that are not pages, such as sources, are named but not linked. A page that the navigation does not mention is put at its
+end.
+"""
+
+from __future__ import annotations
+
+import posixpath
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mkdocs.structure.files import File, Files
+
+if TYPE_CHECKING:
+    from mkdocs.config.defaults import MkDocsConfig
+    from mkdocs.structure.pages import Page
+
+ROOT = Path(__file__).resolve().parent.parent
+ROOT_PAGES = {
+    name: f"project/{name.lower()}" for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md")
+}
+
+_LINK = re.compile(r"(?P<picture>!?)\[(?P<text>[^]]*)\]\((?P<target>[^)\s#]+)(?P<anchor>#[^)\s]*)?\)")
+_CODE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
+
+
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """Put pages at the end of the navigation that it does not mention."""
+    docs = Path(config.docs_dir)
+    named = set(_targets(config.nav))
+    others = sorted(path.relative_to(docs).as_posix() for path in docs.rglob("*.md"))
+    if missing := [name for name in others if name not in named]:
+        config.nav = [*(config.nav or []), {"More": missing}]
+    return config
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the pages at the root of the repository."""
+    for name, uri in ROOT_PAGES.items():
+        files.append(File.generated(config, uri, content=(ROOT / name).read_text(encoding="utf-8")))
+    return files
+
+
+def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Lead links to where the site has the page; take those away that lead out of it."""
+    del config
+    uri = page.file.src_uri
+    source = next((name for name, own in ROOT_PAGES.items() if own == uri), f"docs/{uri}")
+    kept: list[str] = []
+    end = 0
+    for block in _CODE.finditer(markdown):
+        kept += [_LINK.sub(lambda link: _link(link, source, uri, files), markdown[end : block.start()]), block[0]]
+        end = block.end()
+    return "".join([*kept, _LINK.sub(lambda link: _link(link, source, uri, files), markdown[end:])])
+
+
+def _link(link: re.Match[str], source: str, uri: str, files: Files) -> str:
+    target = link["target"]
+    if re.match(r"[a-z]+:", target):
+        return link[0]
+    file = posixpath.normpath(posixpath.join(posixpath.dirname(source), target))
+    to = ROOT_PAGES.get(file, file.removeprefix("docs/"))
+    if not file.startswith("docs/") and file not in ROOT_PAGES:
+        return link["text"]
+    if files.get_file_from_path(to) is None:
+        return link[0]  # MkDocs says what is wrong with it
+    relative = posixpath.relpath(to, posixpath.dirname(uri) or ".")
+    return f"{link['picture']}[{link['text']}]({relative}{link['anchor'] or ''})"
+
+
+def _targets(nav: Any) -> list[str]:
+    if isinstance(nav, str):
+        return [nav]
+    items = nav.values() if isinstance(nav, dict) else nav or ()
+    return [target for item in items for target in _targets(item)]
