@@ -1,7 +1,8 @@
 """Whether another installed package overwrites this one.
 
 Two distributions that both bring a top-level `urlab_client` write over each other's files, and what is left is neither.
-Looking through all installed distributions takes a while, so it is done by `urlab doctor`, and when an import has failed.
+Looking through all installed distributions takes a while, so it is done by `urlab doctor`, and when an import has
+failed.
 """
 
 from importlib.metadata import packages_distributions
