@@ -18,10 +18,13 @@ ALLOWED: dict[str, frozenset[str]] = {
     "sync": frozenset({"aio", "protocol"}),
     "server": frozenset({"keys", "protocol"}),
     "enums": frozenset({"protocol"}),
-    "": frozenset({"sync", "enums", "protocol"}),
+    "_installation": frozenset(),
+    "": frozenset({"_installation", "sync", "enums", "protocol"}),
     "integrations": frozenset({"", "aio", "enums", "keys", "protocol", "server", "sync"}),
     "web": frozenset({"aio", "protocol"}),
-    "cli": frozenset({"", "aio", "enums", "integrations", "keys", "protocol", "server", "sync", "web"}),
+    "cli": frozenset(
+        {"", "_installation", "aio", "enums", "integrations", "keys", "protocol", "server", "sync", "web"}
+    ),
     "__main__": frozenset({"cli"}),
 }
 
