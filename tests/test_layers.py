@@ -21,6 +21,7 @@ ALLOWED: dict[str, frozenset[str]] = {
     "_installation": frozenset(),
     "": frozenset({"_installation", "sync", "enums", "protocol"}),
     "integrations": frozenset({"", "aio", "enums", "keys", "protocol", "server", "sync"}),
+    "cluster": frozenset({"integrations", "protocol", "sync"}),
     "web": frozenset({"aio", "protocol"}),
     "cli": frozenset(
         {"", "_installation", "aio", "enums", "integrations", "keys", "protocol", "server", "sync", "web"}

@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 import os
+import secrets
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+# Examples that need an extra which the test command does not install, by the marker of their tests.
+MARKED = {"ray_rollouts": pytest.mark.ray}
+
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.py"))
 
 
-@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "example", [pytest.param(path, id=path.stem, marks=MARKED.get(path.stem, ())) for path in EXAMPLES]
+)
 def test_example_runs(example: Path, tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-W", "error", example],
         cwd=tmp_path,
-        env={**os.environ, "MPLBACKEND": "agg"},
+        # Ray would leave a token in the home folder.
+        env={"RAY_AUTH_TOKEN": secrets.token_hex(32), **os.environ, "MPLBACKEND": "agg"},
         capture_output=True,
         text=True,
         timeout=90,

@@ -1,0 +1,27 @@
+"""Rollouts on a Ray cluster, here one of this machine alone: two workers, each with a simulated server of its own."""
+
+import os
+import tempfile
+
+import numpy as np
+
+os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # what Ray will do by default, and warns of
+import ray
+
+from urlab_client.cluster import rollouts
+
+TARGET = np.array([0.52, -0.1, 0.15, 0.0, -0.05, 0.0, 0.04], dtype=np.float32)
+
+
+def policy(observation, rng):
+    return TARGET + rng.normal(scale=0.02, size=TARGET.shape)
+
+
+with tempfile.TemporaryDirectory(prefix="ray") as scratch:
+    ray.init(num_cpus=2, include_dashboard=False, object_store_memory=100 << 20, log_to_driver=False, _temp_dir=scratch)
+    options = {"n_substeps": 10, "reset_noise": 0.05}
+    with rollouts(policy, "sim://arm", 6, max_episode_steps=50, env_options=options) as episodes:
+        for episode in episodes:
+            span = np.ptp(episode.observations, axis=0).max()
+            print(f"episode {episode.id} in process {episode.pid}: {episode.sim_time:.2f} s, moved by {span:.2f}")
+    ray.shutdown()

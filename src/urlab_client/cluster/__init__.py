@@ -1,0 +1,16 @@
+"""Rollouts on a Ray cluster: episodes run by actors, each on a simulated server of its own or on a leased address.
+
+Needs the extra `ray`. The driver calls `ray.init()` before anything here.
+"""
+
+import importlib.util
+
+for _module in ("ray", "gymnasium"):
+    if importlib.util.find_spec(_module) is None:
+        raise ImportError(f"{_module} is not installed; run: pip install 'urlab-client[ray]'", name=_module)
+
+from urlab_client.cluster.episodes import Episode, Policy, RolloutError  # noqa: E402
+from urlab_client.cluster.leases import Lease, LeaseLost, LeasePool  # noqa: E402
+from urlab_client.cluster.rollouts import Rollouts, rollouts  # noqa: E402
+
+__all__ = ["Episode", "Lease", "LeaseLost", "LeasePool", "Policy", "RolloutError", "Rollouts", "rollouts"]

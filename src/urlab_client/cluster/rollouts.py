@@ -1,0 +1,311 @@
+"""`rollouts`: many episodes on the workers of a Ray cluster, handed out as they finish."""
+
+from __future__ import annotations
+
+import logging
+import time
+import uuid
+from collections import deque
+from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from importlib import import_module
+from types import MappingProxyType, TracebackType
+from typing import Any, Final, Self
+
+import anyio.to_thread
+
+from urlab_client.cluster.episodes import Episode, Job, Policy, RolloutError, seed_of
+from urlab_client.cluster.leases import LeasePool
+from urlab_client.cluster.worker import Worker
+from urlab_client.protocol.errors import URLabError
+
+__all__ = ["Rollouts", "rollouts"]
+
+log = logging.getLogger("urlab_client.cluster")
+
+_ray: Any = import_module("ray")  # Any: Ray's hints leave every remote call unknown
+_SLICE_S: Final = 0.2  # how soon a cancelled reader and an overdue episode are noticed
+_FETCH_S: Final = 60.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Running:
+    worker: Any
+    job: Job
+    deadline: float
+
+
+class Rollouts(Iterator[Episode], AsyncIterator[Episode]):
+    """The episodes of a run, in the order in which they finish; iterate with `for` or `async for`, once.
+
+    Work is done while somebody iterates: each worker has one episode, finished or not, that nobody took yet, and gets
+    the next one when that was taken. Closing ends the workers and their servers and gives back the leases; it happens
+    by itself after the last episode and after an error. Use it as a context manager when leaving early.
+    """
+
+    def __init__(
+        self,
+        policy: Policy,
+        jobs: Sequence[Job],
+        *,
+        n_workers: int,
+        retries: int,
+        episode_timeout: float,
+        start_timeout: float,
+        make_worker: partial[Any],
+    ) -> None:
+        self._policy: Any = _ray.put(policy)
+        self._todo = deque(jobs)
+        self._n_workers = n_workers
+        self._retries = retries
+        self._episode_timeout = episode_timeout
+        self._start_timeout = start_timeout
+        self._make_worker = make_worker
+        self._starting: dict[Any, Any] = {}
+        self._idle: list[Any] = []
+        self._running: dict[Any, _Running] = {}
+        self._finished: deque[Episode] = deque()
+        self._failed_starts = 0
+        self._working_since = time.monotonic()
+        self._reading = False
+        self._closed = False
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> Episode:
+        while not self._finished:
+            if self._over():
+                raise StopIteration
+            self._turn()
+        return self._finished.popleft()
+
+    def __aiter__(self) -> Self:
+        return self
+
+    async def __anext__(self) -> Episode:
+        while not self._finished:
+            if self._over():
+                raise StopAsyncIteration
+            # What a turn finds stays in `_finished`, so a reader that is cancelled meanwhile loses nothing.
+            await anyio.to_thread.run_sync(self._turn)
+        return self._finished.popleft()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the workers with their servers, and give back the leases. Idempotent; waits for nothing."""
+        self._closed = True
+        self._todo.clear()
+        for running in self._running.values():
+            self._end(running.worker, running.job)
+        for worker in [*self._starting.values(), *self._idle]:
+            self._end(worker)
+        self._running.clear()
+        self._starting.clear()
+        self._idle.clear()
+
+    def _over(self) -> bool:
+        if not self._closed and not self._todo and not self._running:
+            self.close()
+        return self._closed
+
+    def _turn(self) -> None:
+        """Hand out work, wait a moment for what finishes, and look after what failed."""
+        if self._reading:
+            raise RuntimeError("Rollouts are read by one reader at a time")
+        self._reading = True
+        try:
+            self._hand_out()
+            refs = [*self._running, *self._starting]
+            ready, _ = _ray.wait(refs, num_returns=len(refs), timeout=0)
+            if not ready:
+                ready, _ = _ray.wait(refs, num_returns=1, timeout=_SLICE_S)
+            for ref in ready:
+                if ref in self._starting:
+                    self._take_worker(ref)
+                else:
+                    self._take_result(ref)
+            self._look_at_clock()
+        except BaseException:
+            self.close()
+            raise
+        finally:
+            self._reading = False
+
+    def _hand_out(self) -> None:
+        while self._idle and self._todo:
+            worker, job = self._idle.pop(), self._todo.popleft()
+            ref = worker.run.remote(self._policy, job)
+            self._running[ref] = _Running(worker, job, time.monotonic() + self._episode_timeout)
+        while self._todo and len(self._running) + len(self._starting) < min(
+            self._n_workers, len(self._running) + len(self._todo)
+        ):
+            worker = self._make_worker()
+            self._starting[worker.node_id.remote()] = worker
+
+    def _take_worker(self, ref: Any) -> None:
+        worker = self._starting.pop(ref)
+        try:
+            _ray.get(ref, timeout=_FETCH_S)
+        except _ray.exceptions.RayError as error:
+            self._end(worker)
+            self._failed_starts += 1
+            log.warning("a worker did not start: %s", error)
+            if self._failed_starts > self._retries:
+                raise RolloutError(f"{self._failed_starts} workers in a row did not start.") from error
+        else:
+            self._failed_starts = 0
+            self._idle.append(worker)
+
+    def _take_result(self, ref: Any) -> None:
+        running = self._running.pop(ref)
+        try:
+            episode: Episode = _ray.get(ref, timeout=_FETCH_S)
+        except _ray.exceptions.RayTaskError as error:
+            cause = error.cause if isinstance(error.cause, Exception) else error
+            self._idle.append(running.worker)
+            if not isinstance(cause, URLabError):
+                # A policy that raises would do so again.
+                raise RolloutError(f"Episode {running.job.id} raised {type(cause).__name__}: {cause}") from error
+            self._again(running.job, cause)
+        except _ray.exceptions.RayError as error:  # the worker, its node or the result is gone
+            self._end(running.worker, running.job)
+            self._again(running.job, error)
+        else:
+            self._idle.append(running.worker)
+            self._finished.append(episode)
+
+    def _look_at_clock(self) -> None:
+        now = time.monotonic()
+        for ref, running in list(self._running.items()):
+            if now > running.deadline:
+                del self._running[ref]
+                self._end(running.worker, running.job)
+                self._again(running.job, TimeoutError(f"not finished within {self._episode_timeout:g} s"))
+        if self._running or self._idle or not self._starting:
+            self._working_since = now
+        elif now - self._working_since > self._start_timeout:
+            raise RolloutError(
+                f"The cluster placed no worker within {self._start_timeout:g} s.",
+                hint=f"It has {_ray.cluster_resources()}; see worker_options and start_timeout.",
+            )
+
+    def _again(self, job: Job, error: Exception) -> None:
+        if job.attempt > self._retries:
+            raise RolloutError(
+                f"Episode {job.id} failed {job.attempt} times, the last time with {type(error).__name__}: {error}"
+            ) from error
+        log.warning("episode %d, attempt %d: %s; it is run again", job.id, job.attempt, error)
+        holder = f"{job.holder.rpartition('/')[0]}/{job.attempt + 1}"
+        self._todo.appendleft(replace(job, attempt=job.attempt + 1, holder=holder))
+
+    def _end(self, worker: Any, job: Job | None = None) -> None:
+        _ray.kill(worker)
+        if job is not None and job.leases is not None:
+            job.leases.give_back(job.holder)
+
+
+def rollouts(
+    policy: Policy,
+    scenes: str | Sequence[str] | LeasePool,
+    n: int,
+    *,
+    seed: int = 0,
+    max_episode_steps: int = 200,
+    env_options: Mapping[str, Any] = MappingProxyType({}),
+    client_options: Mapping[str, Any] = MappingProxyType({}),
+    n_workers: int = 0,
+    worker_options: Mapping[str, Any] = MappingProxyType({}),
+    retries: int = 3,
+    episode_timeout: float = 300.0,
+    start_timeout: float = 120.0,
+    lease_timeout: float = 60.0,
+) -> Rollouts:
+    """Run `n` episodes on the cluster and hand them out as they finish, each exactly once.
+
+    An episode whose worker, node, server or lease fails is run again from its start, with the same seed and so with
+    the same result, elsewhere if need be. Attempts that failed leave nothing in the output.
+
+    Args:
+        policy: Sent to the workers by value; each episode starts with a fresh copy.
+        scenes: `sim://MODEL` addresses, to be served by the workers, in blocks of `n / len(scenes)` episodes; or a
+            pool of addresses to lease, one per episode.
+        n: Number of episodes.
+        seed: Seed of the run.
+        max_episode_steps: Actions after which an episode is truncated.
+        env_options: Further options of `URLabEnv`: `observations`, `reward_fn`, `termination_fn`, `n_substeps`,
+            `reset_noise`.
+        client_options: Further options of the workers' clients.
+        n_workers: Largest number of workers, which is also that of episodes in flight; 0 for one per processor of the
+            cluster, or per address of the pool.
+        worker_options: Options of the Ray actors, such as `num_cpus` or `resources`; one processor each by default.
+        retries: Attempts of an episode after the first one.
+        episode_timeout: Seconds for an attempt, after which its worker is ended.
+        start_timeout: Seconds without any worker after which the run fails.
+        lease_timeout: Seconds that an attempt waits for a free address.
+
+    Returns:
+        The episodes. Iterating raises `RolloutError` when an episode cannot be had.
+
+    Raises:
+        ValueError: An option out of range, or a scene that is not `sim://`.
+        URLabError: Ray is not initialised.
+    """
+    names = [scenes.name] if isinstance(scenes, LeasePool) else [scenes] if isinstance(scenes, str) else list(scenes)
+    pool = scenes if isinstance(scenes, LeasePool) else None
+    if not names or (pool is None and not all(name.startswith("sim://") for name in names)):
+        raise ValueError(f"scenes are one or more sim:// addresses, or a LeasePool of others, not {names!r}")
+    if n < 0 or seed < 0 or n_workers < 0 or retries < 0 or max_episode_steps < 1:
+        raise ValueError("n, seed, n_workers and retries are 0 or more, and max_episode_steps is at least 1")
+    if min(episode_timeout, start_timeout, lease_timeout) <= 0:
+        raise ValueError("episode_timeout, start_timeout and lease_timeout are above 0 seconds")
+    if reserved := {"cameras", "client", "max_episode_steps", "owns_client", "space_mode"} & env_options.keys():
+        raise ValueError(f"env_options cannot have {', '.join(sorted(reserved))}")
+    if not _ray.is_initialized():
+        raise URLabError("Ray is not initialised.", hint="Call ray.init() first.")
+    run = uuid.uuid4().hex
+    jobs = [
+        Job(
+            id=i,
+            seed=seed_of(seed, i),
+            scene=names[i * len(names) // n],
+            attempt=1,
+            holder=f"{run}/{i}/1",
+            leases=pool,
+        )
+        for i in range(n)
+    ]
+    most = n_workers or (pool.size if pool else int(_ray.cluster_resources().get("CPU", 1)))
+    # Ray's own restarts are off: an episode whose worker died must be counted as an attempt.
+    options = {"num_cpus": 1, "scheduling_strategy": "SPREAD", **worker_options, "max_restarts": 0}
+    actor = _ray.remote(Worker).options(**options)
+    return Rollouts(
+        policy,
+        jobs,
+        n_workers=max(most, 1),
+        retries=retries,
+        episode_timeout=episode_timeout,
+        start_timeout=start_timeout,
+        make_worker=partial(
+            actor.remote,
+            {**env_options, "max_episode_steps": max_episode_steps},
+            dict(client_options),
+            lease_timeout,
+        ),
+    )

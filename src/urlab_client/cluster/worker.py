@@ -1,0 +1,115 @@
+"""The actor that runs episodes, one at a time."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+import time
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+from urlab_client.cluster.episodes import Episode, Job, Policy
+from urlab_client.cluster.leases import Lease
+from urlab_client.integrations.gym.env import URLabEnv
+from urlab_client.sync.client import URLabClient
+
+__all__ = ["Worker"]
+
+_ray: Any = import_module("ray")  # Any: Ray's hints leave every remote call unknown
+
+
+class Worker:
+    """Runs episodes. A simulated server serves the episodes of its scene until another scene or a failure comes.
+
+    The server is a child process that ends with this one, however that ends.
+    """
+
+    def __init__(self, env_options: Mapping[str, Any], client_options: Mapping[str, Any], lease_timeout: float) -> None:
+        if sys.version_info < (3, 12):
+            # Ray makes uvloop's policy the default, and with that no other loop can start child processes.
+            asyncio.set_event_loop_policy(asyncio.DefaultEventLoopPolicy())  # pyright: ignore[reportDeprecated] - not there
+        self._env_options = env_options
+        self._client_options: dict[str, Any] = {"step_mode": "direct", **client_options}
+        self._lease_timeout = lease_timeout
+        self._address = ""
+        self._env: URLabEnv | None = None
+
+    def node_id(self) -> str:
+        """Return Ray's id of this node; that it answers says that the worker is up."""
+        return str(_ray.get_runtime_context().get_node_id())
+
+    def run(self, policy: Policy, job: Job) -> Episode:
+        """Run one attempt of an episode.
+
+        Raises:
+            URLabError: The server or the lease failed.
+        """
+        try:
+            if job.leases is None:
+                return self._run(policy, job, None)
+            with job.leases.lease(job.holder, timeout=self._lease_timeout) as lease:
+                try:
+                    return self._run(policy, job, lease)
+                finally:
+                    self._close()  # before somebody else gets the address
+        except BaseException:
+            self._close()  # the next attempt starts afresh
+            raise
+
+    def _run(self, policy: Policy, job: Job, lease: Lease | None) -> Episode:
+        started, clock = time.time(), time.perf_counter()
+        env = self._environment(job.scene if lease is None else lease.address)
+        rng = np.random.default_rng([job.seed, 1])
+        observation, info = env.reset(seed=job.seed)
+        setup = time.perf_counter() - clock
+        observations, actions, rewards = [np.array(observation)], list[Any](), list[float]()
+        terminated = truncated = False
+        while not (terminated or truncated):
+            if lease is not None:
+                lease.keep()
+            action = np.asarray(policy(observation, rng), dtype=np.float32)
+            observation, reward, terminated, truncated, info = env.step(action)
+            observations.append(np.array(observation))
+            actions.append(action)
+            rewards.append(float(reward))
+        return Episode(
+            id=job.id,
+            seed=job.seed,
+            scene=job.scene,
+            address=self._address,
+            attempt=job.attempt,
+            node_id=self.node_id(),
+            pid=os.getpid(),
+            observations=np.stack(observations),
+            actions=np.stack(actions),
+            rewards=np.array(rewards),
+            terminated=bool(terminated),
+            truncated=bool(truncated),
+            sim_time=float(info["sim_time"]),
+            started=started,
+            setup=setup,
+            duration=time.perf_counter() - clock,
+        )
+
+    def _environment(self, address: str) -> URLabEnv:
+        if self._env is not None and self._address == address:
+            return self._env
+        self._close()
+        client = URLabClient(address, **self._client_options)
+        try:
+            client.discover()
+            self._env = URLabEnv(client, owns_client=True, **self._env_options)
+        except BaseException:
+            client.close()
+            raise
+        self._address = address
+        return self._env
+
+    def _close(self) -> None:
+        env, self._env = self._env, None
+        if env is not None:
+            env.close()

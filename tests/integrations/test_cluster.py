@@ -1,0 +1,271 @@
+"""Rollouts on a Ray cluster of three nodes in this machine, with workers and nodes that go away."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import anyio
+import numpy as np
+import pytest
+
+from urlab_client.server import SimulatedServer
+
+pytestmark = pytest.mark.ray
+
+STEPS = 8
+
+# What policies use is defined inside functions: that is sent to the workers by value, and they cannot import tests.
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    """A head without processors, for the driver, and two nodes with one each."""
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))  # else Ray leaves one in the home folder
+    os.environ["RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO"] = "0"
+    import ray
+    from ray.cluster_utils import Cluster
+
+    store = 80 << 20
+    with tempfile.TemporaryDirectory(prefix="r", dir="/tmp", ignore_cleanup_errors=True) as scratch:
+        cluster = Cluster(
+            initialize_head=True,
+            head_node_args={
+                "num_cpus": 0,
+                "object_store_memory": store,
+                "include_dashboard": False,
+                "temp_dir": scratch,
+            },
+        )
+        try:
+            for _ in range(2):
+                cluster.add_node(num_cpus=1, object_store_memory=store)
+            ray.init(address=cluster.address, log_to_driver=False)
+            cluster.wait_for_nodes()
+            yield cluster
+        finally:
+            ray.shutdown()
+            cluster.shutdown()
+
+
+def noisy() -> Any:
+    def policy(observation: Any, rng: np.random.Generator) -> Any:
+        assert observation.dtype == np.float32
+        return rng.normal(scale=0.3, size=7)
+
+    return policy
+
+
+OPTIONS: dict[str, Any] = {
+    "max_episode_steps": STEPS,
+    "seed": 5,
+    "env_options": {"n_substeps": 5, "reset_noise": 0.05},
+}
+
+
+def same(a: Any, b: Any) -> None:
+    assert (a.id, a.seed, a.scene) == (b.id, b.seed, b.scene)
+    for name in ("observations", "actions", "rewards"):
+        assert getattr(a, name).tobytes() == getattr(b, name).tobytes()
+
+
+@pytest.fixture(scope="module")
+def expected(cluster: Any) -> dict[int, Any]:
+    """What a run without failures gives, with one worker."""
+    from urlab_client.cluster import rollouts
+
+    episodes = list(rollouts(noisy(), "sim://arm", 6, n_workers=1, **OPTIONS))
+    assert [episode.id for episode in episodes] == list(range(6))
+    return {episode.id: episode for episode in episodes}
+
+
+def test_episodes_are_whole_and_differ_by_seed(expected: dict[int, Any]) -> None:
+    assert len({episode.seed for episode in expected.values()}) == 6
+    assert len({episode.observations.tobytes() for episode in expected.values()}) == 6
+    for episode in expected.values():
+        assert (len(episode.observations), len(episode.actions), len(episode.rewards)) == (STEPS + 1, STEPS, STEPS)
+        assert (episode.attempt, episode.terminated, episode.truncated) == (1, False, True)
+        assert episode.scene == episode.address == "sim://arm"
+        assert episode.sim_time > 0 < episode.setup <= episode.duration
+
+
+def dies_once(marker: Path) -> Any:
+    """Return a policy that kills its process in the middle of one episode, having noted the children's process ids."""
+    inner, path = noisy(), str(marker)
+
+    class Policy:
+        steps = 0
+
+        def __call__(self, observation: Any, rng: np.random.Generator) -> Any:
+            self.steps += 1  # of this episode: each one gets a copy
+            if self.steps == STEPS // 2:
+                try:
+                    handle = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
+                except FileExistsError:
+                    return inner(observation, rng)
+                children = [file.read_text() for file in Path("/proc/self/task").glob("*/children")]
+                os.write(handle, "".join(children).encode())
+                os.kill(os.getpid(), 9)
+            return inner(observation, rng)
+
+    return Policy()
+
+
+def running(pid: str) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+async def gone(pids: list[str]) -> None:
+    with anyio.fail_after(30):
+        while any(map(running, pids)):
+            await anyio.sleep(0.02)
+
+
+async def test_a_killed_worker_loses_and_doubles_no_episode(expected: dict[int, Any], tmp_path: Path) -> None:
+    from urlab_client.cluster import rollouts
+
+    got: dict[int, Any] = {}
+    async for episode in rollouts(dies_once(tmp_path / "killed"), "sim://arm", 6, n_workers=2, **OPTIONS):
+        assert episode.id not in got
+        got[episode.id] = episode
+    assert sorted(got) == list(range(6))
+    assert sorted(episode.attempt for episode in got.values()) == [1, 1, 1, 1, 1, 2]
+    for i, episode in got.items():
+        same(episode, expected[i])
+    servers = (tmp_path / "killed").read_text().split()
+    assert servers
+    await gone(servers)
+
+
+def test_a_lease_comes_back_from_a_killed_worker(cluster: Any, tmp_path: Path) -> None:
+    from urlab_client.cluster import LeaseLost, LeasePool, rollouts
+
+    with SimulatedServer("arm", play=True) as server:
+        address = f"{server.address}:{server.step_port}"
+        pool = LeasePool([address], name="arms", ttl=600)  # far longer than this test
+        policy = dies_once(tmp_path / "killed")
+        got = list(rollouts(policy, pool, 3, **OPTIONS))
+        assert sorted((episode.id, episode.scene, episode.address) for episode in got) == [
+            (i, "arms", address) for i in range(3)
+        ]
+        assert sorted(episode.attempt for episode in got) == [1, 1, 2]
+        assert pool.holders() == {address: None}
+        with pool.lease("me") as lease:
+            assert (lease.address, pool.holders()) == (address, {address: "me"})
+            with pytest.raises(LeaseLost, match="No address of 'arms' was free"), pool.lease("you", timeout=0.1):
+                pass
+        pool.close()
+
+
+def test_leasing_needs_no_one_who_gives_back(cluster: Any) -> None:
+    from urlab_client.cluster import LeaseLost, LeasePool
+
+    pool = LeasePool(["tcp://editor:1"], ttl=0.2)
+    with pool.lease("dead") as lease, pool.lease("next", timeout=30):  # waits until the first one ran out
+        assert pool.holders()["tcp://editor:1"] in {"next", None}
+        with pytest.raises(LeaseLost, match="ran out"):
+            lease.keep()
+    pool.close()
+
+
+def test_a_policy_that_raises_ends_the_run_with_its_error(cluster: Any) -> None:
+    from urlab_client.cluster import RolloutError, rollouts
+
+    def policy(observation: Any, rng: np.random.Generator) -> Any:
+        raise ZeroDivisionError("in the policy")
+
+    with pytest.raises(RolloutError, match=r"Episode 0 raised ZeroDivisionError: in the policy"):
+        list(rollouts(policy, "sim://arm", 2, n_workers=1, **OPTIONS))
+
+
+def test_a_scene_that_no_server_can_load_uses_up_the_attempts(cluster: Any) -> None:
+    from urlab_client.cluster import RolloutError, rollouts
+
+    with pytest.raises(RolloutError, match="Episode 0 failed 2 times"):
+        list(rollouts(noisy(), "sim://no-such-robot", 1, retries=1, **OPTIONS))
+
+
+async def test_an_attempt_that_takes_too_long_and_one_left_early_leave_nothing(cluster: Any, tmp_path: Path) -> None:
+    from urlab_client.cluster import RolloutError, rollouts
+
+    notes, fifo = str(tmp_path / "children"), str(tmp_path / "fifo")
+    os.mkfifo(fifo)
+
+    def policy(observation: Any, rng: np.random.Generator) -> Any:
+        children = [file.read_text() for file in Path("/proc/self/task").glob("*/children")]
+        Path(notes).write_text("".join(children))
+        return os.open(fifo, os.O_RDONLY)  # waits for a writer, who never comes
+
+    with pytest.raises(RolloutError, match=r"Episode 0 failed 1 times.*not finished within 8 s"):
+        async for _ in rollouts(policy, "sim://arm", 1, retries=0, episode_timeout=8, **OPTIONS):
+            pass
+    first = Path(notes).read_text().split()
+    assert first
+    await gone(first)
+
+    Path(notes).unlink()
+    with anyio.CancelScope() as scope:
+        async with rollouts(policy, "sim://arm", 1, **OPTIONS) as episodes, anyio.create_task_group() as tasks:
+
+            async def leave() -> None:
+                with anyio.fail_after(60):
+                    while not (Path(notes).exists() and Path(notes).read_text()):
+                        await anyio.sleep(0.02)
+                scope.cancel()
+
+            tasks.start_soon(leave)
+            await anext(episodes)
+    assert scope.cancelled_caught
+    await gone(Path(notes).read_text().split())
+
+
+@pytest.mark.parametrize(
+    ("scenes", "options", "problem"),
+    [
+        ([], {}, "scenes are one or more"),
+        ("tcp://editor", {}, "scenes are one or more sim://"),
+        ("sim://arm", {"retries": -1}, "retries are 0 or more"),
+        ("sim://arm", {"episode_timeout": 0}, "above 0 seconds"),
+        ("sim://arm", {"env_options": {"space_mode": "dict"}}, "env_options cannot have space_mode"),
+    ],
+)
+def test_bad_options_are_named(cluster: Any, scenes: Any, options: dict[str, Any], problem: str) -> None:
+    from urlab_client.cluster import rollouts
+
+    with pytest.raises(ValueError, match=problem):
+        rollouts(noisy(), scenes, 1, **options)
+
+
+def test_a_removed_node_loses_and_doubles_no_episode(cluster: Any, expected: dict[int, Any], tmp_path: Path) -> None:
+    from urlab_client.cluster import rollouts
+
+    victim = cluster.list_all_nodes()[-1]
+    inner, victim_id, fifo = noisy(), victim.node_id, str(tmp_path / "fifo")
+    os.mkfifo(fifo)
+
+    def policy(observation: Any, rng: np.random.Generator) -> Any:
+        import ray
+
+        if ray.get_runtime_context().get_node_id() == victim_id:
+            os.close(os.open(fifo, os.O_RDONLY))  # waits here until the node is removed
+        return inner(observation, rng)
+
+    with rollouts(policy, "sim://arm", 6, n_workers=2, **OPTIONS) as episodes:
+        got = [next(episodes)]
+        # Opening succeeds when the worker on the node has begun an episode and waits in its first step.
+        with open(fifo, "w"):  # noqa: PTH123
+            cluster.remove_node(victim, allow_graceful=False)
+        got += episodes
+    assert sorted(episode.id for episode in got) == list(range(6))
+    assert {episode.node_id for episode in got} == {got[0].node_id} != {victim_id}
+    assert max(episode.attempt for episode in got) == 2
+    for episode in got:
+        same(episode, expected[episode.id])
