@@ -3,6 +3,7 @@
 import os
 import tempfile
 
+import matplotlib.pyplot as plt
 import numpy as np
 
 os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # what Ray will do by default, and warns of
@@ -20,8 +21,16 @@ def policy(observation, rng):
 with tempfile.TemporaryDirectory(prefix="ray") as scratch:
     ray.init(num_cpus=2, include_dashboard=False, object_store_memory=100 << 20, log_to_driver=False, _temp_dir=scratch)
     options = {"n_substeps": 10, "reset_noise": 0.05}
-    with rollouts(policy, "sim://arm", 6, max_episode_steps=50, env_options=options) as episodes:
+    figure, axes = plt.subplots(figsize=(7, 2), layout="constrained")
+    with rollouts(policy, "sim://arm", 8, max_episode_steps=50, env_options=options) as episodes:
         for episode in episodes:
             span = np.ptp(episode.observations, axis=0).max()
+            bar = (f"process {episode.pid}", episode.duration - episode.setup)
+            axes.barh(bar[0], episode.setup, left=episode.started, color="0.8")
+            axes.barh(*bar, left=episode.started + episode.setup, color="tab:blue", edgecolor="white")
             print(f"episode {episode.id} in process {episode.pid}: {episode.sim_time:.2f} s, moved by {span:.2f}")
     ray.shutdown()
+start = axes.dataLim.x0
+axes.xaxis.set_major_formatter(lambda x, _: f"{x - start:.1f}")
+axes.set_xlabel("seconds (grey: server and reset; blue: steps of an episode)")
+figure.savefig("timeline.png", dpi=110)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 import secrets
+import select
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import anyio
+import anyio.to_thread
 import numpy as np
 import pytest
 
@@ -33,13 +34,13 @@ def cluster() -> Iterator[Any]:
 
     store = 80 << 20
     with tempfile.TemporaryDirectory(prefix="r", dir="/tmp", ignore_cleanup_errors=True) as scratch:
+        os.environ["RAY_TMPDIR"] = scratch  # short: sockets are in it
         cluster = Cluster(
             initialize_head=True,
             head_node_args={
                 "num_cpus": 0,
                 "object_store_memory": store,
                 "include_dashboard": False,
-                "temp_dir": scratch,
             },
         )
         try:
@@ -55,7 +56,6 @@ def cluster() -> Iterator[Any]:
 
 def noisy() -> Any:
     def policy(observation: Any, rng: np.random.Generator) -> Any:
-        assert observation.dtype == np.float32
         return rng.normal(scale=0.3, size=7)
 
     return policy
@@ -116,17 +116,19 @@ def dies_once(marker: Path) -> Any:
     return Policy()
 
 
-def running(pid: str) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
-
-
-async def gone(pids: list[str]) -> None:
-    with anyio.fail_after(30):
-        while any(map(running, pids)):
-            await anyio.sleep(0.02)
+def gone(notes: Path) -> bool:
+    """Wait for the end of the processes that a policy noted; there must be some."""
+    pids = [int(pid) for pid in notes.read_text().split()]
+    for pid in pids:
+        try:
+            handle = os.pidfd_open(pid)
+        except ProcessLookupError:
+            continue
+        ended, _, _ = select.select([handle], [], [], 30)
+        os.close(handle)
+        if not ended:
+            return False
+    return bool(pids)
 
 
 async def test_a_killed_worker_loses_and_doubles_no_episode(expected: dict[int, Any], tmp_path: Path) -> None:
@@ -140,9 +142,7 @@ async def test_a_killed_worker_loses_and_doubles_no_episode(expected: dict[int, 
     assert sorted(episode.attempt for episode in got.values()) == [1, 1, 1, 1, 1, 2]
     for i, episode in got.items():
         same(episode, expected[i])
-    servers = (tmp_path / "killed").read_text().split()
-    assert servers
-    await gone(servers)
+    assert gone(tmp_path / "killed")
 
 
 def test_a_lease_comes_back_from_a_killed_worker(cluster: Any, tmp_path: Path) -> None:
@@ -193,38 +193,47 @@ def test_a_scene_that_no_server_can_load_uses_up_the_attempts(cluster: Any) -> N
         list(rollouts(noisy(), "sim://no-such-robot", 1, retries=1, **OPTIONS))
 
 
-async def test_an_attempt_that_takes_too_long_and_one_left_early_leave_nothing(cluster: Any, tmp_path: Path) -> None:
-    from urlab_client.cluster import RolloutError, rollouts
-
-    notes, fifo = str(tmp_path / "children"), str(tmp_path / "fifo")
-    os.mkfifo(fifo)
+def waits_forever(notes: Path, fifo: Path) -> Any:
+    """Return a policy that notes the children's process ids and then waits for what nobody writes."""
+    notes_name, fifo_name = str(notes), str(fifo)
+    os.mkfifo(fifo_name)
 
     def policy(observation: Any, rng: np.random.Generator) -> Any:
         children = [file.read_text() for file in Path("/proc/self/task").glob("*/children")]
-        Path(notes).write_text("".join(children))
-        return os.open(fifo, os.O_RDONLY)  # waits for a writer, who never comes
+        Path(notes_name).write_text("".join(children))
+        return os.read(os.open(fifo_name, os.O_RDONLY), 1)
 
+    return policy
+
+
+def test_an_attempt_that_takes_too_long_is_ended_with_its_server(cluster: Any, tmp_path: Path) -> None:
+    from urlab_client.cluster import RolloutError, rollouts
+
+    policy = waits_forever(tmp_path / "notes", tmp_path / "fifo")
     with pytest.raises(RolloutError, match=r"Episode 0 failed 1 times.*not finished within 8 s"):
-        async for _ in rollouts(policy, "sim://arm", 1, retries=0, episode_timeout=8, **OPTIONS):
-            pass
-    first = Path(notes).read_text().split()
-    assert first
-    await gone(first)
+        list(rollouts(policy, "sim://arm", 1, retries=0, episode_timeout=8, **OPTIONS))
+    assert gone(tmp_path / "notes")
 
-    Path(notes).unlink()
+
+async def test_a_cancelled_run_leaves_no_worker_and_no_server(cluster: Any, tmp_path: Path) -> None:
+    from urlab_client.cluster import rollouts
+
+    notes, fifo = tmp_path / "notes", tmp_path / "fifo"
+    policy = waits_forever(notes, fifo)
+    writers: list[int] = []
     with anyio.CancelScope() as scope:
         async with rollouts(policy, "sim://arm", 1, **OPTIONS) as episodes, anyio.create_task_group() as tasks:
 
             async def leave() -> None:
-                with anyio.fail_after(60):
-                    while not (Path(notes).exists() and Path(notes).read_text()):
-                        await anyio.sleep(0.02)
+                # Opening returns when the policy waits at the other end.
+                writers.append(await anyio.to_thread.run_sync(os.open, fifo, os.O_WRONLY))
                 scope.cancel()
 
             tasks.start_soon(leave)
             await anext(episodes)
     assert scope.cancelled_caught
-    await gone(Path(notes).read_text().split())
+    assert gone(notes)
+    os.close(writers[0])
 
 
 @pytest.mark.parametrize(
@@ -261,7 +270,7 @@ def test_a_removed_node_loses_and_doubles_no_episode(cluster: Any, expected: dic
     with rollouts(policy, "sim://arm", 6, n_workers=2, **OPTIONS) as episodes:
         got = [next(episodes)]
         # Opening succeeds when the worker on the node has begun an episode and waits in its first step.
-        with open(fifo, "w"):  # noqa: PTH123
+        with open(fifo, "w"):
             cluster.remove_node(victim, allow_graceful=False)
         got += episodes
     assert sorted(episode.id for episode in got) == list(range(6))

@@ -37,7 +37,7 @@ class Episode:
         attempt: 1, or more after failures.
         node_id: Ray's id of the node, hexadecimal.
         pid: Process id of the worker.
-        observations: Float32, shape (T + 1, observation size).
+        observations: Float64, shape (T + 1, observation size).
         actions: Float32, shape (T, action size).
         rewards: Float64, shape (T,).
         terminated: Whether the termination function ended it.

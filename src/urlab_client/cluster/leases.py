@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Generator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from typing import Any, Final
 
@@ -164,7 +164,9 @@ class LeasePool:
         try:
             yield Lease(self._book, holder, address, self._ttl)
         finally:
-            self.give_back(holder)
+            with suppress(LeaseLost):  # with the pool, the lease is gone too
+                # Waits, because a process that ends at once would not have sent it.
+                _ask(self._book.give_back.remote(holder), _REPLY_S)
 
     def give_back(self, holder: str) -> None:
         """Free what a holder has leased, without waiting for it."""
