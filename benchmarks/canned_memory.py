@@ -8,7 +8,6 @@ its standard input closes.
 from __future__ import annotations
 
 import contextlib
-import contextlib
 import ctypes
 import mmap
 import os

@@ -1,13 +1,13 @@
 """Types of the parts of MuJoCo's bindings that this project uses; the wheel ships none. The rest is `Any`."""
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-_Floats = NDArray[np.float64]
-_Ints = NDArray[np.int32]
+_Floats: TypeAlias = NDArray[np.float64]
+_Ints: TypeAlias = NDArray[np.int32]
 
 class FatalError(Exception): ...
 class UnexpectedError(Exception): ...
