@@ -178,9 +178,20 @@ def test_resets_refuse_masks_and_seeds_that_do_not_fit(made: list[Any]) -> None:
     assert observations[:, 7].tolist() == [0.04] * 3
 
 
-def test_a_batch_has_no_controllers(made: list[Any]) -> None:
-    with pytest.raises(urlab_client.URLabError, match="arm has a controller"):
-        URLabBatchEnv("sim://arm?controller=arm=pd", 2)
+@pytest.mark.parametrize(
+    "address", ["sim://quadruped?controller=quadruped=pd,kp=60,kv=2", "sim://arm?controller=arm=passthrough"]
+)
+def test_controllers_act_in_a_batch_as_on_a_server(address: str, made: list[Any]) -> None:
+    wire = URLabVectorEnv(address, 1, n_substeps=4)
+    batch = URLabBatchEnv(address, 3, n_substeps=4)
+    made += [wire, batch]
+    expected, ours = wire.reset(seed=0)[0], batch.reset(seed=0)[0]
+    for n in range(20):
+        action = 0.4 * np.sin(0.3 * n + np.arange(wire.action_space.shape[1]))
+        expected = wire.step(action[None])[0]
+        ours = batch.step(np.stack([0 * action, action, -action]))[0]
+        assert np.array_equal(ours[1], expected[0])
+    assert not np.array_equal(ours[0], ours[1])
 
 
 @pytest.mark.parametrize("task_id", TASKS)

@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, ClassVar, Final, cast
+from typing import Any, ClassVar, Final, Protocol, cast
 
 import mujoco
 import numpy as np
@@ -22,6 +22,7 @@ from urlab_client.protocol.enums import ControllerKind
 from urlab_client.server.scene import ArticulationIndex
 
 __all__ = [
+    "Actuated",
     "ArticulationControl",
     "ControlSource",
     "Controller",
@@ -167,6 +168,25 @@ class ControllerConfig:
         return cls(text.kind, **text.gains)
 
 
+class Actuated(Protocol):
+    """What a controller has to know of an articulation; `ArticulationIndex` says what the names mean."""
+
+    @property
+    def actuators(self) -> NDArray[Any]:
+        """Actuator ids."""
+        ...
+
+    @property
+    def actuator_names(self) -> tuple[str, ...]:
+        """Short actuator names, parallel to the ids."""
+        ...
+
+    @property
+    def ctrl_adr(self) -> NDArray[Any]:
+        """Index into `mjData.ctrl` of every control, in actuator order."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class _Binding:
     """Actuators of an articulation that drive a hinge or slide joint, in actuator order."""
@@ -180,7 +200,7 @@ class _Binding:
     upper: Float32s
 
 
-def _first_controls(model: mujoco.MjModel, articulation: ArticulationIndex) -> list[int]:
+def _first_controls(model: mujoco.MjModel, articulation: Actuated) -> list[int]:
     """Position of each actuator's first control among the articulation's controls."""
     starts: list[int] = []
     total = 0
@@ -190,7 +210,7 @@ def _first_controls(model: mujoco.MjModel, articulation: ArticulationIndex) -> l
     return starts
 
 
-def _bind(model: mujoco.MjModel, articulation: ArticulationIndex) -> _Binding:
+def _bind(model: mujoco.MjModel, articulation: Actuated) -> _Binding:
     scalar_joints = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
     joint_transmissions = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
     names: list[str] = []
@@ -235,7 +255,7 @@ class Controller(ABC):
 
     enabled: bool
 
-    def __init__(self, model: mujoco.MjModel, articulation: ArticulationIndex) -> None:
+    def __init__(self, model: mujoco.MjModel, articulation: Actuated) -> None:
         self.enabled = True
         self._binding = _bind(model, articulation)
 
@@ -251,13 +271,13 @@ class Controller(ABC):
 
     @abstractmethod
     def write(self, set_points: Float32s, qpos: Float64s, qvel: Float64s, ctrl: Float64s) -> None:
-        """Write the bound actuators' entries of `ctrl`.
+        """Write the bound actuators' entries of `ctrl`. All arrays may have leading axes, the same ones.
 
         Args:
-            set_points: Selected set-points of the articulation, shape (n controls,).
-            qpos: `mjData.qpos`, shape (nq,).
-            qvel: `mjData.qvel`, shape (nv,).
-            ctrl: `mjData.ctrl`, shape (nu,), written in place.
+            set_points: Selected set-points of the articulation, shape (…, n controls).
+            qpos: `mjData.qpos`, shape (…, nq).
+            qvel: `mjData.qvel`, shape (…, nv).
+            ctrl: `mjData.ctrl`, shape (…, nu), written in place.
         """
 
     def configure(self, params: Mapping[str, object]) -> None:
@@ -281,7 +301,7 @@ class PassthroughController(Controller):
     def write(self, set_points: Float32s, qpos: Float64s, qvel: Float64s, ctrl: Float64s) -> None:
         """Copy the bound set-points."""
         del qpos, qvel
-        ctrl[self._binding.ctrl_adr] = set_points[self._binding.places]
+        ctrl[..., self._binding.ctrl_adr] = set_points.take(self._binding.places, axis=-1)
 
 
 _GAINS: Final = ("kp", "kv", "torque_limit")
@@ -296,7 +316,7 @@ class PDController(Controller):
 
     kind = "pd"
 
-    def __init__(self, model: mujoco.MjModel, articulation: ArticulationIndex, config: ControllerConfig) -> None:
+    def __init__(self, model: mujoco.MjModel, articulation: Actuated, config: ControllerConfig) -> None:
         super().__init__(model, articulation)
         self._defaults = {name: float32(getattr(config, name)) for name in _GAINS}
         count = len(self.bound)
@@ -307,16 +327,16 @@ class PDController(Controller):
         """Write the bound actuators' torques or forces."""
         binding, gains = self._binding, self._gains
         with np.errstate(all="ignore"):  # overflow and NaN follow IEEE, as in the plugin
-            target = set_points.take(binding.places)
+            target = set_points.take(binding.places, axis=-1)
             np.minimum(target, binding.upper, out=target)
             np.maximum(target, binding.lower, out=target)
-            target -= qpos.take(binding.qpos_adr).astype(np.float32)
+            target -= qpos.take(binding.qpos_adr, axis=-1).astype(np.float32)
             target *= gains["kp"]
-            target -= gains["kv"] * qvel.take(binding.qvel_adr).astype(np.float32)
+            target -= gains["kv"] * qvel.take(binding.qvel_adr, axis=-1).astype(np.float32)
             limit = gains["torque_limit"]
             np.minimum(target, limit, out=target)
             np.maximum(target, -limit, out=target)
-        ctrl[binding.ctrl_adr] = target
+        ctrl[..., binding.ctrl_adr] = target
 
     def configure(self, params: Mapping[str, object]) -> None:
         """Change gains and defaults and switch on; negative values are taken as they are."""

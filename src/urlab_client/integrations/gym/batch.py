@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
@@ -18,7 +19,9 @@ from urlab_client.integrations.gym.env import RewardFn, TerminationFn
 from urlab_client.integrations.gym.episode import fields_of
 from urlab_client.integrations.gym.spaces import Field, Observation, SpaceMapping, SpaceMode
 from urlab_client.integrations.gym.vectorized import Floats, Indices, Vectorized
+from urlab_client.protocol.enums import ControllerKind
 from urlab_client.protocol.errors import UnknownKeyframe, URLabError
+from urlab_client.server.controllers import Controller, ControllerConfig, PassthroughController, PDController
 from urlab_client.sync.client import URLabClient
 
 __all__ = ["URLabBatchEnv"]
@@ -29,7 +32,8 @@ class URLabBatchEnv(Vectorized):
 
     The scene is what a server compiles: it is fetched once, and the server is not needed any more. Observations,
     rewards and autoreset are those of `URLabVectorEnv`, bit for bit for the same seeds and actions, as long as no
-    controller is attached and no wrench is applied; there are no cameras.
+    wrench is applied; there are no cameras. Controllers act before each physics step, as they do on the server, with
+    the parameters they had when the scene was fetched.
     """
 
     def __init__(
@@ -65,12 +69,12 @@ class URLabBatchEnv(Vectorized):
             client_options: Further options of the client that fetches the scene.
 
         Raises:
-            URLabError: The scene cannot be fetched, or an articulation has a controller.
+            URLabError: The scene cannot be fetched.
             ValueError: An option out of range.
         """
         if num_envs < 1 or n_substeps < 1 or reset_noise < 0:
             raise ValueError("num_envs and n_substeps are at least 1, and reset_noise is 0 or more")
-        model, keys = _fetch(address, {"step_mode": "direct", **client_options})
+        model, keys, controllers = _fetch(address, {"step_mode": "direct", **client_options})
         mapping = SpaceMapping(model, keys, fields_of(observations), space_mode)
         super().__init__(
             num_envs=num_envs,
@@ -93,6 +97,9 @@ class URLabBatchEnv(Vectorized):
             for key in mapping.keys
         }
         self._sensors = {key: _sensor_addresses(model, mapping.layout(key)) for key in mapping.keys}
+        self._controllers = {
+            key: _controller(model, mapping.layout(key), kind, params) for key, (kind, params) in controllers.items()
+        }
         self._step_count = np.zeros(num_envs, dtype=np.int64)
 
     def _reset_some(self, indices: Indices, keyframe: str | None) -> tuple[Observation, Mapping[int, Exception]]:
@@ -109,11 +116,28 @@ class URLabBatchEnv(Vectorized):
 
     def _step_some(self, indices: Indices, actions: Any) -> tuple[Observation, Mapping[int, Exception]]:
         ctrl = self._arrays["ctrl"]
+        targets: dict[str, NDArray[np.float32]] = {}
         for key, values in self.mapping.set_points(actions).items():
-            ctrl[np.ix_(indices, self.mapping.layout(key).ctrl_adr)] = values[indices]
-        self._batch.step(indices, nstep=self._n_substeps)
+            controller = self._controllers.get(key)
+            if controller is None or not controller.active:
+                ctrl[np.ix_(indices, self.mapping.layout(key).ctrl_adr)] = values[indices]
+            else:
+                targets[key] = values[indices].astype(np.float32)
+        if targets:
+            for _ in range(self._n_substeps):
+                self._control(indices, targets)
+                self._batch.step(indices, nstep=1)
+        else:
+            self._batch.step(indices, nstep=self._n_substeps)
         self._step_count[indices] += self._n_substeps
         return self._observe(indices), {}
+
+    def _control(self, indices: Indices, targets: Mapping[str, NDArray[np.float32]]) -> None:
+        """Let the controllers turn their targets into controls, for the state as it is."""
+        ctrl, qpos, qvel = (self._arrays[name][indices] for name in ("ctrl", "qpos", "qvel"))
+        for key, values in targets.items():
+            self._controllers[key].write(values, qpos, qvel, ctrl)
+        self._arrays["ctrl"][indices] = ctrl
 
     def _clocks(self) -> dict[str, NDArray[Any]]:
         return {"sim_time": self._arrays["time"].copy(), "step_count": self._step_count.copy()}
@@ -148,19 +172,38 @@ class URLabBatchEnv(Vectorized):
         return self._keyframes[found[0]]
 
 
-def _fetch(address: str, client_options: Mapping[str, Any]) -> tuple[mujoco.MjModel, list[str]]:
+def _fetch(
+    address: str, client_options: Mapping[str, Any]
+) -> tuple[mujoco.MjModel, list[str], dict[str, tuple[str, dict[str, Any]]]]:
+    """Return a scene's model, its articulations, and the kind and parameters of those that have a controller."""
     with URLabClient(address, **client_options) as client:
         client.discover()
-        controlled = [key for key, articulation in client.articulations.items() if articulation.controller is not None]
-        if controlled:
-            raise URLabError(
-                f"{', '.join(controlled)} has a controller, which runs on a server only.",
-                hint="Use URLabVectorEnv, or serve the scene without controllers.",
-            )
         model = client.model
         if model is None or not client.articulations:
             raise URLabError(f"There is no articulation at {address}.", hint="Start play first.")
-        return model, list(client.articulations)
+        attached = {key: articulation.controller for key, articulation in client.articulations.items()}
+        controllers = {key: (str(found.kind), dict(found.params)) for key, found in attached.items() if found}
+        return model, list(client.articulations), controllers
+
+
+@dataclass(frozen=True)
+class _Actuated:
+    """See `urlab_client.server.controllers.Actuated`."""
+
+    actuators: Indices
+    actuator_names: tuple[str, ...]
+    ctrl_adr: Indices
+
+
+def _controller(
+    model: mujoco.MjModel, layout: ArticulationLayout, kind: str, params: Mapping[str, object]
+) -> Controller:
+    actuated = _Actuated(np.array([*layout.actuators.values()], dtype=np.intp), (*layout.actuators,), layout.ctrl_adr)
+    if kind != ControllerKind.PD:
+        return PassthroughController(model, actuated)
+    controller = PDController(model, actuated, ControllerConfig())
+    controller.configure(params)
+    return controller
 
 
 def _sensor_addresses(model: mujoco.MjModel, layout: ArticulationLayout) -> Indices:
