@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from urlab_client.integrations.record._extras import need
+from urlab_client.integrations._extras import need
 from urlab_client.integrations.record.reader import Camera, Run, Table
 from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.protocol.rows import Pixels
