@@ -130,6 +130,24 @@ async def test_calls_of_several_tasks_go_one_at_a_time(client: Any, scripted: An
     assert await asyncio.gather(*(client.runtime.set_sim_speed(percent) for percent in speeds)) == speeds
 
 
+async def test_calls_one_after_the_other_leave_other_tasks_their_turns(client: Any, scripted: Any) -> None:
+    scripted.on("set_paused", PAUSED)
+    await client.discover()
+    turns = 0
+
+    async def count() -> None:
+        nonlocal turns
+        while True:
+            await asyncio.sleep(0)
+            turns += 1
+
+    counting = asyncio.create_task(count())
+    for _ in range(100):
+        await client.runtime.set_paused(True)
+    counting.cancel()
+    assert turns >= 100
+
+
 async def test_a_queued_call_times_out_without_being_sent(client: Any, scripted: Any) -> None:
     await discovered(client, scripted)
     first = asyncio.create_task(client.runtime.set_paused(True, timeout=None))

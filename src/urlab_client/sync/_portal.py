@@ -12,7 +12,7 @@ time, for streams and heartbeats. The rules:
 3. Who leaves gives the turn back first and then looks for calls still under way; who queues a call does that first
    and then looks whether anybody has the turn. Either of them rings the thread's bell if nobody would run the loop.
 4. The thread takes the turn when the bell rings, or when no call has left for `_IDLE`: consecutive calls of a script
-   cost no hand-over. It alone sees the loop to its end.
+   cost no hand-over. While they last it looks more and more rarely. It alone sees the loop to its end.
 5. An exception that a signal handler raises amid the loop's own code would lose callbacks. While the main thread runs
    the loop, handlers are therefore kept back; a signal makes it leave the loop, and the handler runs then.
 
@@ -58,6 +58,10 @@ _MAIN_THREAD_DRIVES = sys.platform != "win32"
 
 # Seconds after a call until the thread runs the loop again. A hand-over then costs a hundredth of the pause.
 _IDLE = 0.005
+
+# The longest time between two looks whether calls still follow each other. A thread that wakes up wants the interpreter
+# lock, and for the up to five milliseconds until it gets it, every release of the lock costs the caller a system call.
+_LONGEST_PAUSE = 0.08
 
 # Seconds after which the thread is asked again for the turn, and a caller that waits for it looks for signals.
 _CLAIM_SLICE = 0.05
@@ -393,12 +397,14 @@ class _LoopHost:
 
     def _await_turn(self) -> None:
         """Sleep until the turn is the thread's again."""
+        pause = _IDLE
         while True:
-            if self._bell.acquire(timeout=_IDLE):
+            if self._bell.acquire(timeout=pause):
                 self._turn.acquire()
                 break
             if time.monotonic() - self._left >= _IDLE and self._turn.acquire(blocking=False):
                 break
+            pause = min(2 * pause, _LONGEST_PAUSE)
         # Whatever it rang for until now is in the loop. Left ringing, it would take the turn from the next caller.
         self._bell.acquire(blocking=False)
 

@@ -21,6 +21,7 @@ from msgspec import Struct
 
 from urlab_client.aio.transport.base import Transport
 from urlab_client.aio.transport.mapping import Mapping, RegionInUse
+from urlab_client.aio.transport.spin import Spin
 from urlab_client.aio.transport.waiter import Doorbell, Reply, Waiter
 from urlab_client.aio.transport.windows import NamedEvent
 from urlab_client.protocol import doorbell
@@ -296,8 +297,7 @@ class ShmTransport:
         self._closed = False
         self._refused: dict[str, str] = {}
         self._largest_state = 0
-        self._latency: dict[str, float] = {}
-        self._missed_spins: dict[str, int] = {}
+        self._spin = Spin(_SPIN_S, _LONGEST_SPIN_S)
 
     @property
     def state_port(self) -> int | None:
@@ -487,7 +487,8 @@ class ShmTransport:
             self._ring()
             if deadline is not None:
                 timer = loop.call_at(deadline, self._expire, pending, deadline - started)
-            await self._spin(channel, pending)
+            if self._spin.pays(op.name):
+                await self._spin.look(op.name, pending.future, lambda: self._look_at(channel))
             if self._memory.bell is None:
                 self._watch()
             answer = await pending.future
@@ -499,7 +500,7 @@ class ShmTransport:
             self._used_at = loop.time()
         channel.dirty = False
         self.stats.received += 1
-        self._note_latency(op, loop.time() - started)
+        self._spin.note(op.name, loop.time() - started)
         return answer
 
     def _ring(self) -> None:
@@ -507,18 +508,9 @@ class ShmTransport:
         if bell is not None:
             bell.ring(doorbell.REQUEST)
 
-    async def _spin(self, channel: _Channel, pending: _Pending) -> None:
-        """Look again and again while other tasks have their turns, as long as that may help."""
-        name, loop = pending.op.name, asyncio.get_running_loop()
-        if self._missed_spins.get(name, 0) >= 4:
-            return
-        give_up = loop.time() + min(max(2 * self._latency.get(name, 0.0), _SPIN_S), _LONGEST_SPIN_S)
-        replies = channel.replies.region
-        while not pending.future.done() and loop.time() < give_up:
-            if replies.sequence != channel.seen:
-                self._look()
-            else:
-                await asyncio.sleep(0)
+    def _look_at(self, channel: _Channel) -> None:
+        if channel.replies.region.sequence != channel.seen:
+            self._look()
 
     def _watch(self) -> None:
         """Let the thread look for the reply from now on."""
@@ -596,11 +588,6 @@ class ShmTransport:
                 hint="The server is busy or blocked; allow more time with timeout=…",
             )
         )
-
-    def _note_latency(self, op: Op, seconds: float) -> None:
-        name = op.name
-        self._latency[name] = 0.9 * self._latency.get(name, seconds) + 0.1 * seconds
-        self._missed_spins[name] = self._missed_spins.get(name, 0) + 1 if seconds > _LONGEST_SPIN_S else 0
 
     # When the server goes
 
