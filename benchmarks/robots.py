@@ -24,12 +24,13 @@ _SENSORS = """
 """
 
 
-def robot_mjcf(joints: int, *, terrain: int = 0) -> str:
+def robot_mjcf(joints: int, *, terrain: int = 0, standing: bool = False) -> str:
     """Return a robot with a free base, so many hinges in limbs of six, a motor each, and an inertial unit.
 
     Args:
         joints: Hinges.
         terrain: Side of a height field that only makes the model large, samples.
+        standing: Give it ground to touch; otherwise it falls freely, and physics has least to do.
     """
     limbs: list[str] = []
     for start in range(0, joints, 6):
@@ -37,15 +38,17 @@ def robot_mjcf(joints: int, *, terrain: int = 0) -> str:
         for i in reversed(range(start, min(start + 6, joints))):
             chain = (
                 f'<body name="link{i}" pos="0 0 -0.08"><joint name="joint{i}" axis="{i % 2} {(i + 1) % 2} 0"'
-                f' range="-60 60"/><geom type="capsule" size="0.02 0.03" contype="0" conaffinity="0"/>{chain}</body>'
+                f' range="-60 60"/><geom type="capsule" size="0.02 0.03" contype="{int(standing)}" conaffinity="0"/>'
+                f"{chain}</body>"
             )
         limbs.append(chain)
     motors = "".join(f'<motor name="motor{i}" joint="joint{i}" gear="5"/>' for i in range(joints))
+    ground = '<geom type="plane" size="5 5 1"/>' if standing else ""
     asset = f'<hfield name="terrain" nrow="{terrain}" ncol="{terrain}" size="5 5 1 1"/>' if terrain else ""
     return f"""<mujoco model="robot">
     <default><joint damping="0.5" armature="0.01"/></default>
     <asset>{asset}</asset>
-    <worldbody><body name="torso" pos="0 0 1"><freejoint name="root"/><site name="imu"/>
+    <worldbody>{ground}<body name="torso" pos="0 0 {0.5 if standing else 1}"><freejoint name="root"/><site name="imu"/>
     <geom type="box" size="0.1 0.1 0.2"/>{"".join(limbs)}</body></worldbody>
     <actuator>{motors}</actuator>
     <sensor>{_SENSORS}</sensor>

@@ -49,10 +49,10 @@ class _Simulated:
 
 
 @contextlib.contextmanager
-def _simulated() -> Iterator[_Simulated]:
+def _simulated(*, standing: bool = True) -> Iterator[_Simulated]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "robot.xml"
-        path.write_text(robot_mjcf(_JOINTS))
+        path.write_text(robot_mjcf(_JOINTS, standing=standing))
         ports = [f"--{name}-port=0" for name in ("step", "state", "ctrl", "info")]
         command = [sys.executable, "-m", "urlab_client", "serve", str(path), "--play", "--json", "--until-eof", *ports]
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
@@ -80,8 +80,8 @@ def _from_start(reset: Callable[[], object], step: Callable[[], object]) -> Burs
 
 
 @contextlib.contextmanager
-def _single() -> Iterator[Pair]:
-    with _simulated() as ours, server(recorded(_JOINTS)) as port, Requester(port) as floor:
+def _single(*, standing: bool = True) -> Iterator[Pair]:
+    with _simulated(standing=standing) as ours, server(recorded(_JOINTS)) as port, Requester(port) as floor:
         data = mujoco.MjData(ours.model)
         ask = floor.asking(encode_request(Step(), ours.session_id))
 
@@ -110,18 +110,28 @@ def _hundred() -> Iterator[Pair]:
         )
 
 
+_ROBOT = "robot of 29 joints and a free base"
+
 ROWS = (
     Row(
         name="server-step-1",
-        what="simulated server, direct, humanoid of 29 joints and a free base, n_steps=1",
+        what=f"simulated server, direct, n_steps=1, {_ROBOT} standing on the ground",
         floor="mj_step + blocking REQ round trip of the same bytes",
         reach=1.35,
         prepare=_single,
         count=100,
     ),
     Row(
+        name="server-step-1-falling",
+        what="the same robot in free fall, where physics has least to do",
+        floor="mj_step + blocking REQ round trip of the same bytes",
+        reach=1.35,
+        prepare=lambda: _single(standing=False),
+        count=100,
+    ),
+    Row(
         name="server-step-100",
-        what="the same, n_steps=100",
+        what="simulated server, direct, n_steps=100, the robot standing",
         floor="100 x mj_step in a loop",
         reach=0.95,
         kind="rate",
