@@ -1,0 +1,255 @@
+"""`urlab run-policy`: a network from an ONNX file drives a robot."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+from collections.abc import AsyncGenerator, Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from urlab_client.cli._arguments import Commands, add_keys, port, seconds
+from urlab_client.cli._failure import CommandError
+from urlab_client.cli._mujoco import import_mujoco
+from urlab_client.cli._progress import progress_bar
+from urlab_client.protocol.enums import StepMode
+
+if TYPE_CHECKING:
+    from urlab_client.aio import URLabClient
+    from urlab_client.integrations.policy import Policy, PolicyRun
+    from urlab_client.protocol.base import Floats
+
+__all__ = ["add_parser", "run"]
+
+_FELL = 1
+_SEED = 0
+
+
+class RunPolicyArguments(argparse.Namespace):
+    """What the command line says."""
+
+    policy: Path
+    address: str | None
+    declaration: Path | None
+    robot: str | None
+    seconds: float
+    twist: list[float] | None
+    step_mode: StepMode | None
+    compare: bool
+    record: Path | None
+    camera: list[str]
+    overwrite: bool
+    step_port: int
+    state_port: int
+    server_key: str | None
+    client_key: str | None
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command to the parser."""
+    parser = commands.add_parser(
+        "run-policy",
+        help="let a network from an ONNX file drive a robot",
+        description="Run a policy: a network in an ONNX file, and a TOML file beside it that says what it sees and "
+        "what its outputs mean. Refuses to start where robot, step mode, timestep or controller are not what it requires. "
+        "Without an address it starts a simulated server; with one it opens a session, which takes the server over "
+        "from the client that drives it. Exit code 1 when the robot fell. Needs the extra 'urlab-client[onnx]'.",
+    )
+    parser.add_argument("policy", type=Path, metavar="POLICY", help="the network, a .onnx file")
+    parser.add_argument(
+        "address", nargs="?", help="tcp://HOST, tcp://HOST:PORT or sim://MODEL (default: a server for --robot)"
+    )
+    parser.add_argument(
+        "--declaration", type=Path, metavar="FILE", help="the .toml file (default: that beside POLICY, of its name)"
+    )
+    parser.add_argument(
+        "--robot",
+        metavar="ROBOT",
+        help="an MJCF file or the name of a bundled robot to simulate; with an address the articulation to drive "
+        "(default: what the declaration says)",
+    )
+    parser.add_argument(
+        "--seconds", type=seconds, default=10.0, metavar="S", help="simulated seconds (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--command",
+        dest="twist",
+        type=float,
+        nargs=3,
+        metavar=("VX", "VY", "WZ"),
+        help="what to do: m/s forward, m/s to the left, rad/s to the left (default: what the declaration says)",
+    )
+    parser.add_argument(
+        "--step-mode",
+        type=StepMode,
+        choices=[StepMode.DIRECT, StepMode.LIVE],
+        help="direct or live (default: the first that the declaration allows)",
+    )
+    parser.add_argument("--compare", action="store_true", help="run zero and random outputs first, for comparison")
+    parser.add_argument(
+        "--record", type=Path, metavar="FILE", help="record the policy's run into a .mcap file (extra 'mcap')"
+    )
+    parser.add_argument(
+        "--camera",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="with --record: a camera to keep, as ARTICULATION/CAMERA, or 'all'; repeatable",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="with --record: replace FILE if it exists")
+    parser.add_argument("--step-port", type=port, default=5559, metavar="PORT", help="RPC port (default: %(default)s)")
+    parser.add_argument(
+        "--state-port", type=port, default=5555, metavar="PORT", help="state stream (default: %(default)s)"
+    )
+    add_keys(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: RunPolicyArguments) -> int:
+    """Run the policy; return 1 if the robot fell, else 0.
+
+    Raises:
+        CommandError: An option cannot be used, or a library is missing.
+        URLabError: A file is wrong, the policy does not fit, or the server cannot be reached.
+    """
+    import_mujoco()
+    _check_record(arguments)
+    from urlab_client.integrations.policy import load  # noqa: PLC0415
+
+    try:
+        policy = load(arguments.policy, arguments.declaration)
+    except ImportError as error:
+        raise CommandError(str(error)) from None
+    if arguments.twist is not None:
+        try:
+            policy.command = arguments.twist
+        except ValueError as error:
+            raise CommandError(f"--command: {error}") from None
+    runs = asyncio.run(_run(arguments, policy))
+    _print(runs)
+    return _FELL if runs["policy"].falls else 0
+
+
+def _check_record(arguments: RunPolicyArguments) -> None:
+    if arguments.record is None:
+        if arguments.camera or arguments.overwrite:
+            raise CommandError("--camera and --overwrite go with --record")
+        return
+    if arguments.record.exists() and not arguments.overwrite:
+        raise CommandError(f"{arguments.record} exists; --overwrite replaces it")
+    try:
+        import urlab_client.integrations.record  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]
+    except ImportError as error:
+        raise CommandError(str(error)) from None
+
+
+async def _run(arguments: RunPolicyArguments, policy: Policy) -> dict[str, PolicyRun]:
+    """Return what came of each run, by what acted."""
+    from urlab_client.aio import URLabClient  # noqa: PLC0415
+    from urlab_client.integrations.policy import require  # noqa: PLC0415
+    from urlab_client.integrations.policy import run as run_policy  # noqa: PLC0415
+
+    address, articulation = _where(arguments, policy)
+    client = URLabClient(
+        address,
+        step_port=arguments.step_port,
+        state_port=arguments.state_port,
+        step_mode=arguments.step_mode or policy.spec.step_modes[0],
+        server_key=arguments.server_key,
+        client_key=arguments.client_key,
+    )
+    actors = {**(_others(policy) if arguments.compare else {}), "policy": policy}
+    runs: dict[str, PolicyRun] = {}
+    async with client:
+        await client.discover()
+        require(client, policy, articulation)
+        for name, actor in actors.items():
+            with progress_bar(name, arguments.seconds) as progress:
+
+                def show(so_far: PolicyRun, progress: Callable[[float], None] = progress) -> None:
+                    progress(so_far.sim_time)
+
+                async with _recorded(client, arguments if actor is policy else None):
+                    runs[name] = await run_policy(
+                        client, actor, articulation=articulation, seconds=arguments.seconds, on_action=show
+                    )
+    return runs
+
+
+def _where(arguments: RunPolicyArguments, policy: Policy) -> tuple[str, str | None]:
+    """Return the address, and the articulation if it is not the one that is declared."""
+    if arguments.address is not None:
+        return arguments.address, arguments.robot
+    model = arguments.robot or policy.spec.robot
+    actor = Path(model).stem  # what a server calls the actor of a file
+    controller = f"?controller={actor}=pd" if policy.spec.action.via == "controller" else ""
+    return f"sim://{model}{controller}", actor
+
+
+def _others(policy: Policy) -> dict[str, Policy]:
+    """Return what to compare with: the same declaration and command, other outputs."""
+    from urlab_client.integrations.policy import Policy  # noqa: PLC0415
+
+    low, high = policy.spec.action.clip
+    size = len(policy.spec.action.joints)
+    rng = np.random.default_rng(_SEED)
+
+    def zero(observation: Floats) -> Floats:
+        return np.zeros(size)
+
+    def random(observation: Floats) -> Floats:
+        return rng.uniform(low, high, size)
+
+    others = {name: Policy(policy.spec, network, source=name) for name, network in (("zero", zero), ("random", random))}
+    if policy.spec.command is not None:
+        for other in others.values():
+            other.command = policy.command
+    return others
+
+
+@contextlib.asynccontextmanager
+async def _recorded(client: URLabClient, arguments: RunPolicyArguments | None) -> AsyncGenerator[None]:
+    """Record what happens in the block, if that was asked for."""
+    if arguments is None or arguments.record is None:
+        yield
+        return
+    from urlab_client.integrations.record import record  # noqa: PLC0415
+
+    cameras = "all" if "all" in arguments.camera else arguments.camera
+    try:
+        async with record(client, arguments.record, cameras=cameras, overwrite=arguments.overwrite):
+            yield
+    except KeyError as error:
+        raise CommandError(f"--camera: {error.args[0]}") from None
+
+
+def _print(runs: dict[str, PolicyRun]) -> None:
+    from rich import box  # noqa: PLC0415
+    from rich.console import Console  # noqa: PLC0415
+    from rich.table import Table  # noqa: PLC0415
+
+    last = runs["policy"]
+    table = Table(
+        title=f"{last.articulation}, {last.step_mode} mode, {last.sim_time:.1f} s of simulation",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+        show_edge=False,
+    )
+    table.add_column("outputs")
+    for heading in ("mean\nreward", "forward\n(m)", "velocity\nerror (m/s)", "falls", "late\nactions", "actions/s"):
+        table.add_column(heading, justify="right")
+    for name, found in runs.items():
+        table.add_row(
+            name,
+            f"{found.reward:.3f}",
+            f"{found.forward:.2f}",
+            f"{found.velocity_error:.3f}",
+            str(found.falls),
+            str(found.late) if found.step_mode is StepMode.LIVE else "",
+            f"{found.actions / found.wall_time:.0f}",
+        )
+    console = Console()
+    (console if console.is_terminal else Console(width=100)).print(table)

@@ -1,0 +1,27 @@
+"""Policies from ONNX files: a network, a TOML file that says what it sees and does, and running it on a robot.
+
+Running a network needs the extra `onnx`; declarations, mappings and policies of your own callables do not.
+"""
+
+from urlab_client.integrations.policy.mapping import PolicyMapping, PolicyMismatch, RobotState
+from urlab_client.integrations.policy.network import Network, OnnxNetwork
+from urlab_client.integrations.policy.policy import Policy, load
+from urlab_client.integrations.policy.runner import PolicyRun, require, run
+from urlab_client.integrations.policy.spec import PolicyFileError, PolicySpec, parse_spec, read_spec
+
+__all__ = [
+    "Network",
+    "OnnxNetwork",
+    "Policy",
+    "PolicyFileError",
+    "PolicyMapping",
+    "PolicyMismatch",
+    "PolicyRun",
+    "PolicySpec",
+    "RobotState",
+    "load",
+    "parse_spec",
+    "read_spec",
+    "require",
+    "run",
+]

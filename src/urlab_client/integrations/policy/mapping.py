@@ -1,0 +1,374 @@
+"""From a robot's state to what the network sees, and from its outputs to set-points.
+
+All functions take single robots and batches alike: arrays may have leading axes. Training and running use the same
+ones, so a network sees the same numbers in both.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from urlab_client.aio.controllers import URLabController as AsyncController
+from urlab_client.aio.handles import Actuator, Joint, Sensor
+from urlab_client.integrations.policy.spec import (
+    AngularVelocity,
+    BaseHeight,
+    Clock,
+    CommandTerm,
+    Gravity,
+    JointPosition,
+    JointVelocity,
+    LastAction,
+    LinearVelocity,
+    Numbers,
+    PolicySpec,
+    SensorTerm,
+    Term,
+)
+from urlab_client.protocol.base import Floats
+from urlab_client.protocol.enums import ControlMode
+from urlab_client.protocol.errors import URLabError
+from urlab_client.sync.controllers import URLabController
+
+__all__ = ["PolicyMapping", "PolicyMismatch", "Robot", "RobotState"]
+
+_SCALAR_JOINTS: Final = (2, 3)  # slide, hinge
+_COMMAND: Final = 3
+
+
+class PolicyMismatch(URLabError):
+    """A policy does not fit the robot or the session; says what is there, what it requires, and how to get it."""
+
+
+class Robot(Protocol):
+    """What a policy uses of an articulation of either flavour."""
+
+    @property
+    def prefix(self) -> str:
+        """Articulation key."""
+        ...
+
+    @property
+    def joints(self) -> Mapping[str, Joint]:
+        """Joints by name."""
+        ...
+
+    @property
+    def actuators(self) -> Mapping[str, Actuator]:
+        """Actuators by name."""
+        ...
+
+    @property
+    def sensors(self) -> Mapping[str, Sensor]:
+        """Sensors by name."""
+        ...
+
+    @property
+    def controller(self) -> AsyncController | URLabController | None:
+        """The controller, or None."""
+        ...
+
+    @property
+    def control_mode(self) -> ControlMode:
+        """Whether the controller is in force."""
+        ...
+
+    @property
+    def has_free_base(self) -> bool:
+        """Whether the root has a free joint."""
+        ...
+
+    @property
+    def ctrl_array(self) -> Floats:
+        """Set-points, to be written in place."""
+        ...
+
+    @property
+    def qpos_array(self) -> Floats:
+        """Joint positions."""
+        ...
+
+    @property
+    def qvel_array(self) -> Floats:
+        """Joint velocities."""
+        ...
+
+    def get_sensors(self) -> dict[str, Floats]:
+        """Readings by sensor name."""
+        ...
+
+
+class RobotState(NamedTuple):
+    """The state of a robot, or of a batch of them.
+
+    Attributes:
+        qpos: Joint positions in the order of `qpos_array`, shape (…, nq).
+        qvel: Joint velocities in the order of `qvel_array`, shape (…, nv).
+        sensors: Readings by sensor name, shape (…, dim).
+    """
+
+    qpos: Floats
+    qvel: Floats
+    sensors: Mapping[str, Floats] = {}
+
+    @classmethod
+    def of(cls, robot: Robot) -> RobotState:
+        """Return the state that an articulation has now."""
+        return cls(robot.qpos_array, robot.qvel_array, robot.get_sensors())
+
+    @property
+    def gravity(self) -> Floats:
+        """Direction of gravity in the base frame, shape (…, 3)."""
+        return -self._rotation()[..., 2, :]
+
+    @property
+    def linear_velocity(self) -> Floats:
+        """Velocity of the base, m/s, base frame, shape (…, 3)."""
+        return np.einsum("...ij,...i->...j", self._rotation(), self.qvel[..., :3])
+
+    @property
+    def angular_velocity(self) -> Floats:
+        """Angular velocity of the base, rad/s, base frame, shape (…, 3)."""
+        return self.qvel[..., 3:6]
+
+    def _rotation(self) -> Floats:
+        """Return what turns vectors of the base frame into the world frame, shape (…, 3, 3)."""
+        w, x, y, z = np.moveaxis(self.qpos[..., 3:7], -1, 0)
+        rows = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+        return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+class _Moment(NamedTuple):
+    """What a term may look at."""
+
+    state: RobotState
+    command: Floats
+    last_action: Floats
+    time: float
+
+
+_Read = Callable[[_Moment], Floats]
+
+
+class PolicyMapping:
+    """A declaration bound to a robot's joints, actuators and sensors.
+
+    Attributes:
+        spec: The declaration.
+        observation_size: Numbers in one observation.
+        action_size: Outputs of the network.
+        joints: Joint of each output.
+        actuators: Actuator of each output.
+        ctrl: Position of each output in `ctrl_array`.
+    """
+
+    def __init__(self, spec: PolicySpec, robot: Robot, source: str) -> None:
+        """Bind.
+
+        Args:
+            spec: The declaration.
+            robot: An articulation of a discovered client with a local model.
+            source: Names the declaration in errors, usually its file.
+
+        Raises:
+            PolicyMismatch: The robot lacks a joint, an actuator, a sensor or a free base.
+        """
+        self.spec = spec
+        self._source = source
+        self._robot = robot.prefix
+        self._has_base = robot.has_free_base
+        if not robot.joints:
+            raise PolicyMismatch(
+                f"{source}: the joints of {self._robot!r} are not known.",
+                hint="Make the client with local_model=True and call discover() during play.",
+            )
+        self.joints = self._joints(robot, spec.action.joints, "action.joints")
+        self.actuators = [_actuator(robot, joint, source) for joint in self.joints]
+        self.ctrl = np.array([actuator.ctrl_local.start for actuator in self.actuators], dtype=np.intp)
+        self.action_size = len(self.joints)
+        self._qpos, self._qvel = _offsets(self.joints)
+        self._scale, self._offset = _array(spec.action.scale), _array(spec.action.offset)
+        self._terms: list[tuple[_Read, Term]] = []
+        self.observation_size = 0
+        for index, term in enumerate(spec.observation):
+            where = f"observation[{index}]"
+            size, read = self._term(robot, term, where)
+            for name in ("scale", "offset"):
+                value: Numbers = getattr(term, name)
+                if isinstance(value, list) and len(value) != size:
+                    raise self._misfit(f"{where}.{name}", f"has {len(value)} numbers; it takes one, or {size}")
+            self._terms.append((read, term))
+            self.observation_size += size
+        if (spec.fall or spec.reward) and not self._has_base:
+            raise self._misfit("fall" if spec.fall else "reward", f"needs a free base; {self._robot!r} has none")
+        spread = self._joints(robot, spec.reward.spread_joints if spec.reward else [], "reward.spread_joints")
+        self._spread = _offsets(spread)[0]
+
+    def observe(self, state: RobotState, command: Floats, last_action: Floats, time: float) -> Floats:
+        """Return one observation, shape (…, observation_size).
+
+        Args:
+            state: State of the robot.
+            command: (vx, vy, yaw rate), shape (…, 3).
+            last_action: The last output after clipping, shape (…, action_size).
+            time: Seconds since the start.
+        """
+        moment = _Moment(state, command, last_action, time)
+        parts: list[Floats] = []
+        for read, term in self._terms:
+            part = (read(moment) - _array(term.offset)) * _array(term.scale)
+            parts.append(part if term.clip is None else np.clip(part, *term.clip))
+        leading = state.qpos.shape[:-1]
+        return np.concatenate([np.broadcast_to(part, (*leading, part.shape[-1])) for part in parts], axis=-1)
+
+    def clipped(self, output: Floats) -> Floats:
+        """Return the network's outputs within their limits."""
+        return np.clip(output, *self.spec.action.clip)
+
+    def targets(self, action: Floats) -> Floats:
+        """Return joint targets or torques of a clipped output, shape (…, action_size)."""
+        return self._offset + self._scale * action
+
+    def torques(self, targets: Floats, state: RobotState) -> Floats:
+        """Return what the PD law of `gains` gives for some joint targets, shape (…, action_size)."""
+        gains = self.spec.gains
+        if gains is None:
+            raise ValueError(f"{self._source} has no gains: its action goes via actuators")
+        limit = _array(gains.torque_limit)
+        wanted = _array(gains.kp) * (targets - state.qpos[..., self._qpos])
+        return np.clip(wanted - _array(gains.kv) * state.qvel[..., self._qvel], -limit, limit)
+
+    def gains(self) -> dict[str, dict[str, float]]:
+        """Return the gains as `set_gains` takes them: by the name of each, then by actuator."""
+        gains, names = self.spec.gains, [actuator.name for actuator in self.actuators]
+        if gains is None:
+            return {}
+        values = {"kp": gains.kp, "kv": gains.kv, "torque_limit": gains.torque_limit}
+        return {
+            name: dict(zip(names, np.broadcast_to(_array(value), self.action_size).tolist(), strict=True))
+            for name, value in values.items()
+        }
+
+    def fallen(self, state: RobotState) -> NDArray[np.bool_]:
+        """Whether the robot has fallen, shape (…)."""
+        fall = self.spec.fall
+        if fall is None:
+            return np.zeros(state.qpos.shape[:-1], dtype=bool)
+        return (state.qpos[..., 2] < fall.height) | (-state.gravity[..., 2] < fall.upright)
+
+    def reward(self, state: RobotState, command: Floats, action: Floats, last_action: Floats) -> Floats:
+        """Return the reward of `TrackingReward` for an action and the state it led to, shape (…); 0 without one."""
+        reward = self.spec.reward
+        if reward is None:
+            return np.zeros(state.qpos.shape[:-1])
+        linear, angular = state.linear_velocity, state.angular_velocity
+        gain = (
+            reward.alive
+            + reward.velocity * np.exp(-_squares(linear[..., :2] - command[..., :2]) / reward.velocity_width)
+            + reward.yaw * np.exp(-((angular[..., 2] - command[..., 2]) ** 2) / reward.yaw_width)
+            + reward.level * np.exp(-_squares(state.gravity[..., :2]) / reward.level_width)
+        )
+        cost = (
+            reward.bounce * linear[..., 2] ** 2
+            + reward.roll * _squares(angular[..., :2])
+            + reward.change * _squares(action - last_action)
+            + reward.spread * _squares(state.qpos[..., self._spread])
+        )
+        return np.where(self.fallen(state), 0.0, gain - cost)
+
+    def _term(self, robot: Robot, term: Term, where: str) -> tuple[int, _Read]:
+        """Return how many numbers a term has, and how to read them."""
+        match term:
+            case JointPosition():
+                qpos, _ = _offsets(self._joints(robot, term.joints, f"{where}.joints") or self.joints)
+                return len(qpos), lambda moment: moment.state.qpos[..., qpos]
+            case JointVelocity():
+                _, qvel = _offsets(self._joints(robot, term.joints, f"{where}.joints") or self.joints)
+                return len(qvel), lambda moment: moment.state.qvel[..., qvel]
+            case SensorTerm():
+                sensor = robot.sensors.get(term.sensor)
+                if sensor is None:
+                    raise self._misfit(f"{where}.sensor", _unknown("sensor", term.sensor, robot.prefix, robot.sensors))
+                name = sensor.name
+                return sensor.dim, lambda moment: moment.state.sensors[name]
+            case LastAction():
+                return self.action_size, lambda moment: moment.last_action
+            case Clock() | CommandTerm():
+                return _free_term(term)
+            case _:
+                if not self._has_base:
+                    raise self._misfit(where, f"needs a free base; {robot.prefix!r} has none")
+                return _base_term(term)
+
+    def _joints(self, robot: Robot, names: Sequence[str], where: str) -> list[Joint]:
+        found: list[Joint] = []
+        for index, name in enumerate(names):
+            joint = robot.joints.get(name)
+            if joint is None:
+                raise self._misfit(f"{where}[{index}]", _unknown("joint", name, robot.prefix, robot.joints))
+            if joint.jnt_type not in _SCALAR_JOINTS:
+                raise self._misfit(f"{where}[{index}]", f"{name!r} is neither a hinge nor a slide joint")
+            found.append(joint)
+        return found
+
+    def _misfit(self, where: str, problem: str) -> PolicyMismatch:
+        return PolicyMismatch(f"{self._source}: {where}: {problem}.")
+
+
+def _free_term(term: Clock | CommandTerm) -> tuple[int, _Read]:
+    if isinstance(term, CommandTerm):
+        return _COMMAND, lambda moment: moment.command
+    rate = 2 * math.pi * term.hz
+    return 2, lambda moment: np.array([math.sin(rate * moment.time), math.cos(rate * moment.time)])
+
+
+def _base_term(term: BaseHeight | Gravity | LinearVelocity | AngularVelocity) -> tuple[int, _Read]:
+    match term:
+        case BaseHeight():
+            return 1, lambda moment: moment.state.qpos[..., 2:3]
+        case Gravity():
+            return 3, lambda moment: moment.state.gravity
+        case LinearVelocity():
+            return 3, lambda moment: moment.state.linear_velocity
+        case AngularVelocity():
+            return 3, lambda moment: moment.state.angular_velocity
+
+
+def _actuator(robot: Robot, joint: Joint, source: str) -> Actuator:
+    """Return the actuator that drives a joint."""
+    found = [actuator for actuator in robot.actuators.values() if actuator.joint == joint.name]
+    if len(found) != 1 or found[0].ctrl_local.stop - found[0].ctrl_local.start != 1:
+        raise PolicyMismatch(
+            f"{source}: action.joints: {len(found)} actuators of {robot.prefix!r} drive {joint.name!r}; "
+            "it takes one, with one input."
+        )
+    return found[0]
+
+
+def _offsets(joints: Sequence[Joint]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return where joints are in `qpos_array` and in `qvel_array`."""
+    return (
+        np.array([joint.qpos_local_offset for joint in joints], dtype=np.intp),
+        np.array([joint.qvel_local_offset for joint in joints], dtype=np.intp),
+    )
+
+
+def _unknown(kind: str, name: str, robot: str, known: Mapping[str, object]) -> str:
+    return f"{robot!r} has no {kind} {name!r}; it has {', '.join(known) or 'none'}"
+
+
+def _array(value: Numbers) -> Floats:
+    return np.asarray(value, dtype=np.float64)
+
+
+def _squares(values: Floats) -> Floats:
+    return np.sum(values**2, axis=-1)

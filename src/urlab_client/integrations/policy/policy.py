@@ -1,0 +1,174 @@
+"""`Policy`: a network with its declaration, and what it remembers of one robot."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from urlab_client.integrations.policy.mapping import PolicyMapping, PolicyMismatch, Robot, RobotState
+from urlab_client.integrations.policy.network import Network, OnnxNetwork
+from urlab_client.integrations.policy.spec import PolicyFileError, PolicySpec, read_spec
+from urlab_client.protocol.base import Floats
+
+__all__ = ["Policy", "load"]
+
+
+class Policy:
+    """Drives one robot at a time.
+
+    It remembers what its observations need: the clock, the last action, earlier observations. `reset()` forgets it.
+
+    Attributes:
+        spec: The declaration.
+        source: What errors call the declaration, usually its file.
+    """
+
+    def __init__(self, spec: PolicySpec, network: Network, *, source: str = "policy") -> None:
+        """Make a policy of a declaration and any callable that maps observations to outputs.
+
+        Args:
+            spec: The declaration.
+            network: The network; `load` makes one from a file.
+            source: What errors call the declaration.
+        """
+        self.spec = spec
+        self.source = source
+        self._network = network
+        self._command: Floats = np.zeros(3) if spec.command is None else np.array(spec.command.default)
+        self._robot: Robot | None = None
+        self._mapping: PolicyMapping | None = None
+        self._targets: Floats = np.zeros(0)
+        self.reset()
+
+    @property
+    def command(self) -> Floats:
+        """The command (vx, vy, yaw rate), m/s and rad/s, base frame. May be assigned at any time.
+
+        Raises:
+            ValueError: On assigning another number of values, values it was not trained for, or any to a policy that
+                takes none.
+        """
+        return self._command.copy()
+
+    @command.setter
+    def command(self, values: Sequence[float] | Floats) -> None:
+        known = self.spec.command
+        given = np.array(values, dtype=np.float64)
+        if known is None:
+            raise ValueError(f"{self.source} takes no command")
+        if given.shape != (3,) or not np.all((given >= known.low) & (given <= known.high)):
+            raise ValueError(
+                f"a command is vx, vy, yaw rate from {list(known.low)} to {list(known.high)} (m/s, m/s, rad/s), "
+                f"not {given.tolist()}"
+            )
+        self._command = given
+
+    @property
+    def action(self) -> Floats:
+        """The last outputs after clipping, shape (n_joints,); zeros before the first."""
+        return self._action.copy()
+
+    def bind(self, robot: Robot) -> PolicyMapping:
+        """Fit the policy to an articulation of a discovered client, and return how.
+
+        Raises:
+            PolicyMismatch: The robot lacks what the declaration names.
+            PolicyFileError: The network has other sizes than the declaration.
+        """
+        mapping = PolicyMapping(self.spec, robot, self.source)
+        network = self._network
+        if isinstance(network, OnnxNetwork):
+            sizes = {
+                "inputs": (network.inputs, mapping.observation_size * self.spec.history, "observation times history"),
+                "outputs": (network.outputs, mapping.action_size, "action.joints"),
+            }
+            for kind, (there, declared, key) in sizes.items():
+                if there not in (None, declared):
+                    raise PolicyFileError(
+                        f"{network.path} has {there} {kind}, but {self.source} declares {declared} ({key})."
+                    )
+        if mapping.action_size != len(self._action):
+            self.reset()
+        self._robot, self._mapping = robot, mapping
+        return mapping
+
+    def reset(self) -> None:
+        """Forget: the clock starts again, the last action is zero."""
+        self._acted = 0
+        self._action: Floats = np.zeros(len(self.spec.action.joints))
+        self._history: list[Floats] = []
+
+    def act(self, robot: Robot, time: float | None = None) -> Floats:
+        """Look at a robot, and write its set-points for the next `decimation` physics steps.
+
+        With `via = "client"` they are the torques for the present state; `hold` computes them for later ones.
+
+        Args:
+            robot: The articulation.
+            time: Seconds since the start; by default the actions since `reset()` times their period.
+
+        Returns:
+            Joint targets or torques, shape (n_joints,).
+
+        Raises:
+            PolicyMismatch: The robot lacks what the declaration names.
+            PolicyFileError: The network's sizes are not those declared, or it returned NaN or infinity.
+        """
+        mapping = self._mapping if robot is self._robot and self._mapping is not None else self.bind(robot)
+        now = self._acted * self.spec.period if time is None else time
+        observation = mapping.observe(RobotState.of(robot), self._command, self._action, now)
+        kept = self._history or [observation] * self.spec.history
+        self._history = [*kept[1:], observation]
+        output = self._network(np.concatenate(self._history))
+        if output.shape != (mapping.action_size,):
+            raise PolicyFileError(
+                f"The network returned {output.size} numbers, but {self.source} declares {mapping.action_size} "
+                "(action.joints)."
+            )
+        if not math.isfinite(output.sum()):
+            raise PolicyFileError(f"The network of {self.source} returned NaN or infinity for {observation.tolist()}.")
+        self._acted += 1
+        self._action = mapping.clipped(output)
+        self._targets = mapping.targets(self._action)
+        if self.spec.action.via == "client":
+            self.hold(robot)
+        else:
+            robot.ctrl_array[mapping.ctrl] = self._targets
+        return self._targets
+
+    def hold(self, robot: Robot) -> None:
+        """Write the torques that pull a robot, as it is now, towards the targets of the last action.
+
+        To be called before each physics step between two actions, for a policy with `via = "client"`.
+
+        Raises:
+            PolicyMismatch: There was no action on this robot yet.
+        """
+        mapping = self._mapping
+        if robot is not self._robot or mapping is None:
+            raise PolicyMismatch(f"{self.source}: there was no action on {robot.prefix!r} yet.", hint="Call act().")
+        robot.ctrl_array[mapping.ctrl] = mapping.torques(self._targets, RobotState.of(robot))
+
+    def __repr__(self) -> str:
+        return f"<Policy {self.source} for {self.spec.robot!r}>"
+
+
+def load(onnx: str | PathLike[str], toml: str | PathLike[str] | None = None) -> Policy:
+    """Load a network and its declaration.
+
+    Args:
+        onnx: The network.
+        toml: Its declaration; by default the file of the same name that ends in `.toml`.
+
+    Raises:
+        PolicyFileError: A file is missing or wrong.
+        ImportError: The extra `onnx` is not installed.
+    """
+    path = Path(onnx)
+    declared = path.with_suffix(".toml") if toml is None else Path(toml)
+    spec = read_spec(declared)
+    return Policy(spec, OnnxNetwork(path), source=str(declared))

@@ -1,0 +1,298 @@
+"""Running a policy on a client: refuse what does not fit, then act, step, and count."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+from msgspec import Struct
+
+from urlab_client.aio.articulation import URLabArticulation
+from urlab_client.aio.client import URLabClient
+from urlab_client.aio.deadline import DEFAULT
+from urlab_client.integrations.policy.mapping import PolicyMapping, PolicyMismatch, RobotState
+from urlab_client.integrations.policy.policy import Policy
+from urlab_client.protocol.base import Floats
+from urlab_client.protocol.enums import ActuatorType, ControllerKind, ControlMode, StepMode
+from urlab_client.protocol.errors import URLabError
+
+__all__ = ["PolicyRun", "require", "run"]
+
+_STANDSTILL_S: Final = 5.0
+_SMOOTHING_S: Final = 0.5
+_TIMESTEP_TOLERANCE: Final = 1e-9
+
+OnAction = Callable[["PolicyRun"], None]
+"""Called after each action with the run so far."""
+
+
+class PolicyRun(Struct):
+    """What came of running a policy.
+
+    Attributes:
+        articulation: Key of the robot.
+        step_mode: How it was stepped.
+        actions: Actions taken.
+        steps: Physics steps taken; 0 in live mode, where nobody counts them.
+        sim_time: Simulated seconds.
+        wall_time: Seconds it took.
+        falls: Times the robot fell, each followed by a reset.
+        upright_time: Simulated seconds until the first fall, or `sim_time`.
+        distance: Length of the base's way, metres, as the sum of straight lines between two resets.
+        forward: Of that along the heading it had at each start, metres.
+        velocity_error: Root mean square of commanded minus actual horizontal velocity, m/s, base frame, smoothed over
+            half a second.
+        reward: Mean reward per action.
+        late: Actions that came more than one period late, in live mode.
+    """
+
+    articulation: str
+    step_mode: StepMode
+    actions: int = 0
+    steps: int = 0
+    sim_time: float = 0.0
+    wall_time: float = 0.0
+    falls: int = 0
+    upright_time: float = 0.0
+    distance: float = 0.0
+    forward: float = 0.0
+    velocity_error: float = 0.0
+    reward: float = 0.0
+    late: int = 0
+
+    @property
+    def steps_per_second(self) -> float:
+        """Physics steps per second of wall time."""
+        return self.steps / self.wall_time if self.wall_time else 0.0
+
+
+def require(client: URLabClient, policy: Policy, articulation: str | None = None) -> URLabArticulation:
+    """Check that a policy can drive its robot through a client as it is, and return the robot.
+
+    Args:
+        client: A discovered client.
+        policy: The policy.
+        articulation: Key, actor id or class name of the robot, if it is not the one that is declared.
+
+    Raises:
+        PolicyMismatch: It cannot; says what is there, what is required, and how to get it.
+        PolicyFileError: The network has other sizes than the declaration.
+    """
+    spec, source = policy.spec, policy.source
+    if client.model is None or not client.articulations:
+        raise PolicyMismatch(
+            f"{source}: the client knows no articulation to act on.",
+            hint="Start play and call discover() first, with local_model=True.",
+        )
+    name = articulation or spec.robot
+    robot = client.articulations.get(name)
+    if robot is None:
+        raise PolicyMismatch(
+            f"{source}: robot: there is no articulation {name!r}; there are: {', '.join(client.articulations)}.",
+            hint="Name one of them, by its key, actor id or class name.",
+        )
+    if client.step_mode not in spec.step_modes:
+        wanted = " or ".join(map(repr, map(str, spec.step_modes)))
+        raise PolicyMismatch(
+            f"{source}: the session steps in {str(client.step_mode)!r} mode; step_modes requires {wanted}.",
+            hint=f"Make the client with step_mode={str(spec.step_modes[0])!r}; a server that pins its mode must be "
+            "told there.",
+        )
+    timestep = float(client.model.opt.timestep)
+    if abs(timestep - spec.timestep) > _TIMESTEP_TOLERANCE:
+        raise PolicyMismatch(
+            f"{source}: physics has a timestep of {timestep:g} s; timestep requires {spec.timestep:g} s.",
+            hint=f"Call client.runtime.set_sim_options(timestep={spec.timestep:g}).",
+        )
+    mapping = policy.bind(robot)
+    _require_control(robot, mapping, source)
+    return robot
+
+
+def _require_control(robot: URLabArticulation, mapping: PolicyMapping, source: str) -> None:
+    """Check that set-points will mean what the declaration says."""
+    action, key, controller = mapping.spec.action, robot.prefix, robot.controller
+    in_force = controller is not None and robot.control_mode is not ControlMode.RAW
+    if action.via == "controller":
+        if controller is None or controller.kind != ControllerKind.PD:
+            there = "no controller" if controller is None else f"a {controller.kind} controller"
+            raise PolicyMismatch(
+                f"{source}: {key!r} has {there}; action.via = 'controller' requires a PD controller.",
+                hint=f"Serve it with --controller {robot.actor_id or key}=pd, or give it one in the editor.",
+            )
+        if not in_force:
+            raise PolicyMismatch(
+                f"{source}: the controller of {key!r} is bypassed; action.via = 'controller' requires it.",
+                hint="Set articulation.control_mode = 'ue_controller'.",
+            )
+        bound = controller.params.get("kp", {})
+        if missing := [actuator.name for actuator in mapping.actuators if actuator.name not in bound]:
+            raise PolicyMismatch(f"{source}: the controller of {key!r} does not drive {', '.join(missing)}.")
+    elif in_force:
+        raise PolicyMismatch(
+            f"{source}: {key!r} has a controller in force; action.via = {action.via!r} requires that set-points reach "
+            "the actuators unchanged.",
+            hint="Set articulation.control_mode = 'raw', which works in direct mode, or serve it without a controller.",
+        )
+    servo = action.kind == "joint_position" and action.via == "actuators"
+    required = ActuatorType.POSITION if servo else ActuatorType.MOTOR
+    if other := [actuator for actuator in mapping.actuators if actuator.type not in (None, required)]:
+        raise PolicyMismatch(
+            f"{source}: actuator {other[0].name!r} of {key!r} is a {other[0].type}; action.kind = {action.kind!r} via "
+            f"{action.via!r} requires a {required}.",
+            hint="Change action.kind or action.via to what the robot has.",
+        )
+
+
+async def run(
+    client: URLabClient,
+    policy: Policy,
+    *,
+    articulation: str | None = None,
+    seconds: float = 10.0,
+    on_action: OnAction | None = None,
+) -> PolicyRun:
+    """Let a policy drive its robot for some simulated seconds.
+
+    Starts with a reset, and resets after each fall. In direct mode physics advances by `decimation` steps per action;
+    in live mode it advances by itself, is unpaused, and gets an action every period of its own clock. A PD controller
+    gets the declared gains; those it had are put back at the end.
+
+    Args:
+        client: A discovered client.
+        policy: The policy.
+        articulation: Key, actor id or class name of the robot, if it is not the one that is declared.
+        seconds: Simulated seconds.
+        on_action: Called after each action.
+
+    Raises:
+        PolicyMismatch: The policy cannot drive this robot in this session; nothing was moved.
+        URLabError: The server refused something, or physics stands still in live mode.
+    """
+    robot = require(client, policy, articulation)
+    before: dict[str, dict[str, float]] = {}
+    controller = robot.controller if policy.spec.action.via == "controller" else None
+    if controller is not None:
+        wanted = policy.bind(robot).gains()
+        before = {name: {key: controller.params[name][key] for key in wanted[name]} for name in wanted}
+        await controller.configure(timeout=DEFAULT, **wanted)
+    try:
+        return await _Run(client, robot, policy, on_action).until(seconds)
+    finally:
+        if controller is not None and client.connected:
+            with contextlib.suppress(URLabError):  # a courtesy: play may be over
+                await controller.configure(timeout=DEFAULT, **before)
+
+
+class _Run:
+    """One run of a policy, and what it adds up."""
+
+    def __init__(
+        self, client: URLabClient, robot: URLabArticulation, policy: Policy, on_action: OnAction | None
+    ) -> None:
+        self._client = client
+        self._robot = robot
+        self._policy = policy
+        self._mapping = policy.bind(robot)
+        self._on_action = on_action
+        self._live = client.step_mode is StepMode.LIVE
+        self._result = PolicyRun(articulation=robot.prefix, step_mode=client.step_mode)
+        self._rewards = 0.0
+        self._squared_error = 0.0
+        self._velocity: Floats = np.zeros(2)
+        self._start: Floats = np.zeros(3)
+        self._heading: Floats = np.array([1.0, 0.0])
+        self._travelled = (0.0, 0.0)
+
+    async def until(self, seconds: float) -> PolicyRun:
+        """Run for some simulated seconds."""
+        loop = asyncio.get_running_loop()
+        client, result, period = self._client, self._result, self._policy.spec.period
+        await self._restart()
+        if self._live:
+            await client.runtime.set_paused(False)
+        started = loop.time()
+        while result.sim_time < seconds - period / 2:
+            last_action = self._policy.action
+            if self._live:
+                await self._live_action()
+            else:
+                await self._direct_action()
+            self._count(last_action, loop.time() - started)
+            if self._on_action is not None:
+                self._on_action(result)
+            if self._mapping.fallen(RobotState.of(self._robot)):
+                result.falls += 1
+                await self._restart()
+        if not result.falls:
+            result.upright_time = result.sim_time
+        return result
+
+    async def _restart(self) -> None:
+        """Put the simulation at its start; the policy forgets."""
+        self._travelled = (self._result.distance, self._result.forward)
+        self._robot.ctrl_array[self._mapping.ctrl] = self._mapping.targets(np.zeros(self._mapping.action_size))
+        await self._client.reset(self._policy.spec.keyframe)
+        self._policy.reset()
+        self._last_time = self._began = self._client.sim_time
+        self._due = self._began
+        if self._robot.has_free_base:
+            self._start = self._robot.qpos_array[:3].copy()
+            w, x, y, z = self._robot.qpos_array[3:7]
+            self._heading = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + w * z)])
+
+    async def _direct_action(self) -> None:
+        client, policy, spec = self._client, self._policy, self._policy.spec
+        policy.act(self._robot)
+        if spec.action.via != "client":
+            await client.step(spec.decimation)
+        else:
+            for _ in range(spec.decimation - 1):
+                await client.step()
+                policy.hold(self._robot)
+            await client.step()
+        self._result.steps += spec.decimation
+
+    async def _live_action(self) -> None:
+        """Send an action, and wait until the simulation's clock is one period further."""
+        client, period = self._client, self._policy.spec.period
+        loop = asyncio.get_running_loop()
+        self._policy.act(self._robot, client.sim_time - self._began)
+        await client.step()  # stamps the set-points, and reads
+        self._due += period
+        give_up = loop.time() + _STANDSTILL_S
+        while (missing := self._due - client.sim_time) > 0:
+            if loop.time() > give_up:
+                raise URLabError(
+                    f"Physics stands still at {client.sim_time:.2f} s.",
+                    hint="Something paused it: client.runtime.set_paused(False), or `urlab doctor`.",
+                )
+            await asyncio.sleep(missing)
+            await client.step()
+        if missing < -period:
+            self._result.late += 1
+            self._due = client.sim_time
+
+    def _count(self, last_action: Floats, wall_time: float) -> None:
+        result, policy, state = self._result, self._policy, RobotState.of(self._robot)
+        elapsed = self._client.sim_time - self._last_time
+        self._last_time = self._client.sim_time
+        result.actions += 1
+        result.wall_time = wall_time
+        result.sim_time += elapsed
+        if not result.falls:
+            result.upright_time = result.sim_time
+        self._rewards += float(self._mapping.reward(state, policy.command, policy.action, last_action))
+        result.reward = self._rewards / result.actions
+        if self._robot.has_free_base:
+            way = state.qpos[:2] - self._start[:2]
+            result.distance = self._travelled[0] + float(np.hypot(*way))
+            result.forward = self._travelled[1] + float(way @ self._heading)
+            error = state.linear_velocity[:2] - policy.command[:2]
+            # Steps make the base sway; what counts is where it goes.
+            self._velocity += min(1.0, elapsed / _SMOOTHING_S) * (error - self._velocity)
+            self._squared_error += float(self._velocity @ self._velocity)
+            result.velocity_error = (self._squared_error / result.actions) ** 0.5
