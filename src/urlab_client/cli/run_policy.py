@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import sys
 from collections.abc import AsyncGenerator, Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
 import numpy as np
 
 from urlab_client.cli._arguments import Commands, add_keys, port, seconds
@@ -42,6 +44,7 @@ class RunPolicyArguments(argparse.Namespace):
     record: Path | None
     camera: list[str]
     overwrite: bool
+    json: bool
     step_port: int
     state_port: int
     server_key: str | None
@@ -54,9 +57,10 @@ def add_parser(commands: Commands) -> None:
         "run-policy",
         help="let a network from an ONNX file drive a robot",
         description="Run a policy: a network in an ONNX file, and a TOML file beside it that says what it sees and "
-        "what its outputs mean. Refuses to start where robot, step mode, timestep or controller are not what it requires. "
-        "Without an address it starts a simulated server; with one it opens a session, which takes the server over "
-        "from the client that drives it. Exit code 1 when the robot fell. Needs the extra 'urlab-client[onnx]'.",
+        "what its outputs mean. Refuses to start where robot, step mode, timestep or controller are not what it "
+        "requires. Without an address it starts a simulated server; with one it opens a session, which takes the "
+        "server over from the client that drives it. Exit code 1 when the robot fell. Needs the extra "
+        "'urlab-client[onnx]'.",
     )
     parser.add_argument("policy", type=Path, metavar="POLICY", help="the network, a .onnx file")
     parser.add_argument(
@@ -100,6 +104,7 @@ def add_parser(commands: Commands) -> None:
         help="with --record: a camera to keep, as ARTICULATION/CAMERA, or 'all'; repeatable",
     )
     parser.add_argument("--overwrite", action="store_true", help="with --record: replace FILE if it exists")
+    parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--step-port", type=port, default=5559, metavar="PORT", help="RPC port (default: %(default)s)")
     parser.add_argument(
         "--state-port", type=port, default=5555, metavar="PORT", help="state stream (default: %(default)s)"
@@ -129,7 +134,10 @@ def run(arguments: RunPolicyArguments) -> int:
         except ValueError as error:
             raise CommandError(f"--command: {error}") from None
     runs = asyncio.run(_run(arguments, policy))
-    _print(runs)
+    if arguments.json:
+        sys.stdout.write(f"{msgspec.json.encode(runs).decode()}\n")
+    else:
+        _print(runs)
     return _FELL if runs["policy"].falls else 0
 
 

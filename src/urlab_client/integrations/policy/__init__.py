@@ -6,7 +6,7 @@ Running a network needs the extra `onnx`; declarations, mappings and policies of
 from urlab_client.integrations.policy.mapping import PolicyMapping, PolicyMismatch, RobotState
 from urlab_client.integrations.policy.network import Network, OnnxNetwork
 from urlab_client.integrations.policy.policy import Policy, load
-from urlab_client.integrations.policy.runner import PolicyRun, require, run
+from urlab_client.integrations.policy.runner import PolicyRun, require, run, run_blocking
 from urlab_client.integrations.policy.spec import PolicyFileError, PolicySpec, parse_spec, read_spec
 
 __all__ = [
@@ -24,4 +24,5 @@ __all__ = [
     "read_spec",
     "require",
     "run",
+    "run_blocking",
 ]

@@ -11,15 +11,17 @@ import numpy as np
 from msgspec import Struct
 
 from urlab_client.aio.articulation import URLabArticulation
-from urlab_client.aio.client import URLabClient
+from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.aio.deadline import DEFAULT
 from urlab_client.integrations.policy.mapping import PolicyMapping, PolicyMismatch, RobotState
 from urlab_client.integrations.policy.policy import Policy
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.enums import ActuatorType, ControllerKind, ControlMode, StepMode
 from urlab_client.protocol.errors import URLabError
+from urlab_client.sync._portal import aio_of
+from urlab_client.sync.client import URLabClient
 
-__all__ = ["PolicyRun", "require", "run"]
+__all__ = ["PolicyRun", "require", "run", "run_blocking"]
 
 _STANDSTILL_S: Final = 5.0
 _SMOOTHING_S: Final = 0.5
@@ -69,7 +71,7 @@ class PolicyRun(Struct):
         return self.steps / self.wall_time if self.wall_time else 0.0
 
 
-def require(client: URLabClient, policy: Policy, articulation: str | None = None) -> URLabArticulation:
+def require(client: AsyncClient, policy: Policy, articulation: str | None = None) -> URLabArticulation:
     """Check that a policy can drive its robot through a client as it is, and return the robot.
 
     Args:
@@ -148,7 +150,7 @@ def _require_control(robot: URLabArticulation, mapping: PolicyMapping, source: s
 
 
 async def run(
-    client: URLabClient,
+    client: AsyncClient,
     policy: Policy,
     *,
     articulation: str | None = None,
@@ -187,11 +189,24 @@ async def run(
                 await controller.configure(timeout=DEFAULT, **before)
 
 
+def run_blocking(
+    client: URLabClient,
+    policy: Policy,
+    *,
+    articulation: str | None = None,
+    seconds: float = 10.0,
+    on_action: OnAction | None = None,
+) -> PolicyRun:
+    """Do what `run` does with a blocking client."""
+    coro = run(aio_of(client), policy, articulation=articulation, seconds=seconds, on_action=on_action)
+    return client._portal.call(coro)  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
+
+
 class _Run:
     """One run of a policy, and what it adds up."""
 
     def __init__(
-        self, client: URLabClient, robot: URLabArticulation, policy: Policy, on_action: OnAction | None
+        self, client: AsyncClient, robot: URLabArticulation, policy: Policy, on_action: OnAction | None
     ) -> None:
         self._client = client
         self._robot = robot

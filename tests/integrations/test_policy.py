@@ -1,0 +1,358 @@
+"""Policies: what declarations are refused, what a network sees and does, and what a policy refuses to drive."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from urlab_client import URLabClient, URLabError, aio
+from urlab_client.integrations import policy as policies
+from urlab_client.integrations.policy import (
+    Policy,
+    PolicyFileError,
+    PolicyMismatch,
+    RobotState,
+    parse_spec,
+    require,
+    run,
+    run_blocking,
+)
+
+QUADRUPED = "sim://quadruped?controller=quadruped=pd"
+
+WALK = """
+robot = "quadruped"
+step_modes = ["direct", "live"]
+timestep = 0.002
+decimation = 10
+
+[[observation]]
+term = "clock"
+hz = 2.0
+
+[[observation]]
+term = "joint_position"
+joints = ["RR_calf", "FL_hip"]
+
+[action]
+via = "controller"
+joints = ["FL_thigh", "FR_thigh"]
+scale = [0.5, 0.25]
+offset = 0.1
+
+[gains]
+kp = 60
+kv = [1.5, 2.5]
+torque_limit = 30.0
+"""
+
+REACH = """
+robot = "arm"
+step_modes = ["direct"]
+timestep = 0.002
+decimation = 20
+
+[[observation]]
+term = "sensor"
+sensor = "grip_position"
+
+[action]
+via = "actuators"
+joints = ["elbow"]
+"""
+
+
+def walk(*changes: tuple[str, str]) -> str:
+    """Return the declaration with some text replaced."""
+    text = WALK
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    return text
+
+
+def policy_of(text: str, outputs: Callable[[Any], Any] | None = None) -> Policy:
+    """Return a policy whose outputs are zeros, or what a function says."""
+    spec = parse_spec(text, "it.toml")
+    return Policy(spec, outputs or (lambda _: np.zeros(len(spec.action.joints))), source="it.toml")
+
+
+@pytest.fixture(scope="module")
+def quadruped() -> Iterator[URLabClient]:
+    with URLabClient(QUADRUPED, step_mode="direct") as client:
+        client.discover()
+        yield client
+
+
+@pytest.fixture(scope="module")
+def arm() -> Iterator[URLabClient]:
+    with URLabClient("sim://arm", step_mode="direct") as client:
+        client.discover()
+        yield client
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("hz = 2.0", "hz = 2.0\nherz = 1", r"observation\[0\]: .*`herz`. Its keys are term, scale, offset, clip, hz"),
+        ("hz = 2.0", 'hz = "2"', r"observation\[0\].hz: Expected `float`, got `str`"),
+        ("hz = 2.0", "", r"observation\[0\]: .*missing required field `hz`"),
+        ('"clock"', '"clok"', r"observation\[0\].term: .*'clok'. Terms are .*gravity, .*clock"),
+        ("[gains]", "[gain]", "unknown field `gain`. Its keys are robot, .*gains"),
+        ("kp = 60\n", "", r"gains: .*missing required field `kp`. Its keys are kp, kv, torque_limit"),
+        ("kp = 60", "kp = -1", "gains: kp is 0 or more"),
+        ("[1.5, 2.5]", "[1.0, 2.0, 3.0]", "gains.kv has 3 numbers; it takes one, or one for each of the action's 2"),
+        ("[0.5, 0.25]", "[0.5]", "action: scale has 1 numbers"),
+        ("[0.5, 0.25]", "nan", "action: scale holds NaN"),
+        ("decimation = 10", "decimation = 10.5", "decimation: Expected `int`, got `float`"),
+        ("decimation = 10", "decimation = 0", "decimation: Expected `int` >= 1"),
+        ('"direct", "live"', '"puppet"', "step_modes are 'direct' and 'live', not 'puppet'"),
+        ('"direct", "live"', '"fast"', r"step_modes\[0\]: Invalid enum value 'fast'"),
+        ('via = "controller"', 'via = "client"', "step_modes cannot have 'live' with action.via = 'client'"),
+        ('via = "controller"', 'via = "actuators"', "'actuators' has no use for the table .gains."),
+        ('via = "controller"', 'via = "controller"\nkind = "torque"', "torques go via 'actuators'"),
+        ('"FL_thigh", "FR_thigh"', '"FL_thigh", "FL_thigh"', "joints names a joint twice"),
+        ("offset = 0.1", "clip = [1.0, -1.0]", r"clip is \[low, high\]"),
+        ("[gains]", '[[observation]]\nterm = "command"\n[gains]', r"need the table \[command\]"),
+        (
+            "[gains]",
+            "[command]\ndefault=[1,0,0]\nlow=[0,0,0]\nhigh=[0.5,0,0]\n[gains]",
+            "default .* between low and hi",
+        ),
+        ("[gains]", "[gains", "not TOML: .*line"),
+    ],
+)
+def test_a_declaration_that_cannot_work_is_refused_by_file_and_key(old: str, new: str, said: str) -> None:
+    with pytest.raises(PolicyFileError, match=said) as caught:
+        parse_spec(walk((old, new)), "walk.toml")
+    assert str(caught.value).startswith("walk.toml: ")
+
+
+def test_files_that_are_not_there_are_named(tmp_path: Path) -> None:
+    with pytest.raises(PolicyFileError, match=r"away.toml: cannot be read: No such file"):
+        policies.load(tmp_path / "away.onnx")
+    (tmp_path / "away.toml").write_text(WALK)
+    with pytest.raises(PolicyFileError, match=r"away.onnx: no such file"):
+        policies.load(tmp_path / "away.onnx")
+    (tmp_path / "away.onnx").write_bytes(b"no network")
+    with pytest.raises(PolicyFileError, match=r"away.onnx: not a network that ONNX Runtime can run"):
+        policies.load(tmp_path / "away.onnx")
+
+
+def test_the_extra_is_named_when_it_is_missing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "it.toml").write_text(WALK)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ImportError, match=re.escape("pip install 'urlab-client[onnx]'")):
+        policies.load(tmp_path / "it.onnx")
+
+
+def test_a_base_is_seen_as_mujoco_measures_it(quadruped: URLabClient) -> None:
+    text = WALK.replace("hz = 2.0", "hz = 2.0\n" + "".join(f'[[observation]]\nterm = "{term}"\n' for term in (
+        "base_height", "gravity", "linear_velocity", "angular_velocity", "joint_velocity")))  # fmt: skip
+    robot = quadruped.articulations["quadruped"]
+    mapping = policy_of(text).bind(robot)
+    model, data = quadruped.model, mujoco.MjData(quadruped.model)
+    rng = np.random.default_rng(3)
+    data.qpos[:] = rng.normal(size=model.nq)
+    data.qpos[3:7] /= np.linalg.norm(data.qpos[3:7])
+    data.qvel[:] = rng.normal(size=model.nv)
+    mujoco.mj_forward(model, data)
+    state = RobotState(np.stack([data.qpos, data.qpos]), np.stack([data.qvel, data.qvel]))
+
+    seen = mapping.observe(state, np.zeros((2, 3)), np.zeros((2, 2)), time=0.125)
+
+    trunk = model.body("quadruped_trunk").id
+    velocity = np.zeros(6)
+    mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, trunk, velocity, 1)
+    down = data.xmat[trunk].reshape(3, 3).T @ [0, 0, -1]
+    thighs = [data.joint(f"quadruped_{leg}_thigh").qvel[0] for leg in ("FL", "FR")]
+    joints = [data.joint(f"quadruped_{name}").qpos[0] for name in ("RR_calf", "FL_hip")]
+    expected = [1.0, 0.0, data.qpos[2], *down, *velocity[3:], *velocity[:3], *thighs, *joints]
+    assert seen.shape == (2, mapping.observation_size)
+    for row in seen:
+        np.testing.assert_allclose(row, expected, atol=1e-12)
+
+
+def test_scales_clips_history_command_and_last_action_make_the_input(quadruped: URLabClient) -> None:
+    text = WALK[: WALK.index("[[observation]]")] + (
+        'history = 2\n[[observation]]\nterm = "command"\nscale = [2.0, 1.0, 1.0]\noffset = 0.1\nclip = [-0.5, 0.5]\n'
+        '[[observation]]\nterm = "last_action"\n' + WALK[WALK.index("[action]") :]
+    )
+    text += "[command]\ndefault = [0.2, 0.0, 0.0]\nlow = [0.0, 0.0, -1.0]\nhigh = [1.0, 0.0, 1.0]\n"
+    inputs: list[list[float]] = []
+
+    def outputs(observation: Any) -> Any:
+        inputs.append(np.round(observation, 9).tolist())
+        return np.array([5.0, -0.5])
+
+    policy, robot = policy_of(text, outputs), quadruped.articulations["quadruped"]
+    quadruped.reset()
+    policy.act(robot)
+    policy.command = [0.25, 0.0, -1.0]
+    policy.act(robot)
+    first, second = [0.2, -0.1, -0.1, 0.0, 0.0], [0.3, -0.1, -0.5, 1.0, -0.5]
+    assert inputs == [first + first, first + second]
+    assert policy.action.tolist() == [1.0, -0.5]  # clipped
+    thighs = {name: robot.actuators[name].value for name in ("FL_thigh", "FR_thigh")}
+    assert thighs == {"FL_thigh": 0.1 + 0.5 * 1.0, "FR_thigh": 0.1 - 0.25 * 0.5}
+    policy.reset()
+    assert policy.action.tolist() == [0.0, 0.0]
+    for wrong in ([2.0, 0.0, 0.0], [0.1], [np.nan, 0.0, 0.0]):
+        with pytest.raises(ValueError, match=r"from \[0.0, 0.0, -1.0\] to \[1.0, 0.0, 1.0\]"):
+            policy.command = wrong
+    with pytest.raises(ValueError, match="takes no command"):
+        policy_of(WALK).command = [0.0, 0.0, 0.0]
+
+
+def test_gains_last_as_long_as_the_run(quadruped: URLabClient) -> None:
+    controller = quadruped.articulations["quadruped"].controller
+    before = {name: dict(values) for name, values in controller.params.items() if isinstance(values, dict)}
+    during: list[tuple[float, float]] = []
+
+    found = run_blocking(
+        quadruped,
+        policy_of(WALK),
+        seconds=0.1,
+        on_action=lambda _: during.append((controller.kp["FL_thigh"], controller.kv["FR_thigh"])),
+    )
+    assert during == [(60.0, 2.5)] * 5
+    assert (found.actions, found.steps, found.step_mode) == (5, 50, "direct")
+    assert found.sim_time == pytest.approx(0.1)
+    assert {name: dict(controller.params[name]) for name in before} == before
+
+
+def test_a_clients_own_pd_law_moves_a_robot_as_the_servers_does(quadruped: URLabClient) -> None:
+    wave = [np.array([np.sin(n), np.cos(2 * n)]) for n in range(20)]
+    ends = []
+    with URLabClient("sim://quadruped", step_mode="direct") as bare:
+        bare.discover()
+        for client, text in (
+            (quadruped, WALK),
+            (bare, walk(('via = "controller"', 'via = "client"'), ('"direct", "live"', '"direct"'))),
+        ):
+            waves = iter(wave)
+            policy = policy_of(text, lambda _, waves=waves: next(waves))
+            # Only the thighs' gains are declared; without any on the other joints the robots fold alike.
+            if client is quadruped:
+                client.articulations["quadruped"].controller.set_defaults(kp=0, kv=0)
+            run_blocking(client, policy, seconds=0.1)
+            ends.append(client.articulations["quadruped"].qpos_array.copy())
+    quadruped.articulations["quadruped"].controller.set_defaults(kp=100, kv=5)
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-5)  # the server computes in single precision
+    assert abs(ends[0][8]) > 0.05
+
+
+def test_position_servos_take_targets_as_they_are(arm: URLabClient) -> None:
+    heights: list[float] = []
+
+    def lower(observation: Any) -> Any:
+        heights.append(float(observation[2]))
+        return np.array([0.5])
+
+    found = run_blocking(arm, policy_of(REACH, lower), seconds=1.0)
+    assert found.actions == 25
+    assert arm.articulations["arm"].get_qpos()["elbow"] == pytest.approx(0.5, abs=0.02)
+    assert heights[-1] < heights[0] - 0.1
+    assert (found.distance, found.falls, found.reward) == (0.0, 0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (WALK.replace('"quadruped"', '"dog"'), r"no articulation 'dog'; there are: quadruped"),
+        (walk(('"direct", "live"', '"live"')), r"in 'direct' mode; step_modes requires 'live'.*step_mode='live'"),
+        (walk(("0.002", "0.005")), r"timestep of 0.002 s; timestep requires 0.005 s.*set_sim_options\(timestep=0.005"),
+        (walk(('"FR_thigh"', '"XX_thigh"')), r"action.joints\[1\]: .*no joint 'XX_thigh'; it has .*FR_thigh"),
+        (walk(('"FR_thigh"', '"root"')), r"action.joints\[1\]: 'root' is neither a hinge nor a slide"),
+        (walk(('"RR_calf"', '"calf"')), r"observation\[1\].joints\[0\]: .*no joint 'calf'"),
+        (walk(("hz = 2.0", "hz = 2.0\nscale = [1.0, 2.0, 3.0]")), r"observation\[0\].scale: has 3 .*one, or 2"),
+        (
+            walk(("[action]", '[[observation]]\nterm = "sensor"\nsensor = "nose"\n[action]')),
+            r"observation\[2\].sensor: .*no sensor 'nose'; it has imu_accelerometer",
+        ),
+        (
+            walk(('via = "controller"', 'via = "client"'), ('"direct", "live"', '"direct"')),
+            r"has a controller in force; action.via = 'client' requires .*control_mode = 'raw'",
+        ),
+    ],
+)
+def test_a_policy_refuses_what_it_was_not_made_for(text: str, said: str, quadruped: URLabClient) -> None:
+    with pytest.raises(PolicyMismatch, match=said):
+        run_blocking(quadruped, policy_of(text))
+
+
+def test_a_policy_refuses_a_robot_without_its_controller_or_actuators(arm: URLabClient, quadruped: URLabClient) -> None:
+    with pytest.raises(PolicyMismatch, match=r"no controller; .* requires a PD controller.*--controller arm=pd"):
+        run_blocking(arm, policy_of(REACH.replace("actuators", "controller") + "[gains]\nkp=1\nkv=1\ntorque_limit=1"))
+    with pytest.raises(
+        PolicyMismatch, match=r"'elbow' of 'arm' is a position; .*'torque' via 'actuators' requires a m"
+    ):
+        run_blocking(arm, policy_of(REACH.replace('via = "actuators"', 'via = "actuators"\nkind = "torque"')))
+    with pytest.raises(PolicyMismatch, match=r"fall: needs a free base; 'arm' has none"):
+        run_blocking(arm, policy_of(REACH + "[fall]\nheight = 0.1"))
+    with pytest.raises(PolicyMismatch, match=r"observation\[0\]: needs a free base"):
+        run_blocking(arm, policy_of(REACH.replace('term = "sensor"\nsensor = "grip_position"', 'term = "gravity"')))
+    with pytest.raises(PolicyMismatch, match="0 actuators of 'arm' drive 'left_finger'"):
+        run_blocking(arm, policy_of(REACH.replace('"elbow"', '"left_finger"')))
+    robot = quadruped.articulations["quadruped"]
+    robot.control_mode = "raw"
+    try:
+        with pytest.raises(PolicyMismatch, match=r"bypassed.*control_mode = 'ue_controller'"):
+            run_blocking(quadruped, policy_of(WALK))
+    finally:
+        robot.control_mode = "ue_controller"
+
+
+@pytest.mark.parametrize(
+    ("outputs", "said"),
+    [(np.zeros(3), "returned 3 numbers, but it.toml declares 2"), (np.array([np.nan, 0.0]), "returned NaN")],
+)
+def test_outputs_that_cannot_be_used_stop_the_run(outputs: Any, said: str, quadruped: URLabClient) -> None:
+    before = quadruped.articulations["quadruped"].controller.kp["FL_thigh"]
+    with pytest.raises(PolicyFileError, match=said):
+        run_blocking(quadruped, policy_of(WALK, lambda _: outputs))
+    assert quadruped.articulations["quadruped"].controller.kp["FL_thigh"] == before
+
+
+def test_a_fall_is_counted_and_the_robot_starts_again(quadruped: URLabClient) -> None:
+    text = (
+        walk(("scale = [0.5, 0.25]", "scale = 1.0"), ("offset = 0.1", "")) + "[fall]\nupright = 0.99\nheight = 0.25\n"
+    )
+    attempts: list[int] = []
+    policy = policy_of(text, lambda _: np.array([1.0, 1.0]))
+    found = run_blocking(quadruped, policy, seconds=2.0, on_action=lambda so_far: attempts.append(so_far.falls))
+    assert found.falls >= 2
+    assert found.upright_time == pytest.approx(0.02 * (attempts.count(0)))
+    assert found.sim_time == pytest.approx(2.0)
+
+
+async def test_in_live_mode_actions_keep_the_pace_of_the_simulation(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("urlab_client.integrations.policy.runner._STANDSTILL_S", 0.3)
+    times: list[float] = []
+    async with aio.URLabClient(QUADRUPED, step_mode="live") as client:
+        await client.discover()
+        assert require(client, policy_of(WALK)) is client.articulations["quadruped"]
+        policy = policy_of(WALK, lambda _: np.array([0.8, 0.8]))
+        found = await run(client, policy, seconds=0.5, on_action=lambda so_far: times.append(so_far.sim_time))
+        assert found.step_mode == "live"
+        assert found.sim_time >= 0.49
+        assert np.diff(times).min() > 0
+        assert client.articulations["quadruped"].get_qpos()["FL_thigh"] == pytest.approx(0.5, abs=0.15)
+
+        tasks: list[asyncio.Task[Any]] = []
+        loop = asyncio.get_running_loop()
+
+        def pause(_: Any) -> None:
+            if not tasks:
+                tasks.append(loop.create_task(client.runtime.set_paused(True)))
+
+        with pytest.raises(URLabError, match="Physics stands still"):
+            await run(client, policy, seconds=60.0, on_action=pause)
+        await tasks[0]
