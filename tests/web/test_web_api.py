@@ -8,6 +8,7 @@ import json
 from collections.abc import AsyncGenerator, Callable, Iterator
 from typing import Any
 
+import numpy as np
 import pytest
 from PIL import Image
 from starlette.applications import Starlette
@@ -204,6 +205,62 @@ def test_live_pictures_come_as_files_too(http: TestClient) -> None:
     picture = http.get("/api/cameras/arm/overview.jpg")
     assert Image.open(io.BytesIO(picture.content)).size == (64, 48)
     assert http.get("/api/cameras/arm/nothing.jpg").status_code == 404
+
+
+def test_the_viewer_gets_the_model_and_the_state_that_is_shown(http: TestClient) -> None:
+    import mujoco
+    from mujoco.studio.web import state_payload
+
+    http.post("/api/run", json={"running": True})
+    http.post("/api/ctrl", json={"arm": {"elbow": 0.7}})
+    assert http.get("/viewer/").status_code == 200
+    size = http.get("/viewer/model?total_bytes").json()["total_bytes"]
+    half = size // 2
+    parts = [http.get(f"/viewer/model?offset_bytes={at}&size_bytes={half + 1}").content for at in (0, half + 1)]
+    binary, *_ = state_payload.parse_model_bundle(b"".join(parts))
+    assert len(b"".join(parts)) == size
+    with (
+        http.websocket_connect("ws://localhost/viewer/state") as viewer,
+        http.websocket_connect("ws://localhost/api/live") as live,
+    ):
+        assert "role=spectator" in viewer.receive_text()
+        viewer.receive_bytes()
+        viewer.receive_bytes()  # two on their way, and no more before it says that one came
+        moved = heard(live, "state", lambda state: abs(state["articulations"]["arm"]["qpos"][2] - 0.7) < 0.02)
+        viewer.send_text("force_control")  # MuJoCo's own; heard and not heeded
+        viewer.send_text("state_ack")
+        payload = viewer.receive_bytes()
+        qpos = moved["articulations"]["arm"]["qpos"]
+        near = [
+            np.allclose(np.frombuffer(payload, np.float64, len(qpos), at), qpos, atol=0.03)
+            for at in range(len(payload) - 8 * len(qpos))
+        ]
+        assert any(near)
+    assert mujoco.MjModel.from_binary_path("m.mjb", {"m.mjb": binary}).nq == len(qpos)
+    with pytest.raises(WebSocketDisconnect) as taken, http.websocket_connect("ws://localhost/viewer/ui") as panels:
+        panels.receive_text()
+    assert taken.value.code == 4001
+
+
+def test_the_viewer_is_behind_the_same_door(site: Starlette, http: TestClient) -> None:
+    evil = {"origin": "http://evil.example"}
+    with pytest.raises(WebSocketDisconnect), http.websocket_connect("ws://localhost/viewer/state", headers=evil):
+        pass
+    assert http.get("/viewer/model", headers={"host": "evil.example"}).status_code == 403
+    del http.headers["authorization"]
+    for path in ("/viewer/", "/viewer/model", "/viewer/web_client.wasm", "/viewer/assets/ibl.ktx"):
+        assert http.get(path).status_code == 401
+    with pytest.raises(WebSocketDisconnect), http.websocket_connect("ws://localhost/viewer/state"):
+        pass
+
+
+def test_the_viewer_s_files_are_sent_once(http: TestClient) -> None:
+    page = http.get("/viewer/")
+    assert "unsafe-eval" in page.headers["content-security-policy"]
+    assert "unsafe" not in http.get("/").headers["content-security-policy"]
+    script = http.get("/viewer/web_client.js")
+    again = http.get("/viewer/web_client.js", headers={"if-none-match": script.headers["etag"]})
+    assert (script.status_code, again.status_code) == (200, 304)
 
 
 def test_another_program_takes_over_and_the_console_takes_it_back(http: TestClient, server: SimulatedServer) -> None:

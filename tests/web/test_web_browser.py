@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import subprocess
 import sys
@@ -10,16 +11,20 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image
 from selenium import webdriver
 from selenium.webdriver.chrome.options import Options
 from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.support.ui import WebDriverWait
 
 FLAGS = (
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--window-size=1300,900",
+    "--headless", "--no-sandbox", "--disable-quic", "--no-first-run", "--window-size=1300,900",
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
 )  # fmt: skip
+FLAT = ("--disable-gpu", "--disable-3d-apis")
+SOLID = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")  # WebGL without a graphics card
 PATIENCE_S = 40
 RUNNING = "document.querySelector('#play').textContent.includes('Pause')"
 SLIDER = "[data-robot=arm] [data-actuator=elbow]"
@@ -63,16 +68,25 @@ class Page:
             SLIDER, value,
         )  # fmt: skip
 
+    def invitation(self) -> str:
+        """Return a link for one more browser."""
+        return str(
+            self.driver.execute_async_script(
+                "const done = arguments[0]; fetch('api/invitations', {method: 'POST'})"
+                ".then(a => a.json()).then(a => done(new URL(a.path, location.href).href))"
+            )
+        )
+
     def elbow_is(self, value: float) -> str:
         shown = "document.querySelector('[data-robot=arm] [data-value=elbow]').textContent"
         return f"Math.abs(parseFloat({shown}.replace('\u2212', '-')) - {value}) < 0.03"
 
 
 @contextlib.contextmanager
-def opened(folder: Path, link: str) -> Iterator[Page]:
+def opened(folder: Path, link: str, flags: tuple[str, ...] = FLAT) -> Iterator[Page]:
     options = Options()
     options.binary_location = "/usr/bin/chromium"
-    for flag in (*FLAGS, f"--user-data-dir={folder}"):
+    for flag in (*FLAGS, *flags, f"--user-data-dir={folder}"):
         options.add_argument(flag)
     driver = webdriver.Chrome(options, Service("/usr/bin/chromedriver"))
     try:
@@ -148,11 +162,7 @@ def test_steps_and_reset_in_direct_mode(page: Page) -> None:
 def test_a_second_viewer_drives_only_when_the_first_lets_go(page: Page, tmp_path: Path) -> None:
     page.slide(0.2)
     page.until("document.querySelector('#driver').dataset.who === 'me'")
-    link = page.driver.execute_async_script(
-        "const done = arguments[0]; fetch('api/invitations', {method: 'POST'})"
-        ".then(a => a.json()).then(a => done(new URL(a.path, location.href).href))"
-    )
-    with opened(tmp_path, link) as second:
+    with opened(tmp_path, page.invitation()) as second:
         second.until("document.querySelector('#driver')?.dataset.who === 'other'")
         assert second.look("document.querySelector('#drive').disabled")
         second.slide(0.8)
@@ -163,6 +173,30 @@ def test_a_second_viewer_drives_only_when_the_first_lets_go(page: Page, tmp_path
         second.slide(0.8)
         page.until(page.elbow_is(0.8))
         page.until("document.querySelector('#driver').dataset.who === 'other'")
+
+
+def test_the_3d_view_shows_the_robot_and_follows_it(page: Page, tmp_path: Path) -> None:
+    page.until("document.querySelector('#view').innerText.includes('no WebGL')")
+    page.slide(0.0)
+    page.until(page.elbow_is(0.0))
+    with opened(tmp_path, page.invitation(), (*SOLID, "--window-size=1000,500")) as one:
+        one.driver.execute_script("window.scrollTo(0, 0)")
+        stage = one.driver.find_element("css selector", ".stage")
+
+        def picture() -> np.ndarray[Any, Any]:
+            return np.asarray(Image.open(io.BytesIO(stage.screenshot_as_png)).convert("RGB"), dtype=np.float64)
+
+        def differ(one: np.ndarray[Any, Any], other: np.ndarray[Any, Any]) -> float:
+            return float((np.abs(one - other).max(axis=2) > 30).mean())
+
+        def blue() -> bool:  # as parts of the arm are, and nothing else
+            return bool(((picture() @ [-1.0, -0.5, 1.0]) > 60).mean() > 0.003)
+
+        wait = WebDriverWait(one.driver, PATIENCE_S, 0.3)
+        wait.until(lambda _: blue(), "the arm never appeared")
+        before = picture()
+        page.slide(1.2)
+        wait.until(lambda _: differ(before, picture()) > 0.005, "the arm never moved")
 
 
 def test_a_killed_server_shows_as_such_and_comes_back(

@@ -25,6 +25,8 @@ _HEADERS = {
     "base-uri 'none'; form-action 'self'",
     "x-content-type-options": "nosniff",
     "referrer-policy": "no-referrer",
+    "cross-origin-opener-policy": "same-origin",  # the 3-D view's threads need an isolated page
+    "cross-origin-embedder-policy": "require-corp",
     "cache-control": "no-store",
 }
 _PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">

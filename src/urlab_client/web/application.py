@@ -27,6 +27,7 @@ from urlab_client.protocol.errors import (
     URLabRPCError,
     URLabTimeoutError,
 )
+from urlab_client.web import studio
 from urlab_client.web.access import Access, Guarded
 from urlab_client.web.desk import Audience, Desk
 from urlab_client.web.lease import Lease, NotDriving, Viewer
@@ -122,6 +123,24 @@ class _Site:
             WebSocketRoute("/api/live", self._live),
             WebSocketRoute("/api/cameras/{path:path}/live", self._pictures),
             Mount("/static", StaticFiles(directory=_STATIC)),
+            *self._studio_routes(),
+        ]
+
+    def _studio_routes(self) -> list[Route | WebSocketRoute | Mount]:
+        shipped = studio.files()
+        if shipped is None:
+            return []
+
+        async def page(request: Request) -> Response:
+            return Response(shipped.page, media_type="text/html", headers={"content-security-policy": shipped.policy})
+
+        return [
+            Route("/viewer/", page),
+            Route("/viewer/model", self._model),
+            WebSocketRoute("/viewer/state", self._poses),
+            WebSocketRoute("/viewer/ui", self._taken),
+            Mount("/viewer/assets", _Checked(directory=shipped.assets)),
+            Mount("/viewer", _Checked(directory=shipped.dist)),
         ]
 
     async def _page(self, request: Request) -> Response:
@@ -295,6 +314,54 @@ class _Site:
                     flow.changed.set()
             tasks.cancel_scope.cancel()
 
+    # The 3-D view
+
+    async def _model(self, request: Request) -> Response:
+        """Answer with the model, its size, or a part of it, as the viewer's page asks."""
+        shown = await self.desk.studio.shown()
+        query = request.query_params
+        if shown is None or query.get("crc32", str(shown.crc)) != str(shown.crc):
+            return _error(404, "no_model", self.desk.studio.missing or "The model is another one now.")
+        if "total_bytes" in query:
+            return _json(encode({"total_bytes": len(shown.bundle)}))
+        start = int(query.get("offset_bytes", 0))
+        length = int(query.get("size_bytes", len(shown.bundle)))
+        if start < 0 or length < 0:
+            return _error(400, "bad_request", "There is no part before the first byte.")
+        return Response(shown.bundle[start : start + length], media_type="application/octet-stream")
+
+    async def _poses(self, socket: WebSocket) -> None:
+        await socket.accept()
+        await socket.send_text(studio.SPECTATOR)
+        flow = _Flow()
+        with self.desk.bell() as changed:
+
+            async def send() -> None:
+                sent = None
+                with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+                    while True:
+                        changed.clear()
+                        snapshot = self.desk.snapshot
+                        shown = await self.desk.studio.shown()
+                        if shown and snapshot and snapshot is not sent and flow.sent - flow.acknowledged < _AHEAD:
+                            sent = snapshot
+                            flow.sent += 1
+                            await socket.send_bytes(self.desk.studio.write(shown, snapshot))
+                        await changed.wait()
+
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(send)
+                while (said := await socket.receive())["type"] == "websocket.receive":
+                    # Besides this it asks for control of MuJoCo's own panels, which there are none of here.
+                    if said.get("text") == studio.SHOWN:
+                        flow.acknowledged += 1
+                        changed.set()
+                tasks.cancel_scope.cancel()
+
+    async def _taken(self, socket: WebSocket) -> None:
+        await socket.accept()
+        await socket.close(studio.TAKEN, "this page watches")
+
     # Viewers
 
     def _viewer(self, request: HTTPConnection) -> Viewer:
@@ -305,6 +372,15 @@ class _Site:
     def _new_name(self) -> str:
         taken = {viewer.name for viewer in self._viewers.values()}
         return next(name for n in range(1, len(taken) + 2) if (name := f"Viewer {n}") not in taken)
+
+
+class _Checked(StaticFiles):
+    """Files that a browser keeps, and asks each time whether they are still the same: they are large."""
+
+    def file_response(self, *args: Any, **kwargs: Any) -> Response:
+        response = super().file_response(*args, **kwargs)
+        response.headers["cache-control"] = "no-cache"
+        return response
 
 
 class _Flow:

@@ -10,7 +10,7 @@ import contextlib
 import logging
 import time
 from collections import deque
-from collections.abc import AsyncGenerator, Mapping
+from collections.abc import AsyncGenerator, Generator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import anyio
@@ -39,6 +39,7 @@ from urlab_client.protocol.messages.streams import (
 from urlab_client.web.lease import Lease, Viewer
 from urlab_client.web.ops import encode, perform
 from urlab_client.web.pictures import Feed
+from urlab_client.web.studio import Studio
 from urlab_client.web.world import World, describe
 
 if TYPE_CHECKING:
@@ -108,11 +109,13 @@ class Desk:
         self.state_seq = 0
         self.entries: deque[Entry] = deque(maxlen=_KEPT)
         self.audience: set[Audience] = set()
+        self.snapshot: StateSnapshot | None = None
+        self.studio = Studio(client)
+        self._bells: set[asyncio.Event] = set()
         self._n = 0
         self._want: str | None = "discover"
         self._wake = asyncio.Event()
         self._ready = asyncio.Event()
-        self._snapshot: StateSnapshot | None = None
         self._moved_at = 0.0
         self._rate = 0.0
         self._rate_from: tuple[float, float] | None = None
@@ -223,7 +226,7 @@ class Desk:
             self.tell()
 
     def _redescribe(self) -> None:
-        self.world = describe(self.client, self.world.version + 1)
+        self.world = describe(self.client, self.world.version + 1, self.studio.missing)
         self.world_json = encode({"type": "world", "world": self.world})
         self._seeded.clear()
         self._twists.clear()
@@ -250,14 +253,14 @@ class Desk:
 
     def _publish(self, snapshot: StateSnapshot) -> None:
         now = time.monotonic()
-        if self._snapshot is None or snapshot.time != self._snapshot.time:
+        if self.snapshot is None or snapshot.time != self.snapshot.time:
             self._moved_at = now
             if self._rate_from is None or not snapshot.time >= self._rate_from[1]:
                 self._rate_from, self._rate = (now, snapshot.time), 0.0
             elif now - self._rate_from[0] > 1:
                 self._rate = (snapshot.time - self._rate_from[1]) / (now - self._rate_from[0])
                 self._rate_from = (now, snapshot.time)
-        self._snapshot = snapshot
+        self.snapshot = snapshot
         self.state_seq += 1
         wall = snapshot.wall_time.sec + snapshot.wall_time.nsec / 1e9
         received = snapshot.recv_wall_time_ns / 1e9
@@ -323,6 +326,19 @@ class Desk:
         """Let everybody look again."""
         for one in self.audience:
             one.changed.set()
+        for bell in self._bells:
+            bell.set()
+
+    @contextlib.contextmanager
+    def bell(self) -> Generator[asyncio.Event]:
+        """Yield an event that is set whenever there is something new."""
+        bell = asyncio.Event()
+        bell.set()
+        self._bells.add(bell)
+        try:
+            yield bell
+        finally:
+            self._bells.discard(bell)
 
     async def _pulse(self) -> None:
         while True:
@@ -407,9 +423,9 @@ class Desk:
         if key in self._seeded:
             return
         self._seeded.add(key)
-        if self._snapshot is None or key not in self._snapshot.per_articulation or art.ctrl_array.any():
+        if self.snapshot is None or key not in self.snapshot.per_articulation or art.ctrl_array.any():
             return
-        state = self._snapshot.per_articulation[key]
+        state = self.snapshot.per_articulation[key]
         for actuator in art.actuators.values():
             at = actuator.ctrl_local
             if art.controller is not None and actuator.joint is not None:

@@ -72,19 +72,20 @@ class ArticulationView(Struct):
 
 
 class World(Struct):
-    """Everything there is. `version` grows with each change."""
+    """Everything there is. `version` grows with each change; `no_view` says why there is no 3-D view, if so."""
 
     version: int = 0
     urlab_version: str = ""
     mujoco_version: str = ""
     playing: bool = False
+    no_view: str = ""
     timestep: float | None = None
     articulations: list[ArticulationView] = field(default_factory=list[ArticulationView])
     cameras: list[CameraInfo] = field(default_factory=list[CameraInfo])
     entities: list[str] = field(default_factory=list[str])
 
 
-def describe(client: URLabClient, version: int) -> World:
+def describe(client: URLabClient, version: int, no_view: str) -> World:
     """Describe what the client knows."""
     model = client.model
     return World(
@@ -92,6 +93,7 @@ def describe(client: URLabClient, version: int) -> World:
         urlab_version=client.urlab_version,
         mujoco_version=client.mujoco_version,
         playing=client.manager_present,
+        no_view=no_view,
         timestep=None if model is None else float(model.opt.timestep),
         articulations=[_articulation(client, art) for art in client.articulations.values()]
         if client.manager_present

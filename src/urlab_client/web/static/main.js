@@ -9,6 +9,7 @@ import { makeRecording } from "./recording.js";
 import { makeRobots } from "./robots.js";
 import { makeContacts, makeScene } from "./scene.js";
 import { makeSensors } from "./sensors.js";
+import { makeView } from "./view.js";
 
 const KEYS = [
   [" ", "space", "play or pause", toggleRun],
@@ -19,7 +20,7 @@ const KEYS = [
   ["?", "?", "this", () => $("help").showModal()],
 ];
 
-for (const make of [makeBar, makeCameras, makeSensors, makeRobots, makeScene, makeRecording, makeContacts, makeLog]) make();
+for (const make of [makeBar, makeView, makeCameras, makeSensors, makeRobots, makeScene, makeRecording, makeContacts, makeLog]) make();
 
 $("help").append(h("h2", {}, "Keys"),
   h("dl", {}, ...KEYS.flatMap(([, shown, what]) => [h("dt", {}, h("kbd", {}, shown)), h("dd", {}, what)]),
