@@ -45,7 +45,8 @@ class Spin:
         try:
             while not reply.done() and now() < give_up:
                 await asyncio.sleep(0)
-                look()
+                if not reply.done():  # by whoever else had a turn, and took away where to look
+                    look()
         finally:
             _looking = False
 
