@@ -191,6 +191,18 @@ class TestInTheBackground:
         await client.runtime.set_mode("direct")
         assert camera.latest_frame is frame
 
+    async def test_pictures_that_nobody_looks_at_need_not_come(
+        self, plugin: Plugin, options: dict[str, Any], publisher: Publisher
+    ) -> None:
+        async with URLabClient("tcp://127.0.0.1", **options, live_pictures=False) as client:
+            await client.discover()
+            camera = client.articulations["arm0"].cameras["wrist"]
+            async with camera.frames("latest") as frames:
+                await publisher.subscribed(STATE, TOPIC)
+                publisher.send(TOPIC, PIXELS)
+                assert (await frames.receive(timeout=5)).pixels.shape == (2, 2, 4)
+            assert camera.latest_frame is None
+
     async def test_a_malformed_picture_is_skipped(
         self, client: URLabClient, publisher: Publisher, caplog: pytest.LogCaptureFixture
     ) -> None:

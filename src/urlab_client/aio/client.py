@@ -98,6 +98,8 @@ class URLabClient:
             `URLAB_CLIENT_KEY`. None makes up a key.
         trust_server: Load the binary model of a server that is neither on this machine nor known by its key. Without,
             the model is compiled here from XML.
+        live_pictures: Receive the pictures of all cameras by themselves in live mode, for `latest_frame`. False spares
+            server and network those that nobody looks at; `frames()` is received all the same.
 
     Raises:
         KeyFileError: A key file cannot be used.
@@ -123,6 +125,7 @@ class URLabClient:
         server_key: str | os.PathLike[str] | None = None,
         client_key: str | os.PathLike[str] | None = None,
         trust_server: bool = False,
+        live_pictures: bool = True,
     ) -> None:
         self._config = ClientConfig(
             address=address,
@@ -141,6 +144,7 @@ class URLabClient:
             server_key=None if server_key is None else os.fspath(server_key),
             client_key=None if client_key is None else os.fspath(client_key),
             trust_server=trust_server,
+            live_pictures=live_pictures,
         )
         if encoding not in {"msgpack", "json"}:
             raise ValueError(f"encoding is msgpack or json, not {encoding!r}")
@@ -168,6 +172,7 @@ class URLabClient:
             check_version=mujoco_version_check,
             promote=auto_promote_step_mode,
             trusted=trust_server or keys is not None or is_local(address),
+            live_pictures=live_pictures,
         )
         self._watch = Watch(self._session, self._state)
         self._transport.on_event = self._watch.on_line

@@ -110,6 +110,7 @@ class SimState:
         check_version: bool,
         promote: bool,
         trusted: bool,
+        live_pictures: bool,
     ) -> None:
         self.session = session
         self.publishers = publishers
@@ -135,6 +136,7 @@ class SimState:
         session.on_refusal = self._note_refusal
         self._promote = promote
         self._trusted = trusted
+        self._live_pictures = live_pictures
         self.doubts = Doubts()
         self.on_adopted: Callable[[], None] | None = None
         self.stopping = False
@@ -151,7 +153,9 @@ class SimState:
     def mode(self, mode: StepMode) -> None:
         self._mode = mode
         live = mode is StepMode.LIVE and self.hello is not None and self.hello.manager_present
-        receivers: list[LiveReception | Pictures] = [self._reception, *(view.pictures for view in self._views())]
+        receivers: list[LiveReception | Pictures] = [self._reception]
+        if self._live_pictures:
+            receivers.extend(view.pictures for view in self._views())
         for receiver in receivers:
             if live:
                 receiver.start()

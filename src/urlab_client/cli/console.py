@@ -104,6 +104,7 @@ async def _serve(arguments: ConsoleArguments) -> None:
             state_port=arguments.state_port,
             server_key=arguments.server_key,
             client_key=arguments.client_key,
+            live_pictures=False,  # each camera is streamed while somebody watches it
         )
     except ValueError as error:
         raise CommandError(str(error)) from None
@@ -129,10 +130,12 @@ async def _serve(arguments: ConsoleArguments) -> None:
 
 def _bound(host: str, number: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    listener = socket.socket(family, socket.SOCK_STREAM)
+    # asyncio sends small messages at once only on sockets that say they are TCP; others wait for the peer, up to 40 ms.
+    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((host, number))
+        listener.listen()  # before the link is printed: whoever is quick waits, and is not refused
     except OSError as error:
         listener.close()
         raise OSError(error.errno, f"port {number} of {host} cannot be used: {error.strerror}") from None

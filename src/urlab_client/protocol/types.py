@@ -142,6 +142,7 @@ class ClientConfig(Struct, frozen=True, kw_only=True):
     server_key: str | None = None
     client_key: str | None = None
     trust_server: bool = False
+    live_pictures: bool = True
 
     def options(self) -> dict[str, Any]:
         """Return the constructor's arguments: `URLabClient(**config.options())`."""

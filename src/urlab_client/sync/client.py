@@ -69,6 +69,8 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
             `URLAB_CLIENT_KEY`. None makes up a key.
         trust_server: Load the binary model of a server that is neither on this machine nor known by its key. Without,
             the model is compiled here from XML.
+        live_pictures: Receive the pictures of all cameras by themselves in live mode, for `latest_frame`. False spares
+            server and network those that nobody looks at; `frames()` is received all the same.
 
     Raises:
         KeyFileError: A key file cannot be used.
@@ -97,6 +99,7 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
         server_key: str | os.PathLike[str] | None = None,
         client_key: str | os.PathLike[str] | None = None,
         trust_server: bool = False,
+        live_pictures: bool = True,
     ) -> None:
         super().__init__(
             aio.URLabClient(
@@ -116,6 +119,7 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
                 server_key=server_key,
                 client_key=client_key,
                 trust_server=trust_server,
+                live_pictures=live_pictures,
             )
         )
 

@@ -241,10 +241,12 @@ class Desk:
         while True:
             try:
                 async with self.client.state_stream("latest", timeout=None) as states:
+                    due = time.monotonic()
                     while True:
-                        began = time.monotonic()
                         self._publish(await states.receive(timeout=None))
-                        await anyio.sleep(max(0.0, began + _PERIOD_S - time.monotonic()))
+                        # By the clock and not by when it woke up, else each late awakening makes the rate lower.
+                        due = max(due + _PERIOD_S, time.monotonic() - _PERIOD_S)
+                        await anyio.sleep(max(0.0, due - time.monotonic()))
             except ClientClosed:
                 return
             except URLabError as error:
