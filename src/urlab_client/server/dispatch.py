@@ -9,7 +9,7 @@ import logging
 import threading
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
-from typing import Any, Final, TypeVar, get_type_hints
+from typing import Any, Final, TypeVar, get_args, get_type_hints
 
 from urlab_client.protocol.base import Needs, Reply, Request, Timing
 from urlab_client.protocol.codec import encode_reply
@@ -25,7 +25,9 @@ __all__ = ["HANDLERS", "Dispatcher", "Handler", "HandlerTable", "handles"]
 logger = logging.getLogger("urlab_client.server")
 
 Q = TypeVar("Q", bound=Request[Any])
-Handler = Callable[[ServerCore, Any], Reply]
+A = TypeVar("A", bound=Reply | bytes)
+Handler = Callable[[ServerCore, Any], Reply | bytes]
+"""Returns the reply, or its msgpack frame where that is quicker to make; a session in JSON gets replies only."""
 
 BARE_NAMES: Final = ("recording", "replay")
 """Namespaces whose ops are looked up in any case but recognise only their exact name."""
@@ -43,9 +45,7 @@ class HandlerTable:
         self.handlers: dict[str, Handler] = {}
         self.structs: dict[str, type[Request[Any]]] = {}
 
-    def handles(
-        self, request: type[Q]
-    ) -> Callable[[Callable[[ServerCore, Q], Reply]], Callable[[ServerCore, Q], Reply]]:
+    def handles(self, request: type[Q]) -> Callable[[Callable[[ServerCore, Q], A]], Callable[[ServerCore, Q], A]]:
         """Register the decorated function for an op.
 
         Args:
@@ -58,12 +58,13 @@ class HandlerTable:
         if op is None or not issubclass(request, op.request):
             raise TypeError(f"{request.__name__} is no op's request")
 
-        def register(handler: Callable[[ServerCore, Q], Reply]) -> Callable[[ServerCore, Q], Reply]:
-            returned = get_type_hints(handler)["return"]
-            if not issubclass(returned, op.reply):
-                raise TypeError(
-                    f"{handler.__qualname__} returns {returned.__name__}, {op.name} wants {op.reply.__name__}"
-                )
+        def register(handler: Callable[[ServerCore, Q], A]) -> Callable[[ServerCore, Q], A]:
+            annotation = get_type_hints(handler)["return"]
+            for returned in get_args(annotation) or (annotation,):
+                if returned is not bytes and not issubclass(returned, op.reply):
+                    raise TypeError(
+                        f"{handler.__qualname__} returns {returned.__name__}, {op.name} wants {op.reply.__name__}"
+                    )
             if op.name in self.handlers:
                 raise TypeError(f"{op.name} has two handlers")
             self.handlers[op.name] = handler
@@ -110,8 +111,9 @@ class Dispatcher:
             try:
                 incoming = self._reader.read(frame)
                 name = incoming.name or name
-                reply = encode_reply(self._serve(incoming, transport, max_reply_bytes), json=self._core.session.json)
-                return _fitting(reply, incoming, max_reply_bytes)
+                reply = self._serve(incoming, transport, max_reply_bytes)
+                frame = reply if isinstance(reply, bytes) else encode_reply(reply, json=self._core.session.json)
+                return _fitting(frame, incoming, max_reply_bytes)
             except Refusal as refusal:
                 path = refusal.absolute_path if refusal.code == "path_not_writable" else None
                 error = ErrorReply(code=refusal.code, message=refusal.message, absolute_path=path)
@@ -133,7 +135,7 @@ class Dispatcher:
             if idle:
                 self._lock.release()
 
-    def _serve(self, incoming: Incoming, transport: Transport, max_reply_bytes: int | None) -> Reply:
+    def _serve(self, incoming: Incoming, transport: Transport, max_reply_bytes: int | None) -> Reply | bytes:
         op, name = incoming.op, incoming.name
         if transport is Transport.SHM and op is not None and op.needs is Needs.EDITOR:
             raise Refusal("wrong_transport", f"op '{name}' is not served over shared memory: send it over ZMQ")

@@ -24,6 +24,7 @@ from urlab_client.server.refusal import Refusal
 from urlab_client.server.rendering import CameraStudio
 from urlab_client.server.replay import ReplaySessions
 from urlab_client.server.scene import CompileFailed, Scene
+from urlab_client.server.stencil import StepFrames
 
 __all__ = ["Play", "Running"]
 
@@ -52,6 +53,11 @@ class Running:
     cameras: CameraStudio
     recordings: Sequence[Path] = ()
     limits: Limits = _DEFAULT_LIMITS
+
+    @cached_property
+    def step_frames(self) -> StepFrames:
+        """What encodes the replies to `step`."""
+        return StepFrames(self.scene, self.engine.controls)
 
     @cached_property
     def options(self) -> OptionOverrides:

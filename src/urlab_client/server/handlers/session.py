@@ -160,7 +160,7 @@ def meta(server: ServerCore, request: Meta) -> MetaOk:
 
 
 @handles(Step)
-def step(server: ServerCore, request: Step) -> StepOk:
+def step(server: ServerCore, request: Step) -> StepOk | bytes:
     running = server.play.running()
     most = server.limits.n_steps
     if request.n_steps > most:
@@ -171,7 +171,10 @@ def step(server: ServerCore, request: Step) -> StepOk:
     shots = running.cameras.shots(request.include_cameras)
 
     if not shots:
-        return running.engine.step(request, lambda _: _observe_step(running, level))
+        if server.session.json or running.engine.replay is not None:
+            return running.engine.step(request, lambda _: _observe_step(running, level))
+        engine, encode = running.engine, running.step_frames.encode
+        return engine.step(request, lambda _: encode(level, engine.time, engine.step_count))
 
     def observe(mode: StepMode) -> tuple[StepOk, StepMode, Exposure | None]:
         stepped = mode in (StepMode.DIRECT, StepMode.PUPPET)
