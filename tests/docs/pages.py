@@ -2,8 +2,9 @@
 
 A block may carry a directive, an HTML comment on the line above it, which readers do not see:
 
-    <!-- run -->                         console block: execute it
     <!-- test -->                        python block: a test file, run by pytest
+    <!-- needs: EXTRA -->                python block: run where the extra is installed, apart from the others
+    <!-- as is: REASON -->               text block that is no output: why it does not run
 
 and on `docs/adding-an-op.md`, for `test_docs_adding_an_op.py`:
 
@@ -22,7 +23,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 
 _FENCE = re.compile(r"^```(?P<language>\S*)\s*$")
-_DIRECTIVE = re.compile(r"^<!-- (?P<directive>(?:run|test|use|append:|insert:|shows:).*?) -->$")
+_DIRECTIVE = re.compile(r"^<!-- (?P<directive>(?:test|use|needs:|as is:|append:|insert:|shows:).*?) -->$")
 
 
 @dataclass(frozen=True)
@@ -93,11 +94,3 @@ def anchors(page: Path) -> set[str]:
     """Return the anchors of a page's headings, as GitHub makes them."""
     headings = re.findall(r"^#+ +(.*?) *$", prose(page), flags=re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
-
-
-def commands(block: Block) -> list[str]:
-    """Return the command lines of a `console` or `sh` block: those after a prompt, or all where there is none."""
-    lines = block.code.replace("\\\n", " ").splitlines()
-    if block.language == "console":
-        return [line.removeprefix("$ ") for line in lines if line.startswith("$ ")]
-    return [line for line in lines if line and not line.startswith("#")]

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-import doctest
 import json
 import os
+import re
+import secrets
 import shlex
 import subprocess
 import sys
+import tomllib
+from collections.abc import Iterator
 from pathlib import Path
+from xml.etree import ElementTree as ET
 
 import pytest
-from pages import ROOT, Block, blocks, commands, pages, shown
+from pages import ROOT, Block, blocks, pages, shown
+from shell import DEADLINE_S, NOT_RUN, Shell, reason, same, steps
 
-DEADLINE_S = 100
-LANGUAGES = {"python", "console", "sh", "text", "xml", "json"}
+SHELL = {"console", "sh"}
+READ = {"json": json.loads, "toml": tomllib.loads, "xml": ET.fromstring}
+"""Languages of blocks that do nothing but must be well formed."""
 
 # Runs the blocks of a page as one program; a separator tells their outputs apart. Tracebacks name the page's lines.
 DRIVER = r"""
@@ -27,23 +33,29 @@ for line, code in blocks:
 """
 
 
-def python_blocks(page: Path) -> list[Block]:
-    return [block for block in blocks(page) if block.language == "python" and not block.directive]
+def python_blocks(page: Path, directive: str = "") -> list[Block]:
+    return [block for block in blocks(page) if block.language == "python" and block.directive == directive]
+
+
+def shell_steps(page: Path) -> list[tuple[Block, str, str]]:
+    """Return the commands of a page that run here: block, command, output."""
+    return [
+        (block, command, output)
+        for block in blocks(page)
+        if block.language in SHELL
+        for command, output in steps(block)
+        if reason(command) is None
+    ]
 
 
 def assert_output(block: Block, got: str) -> None:
     """Compare what a block printed with what the page shows; `...` there stands for anything."""
-    if block.output is None:
-        return
-    checker, flags = doctest.OutputChecker(), doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
-    if not checker.check_output(block.output, got, flags):
-        difference = checker.output_difference(doctest.Example(block.code, block.output), got, flags)
+    if block.output is not None and (difference := same(block.output, got)):
         pytest.fail(f"{block}: {difference}", pytrace=False)
 
 
-@pytest.mark.parametrize("page", [page for page in pages() if python_blocks(page)], ids=shown)
-def test_python_blocks_run(page: Path, tmp_path: Path) -> None:
-    chosen = python_blocks(page)
+def run_python(page: Path, chosen: list[Block], folder: Path, **environment: str) -> str:
+    """Run blocks as one program, compare what they print, and return what it says on standard error."""
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", DRIVER],
         input=json.dumps([str(page), [(block.line, block.code) for block in chosen]]),
@@ -51,33 +63,41 @@ def test_python_blocks_run(page: Path, tmp_path: Path) -> None:
         text=True,
         timeout=DEADLINE_S,
         check=False,
-        cwd=tmp_path,
+        cwd=folder,
+        env={**os.environ, **environment},
     )
-    assert (done.returncode, done.stderr) == (0, ""), f"{shown(page)}\n{done.stdout}\n{done.stderr}"
+    assert done.returncode == 0, f"{shown(page)}\n{done.stdout}\n{done.stderr}"
     for block, got in zip(chosen, done.stdout.split("\x1e"), strict=False):
         assert_output(block, got)
+    return done.stderr
+
+
+@pytest.mark.parametrize("page", [p for p in pages() if python_blocks(p) or shell_steps(p)], ids=shown)
+def test_code_runs(page: Path, tmp_path: Path) -> None:
+    # The commands come second, in the same folder, so that they find what the page's program has written.
+    if chosen := python_blocks(page):
+        assert run_python(page, chosen, tmp_path) == ""
+    shell = Shell(tmp_path)
+    try:
+        for block, command, output in shell_steps(page):
+            got = shell.run(command)
+            if output and (difference := same(output, got)):
+                pytest.fail(f"{block}: {command}: {difference}", pytrace=False)
+        shell.close()
+    finally:
+        shell.abandon()
 
 
 def marked(directive: str) -> list[Block]:
     return [block for page in pages() for block in blocks(page) if block.directive == directive]
 
 
-@pytest.mark.parametrize("block", marked("run"), ids=str)
-def test_marked_console_blocks_run(block: Block, tmp_path: Path) -> None:
-    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
-    script = "\n".join(["set -e", *commands(block)])
-    done = subprocess.run(
-        ["bash", "-c", script],
-        capture_output=True,
-        text=True,
-        timeout=DEADLINE_S,
-        check=False,
-        cwd=tmp_path,
-        env={**os.environ, "PATH": path},
-    )
-    assert (done.returncode, done.stderr) == (0, ""), f"{block}\n{done.stdout}\n{done.stderr}"
-    expected = "".join(f"{line}\n" for line in block.code.splitlines() if not line.startswith("$ "))
-    assert_output(Block(block.page, block.line, "console", block.code, output=expected), done.stdout)
+@pytest.mark.ray
+@pytest.mark.parametrize("page", sorted({block.page for block in marked("needs: ray")}), ids=shown)
+def test_code_that_needs_ray_runs(page: Path, tmp_path: Path) -> None:
+    token = secrets.token_hex(32)  # Ray would leave one in the home folder
+    environment = {"RAY_AUTH_TOKEN": token, "RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
+    run_python(page, python_blocks(page, "needs: ray"), tmp_path, **environment)
 
 
 @pytest.mark.parametrize("page", sorted({block.page for block in marked("test")}), ids=shown)
@@ -98,14 +118,38 @@ def test_marked_tests_pass(page: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, f"{shown(page)}\n{done.stdout}\n{done.stderr}"
 
 
+def every_block() -> Iterator[Block]:
+    for page in pages():
+        yield from blocks(page)
+
+
 def test_something_runs() -> None:
     assert {shown(page) for page in pages() if python_blocks(page)} >= {"README.md", "docs/quickstart.md"}
-    assert marked("run")
+    assert {shown(page) for page in pages() if shell_steps(page)} >= {"README.md", "docs/start.md"}
 
 
-@pytest.mark.parametrize("page", pages(), ids=shown)
-def test_blocks_are_of_a_known_language(page: Path) -> None:
-    assert {block.language for block in blocks(page)} <= LANGUAGES
+def test_no_block_is_left_out() -> None:
+    # Walkthrough steps are the business of test_docs_adding_an_op.py; a text block below another is its output.
+    for block in every_block():
+        kind = block.directive.partition(":")[0]
+        if block.language == "python":
+            assert kind in {"", "test", "needs", "use", "append", "insert", "shows"}, f"{block} does not run"
+            assert kind != "needs" or block.directive == "needs: ray", f"{block}: nothing runs it"
+        elif block.language == "text":
+            assert kind in {"as is", "append"}, f"{block} is nobody's output: say why, `<!-- as is: REASON -->`"
+        else:
+            assert block.language in SHELL | set(READ), f"{block}: {block.language or 'no language'}"
+
+
+def test_what_does_not_run_is_still_there() -> None:
+    commands = [command for block in every_block() if block.language in SHELL for command, _ in steps(block)]
+    for pattern in NOT_RUN:
+        assert any(re.match(pattern, command) for command in commands), f"no page has {pattern}: take it from NOT_RUN"
+
+
+@pytest.mark.parametrize("block", [block for block in every_block() if block.language in READ], ids=str)
+def test_files_are_well_formed(block: Block) -> None:
+    READ[block.language](block.code)
 
 
 @pytest.mark.parametrize("page", pages(), ids=shown)
@@ -113,15 +157,20 @@ def test_commands_are_understood(page: Path) -> None:
     from urlab_client.cli import _parser
 
     for block in blocks(page):
-        if block.language not in {"console", "sh"}:
-            continue
-        for command in commands(block):
+        for command, _ in steps(block) if block.language in SHELL else ():
             words = shlex.split(command.removesuffix("&"))
             if words[:1] == ["urlab"]:
                 try:
                     _parser().parse_args(words[1:])
                 except SystemExit as end:
                     pytest.fail(f"{block}: {command}: exit code {end.code}", pytrace=False)
+
+
+def test_extras_that_pages_install_exist() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    for page in pages():
+        for extras in re.findall(r"(?:urlab-client|-e '\.)\[([\w,-]+)\]", page.read_text(encoding="utf-8")):
+            assert set(extras.split(",")) <= set(project["optional-dependencies"]), f"{shown(page)}: [{extras}]"
 
 
 def test_the_set_up_lines_stand_in_the_readme_word_for_word() -> None:

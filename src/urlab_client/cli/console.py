@@ -6,6 +6,7 @@ import argparse
 import asyncio
 import socket
 import webbrowser
+from contextlib import suppress
 
 from urlab_client.cli._arguments import Commands, add_keys, port
 from urlab_client.cli._failure import CommandError
@@ -85,7 +86,8 @@ def run(arguments: ConsoleArguments) -> int:
     if arguments.host not in {"127.0.0.1", "::1", "localhost"} and not arguments.allow_host:
         raise CommandError(f"--host {arguments.host}: say with --allow-host NAME how browsers reach it")
     import_mujoco()
-    asyncio.run(_serve(arguments))
+    with suppress(KeyboardInterrupt):  # Ctrl-C in the moment before uvicorn listens for it
+        asyncio.run(_serve(arguments))
     return 0
 
 
@@ -122,10 +124,19 @@ async def _serve(arguments: ConsoleArguments) -> None:
                 proxy_headers=False,
                 server_header=False,
             )
-            print(f"{arguments.address} is shown at {link} (good for one browser); Ctrl-C ends it.", flush=True)
-            if arguments.open:
-                webbrowser.open(link)
-            await uvicorn.Server(config).serve(sockets=[listener])
+
+            class Server(uvicorn.Server):
+                async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+                    await super().startup(sockets)
+                    if self.started:  # from here on Ctrl-C ends it in good order
+                        print(
+                            f"{arguments.address} is shown at {link} (good for one browser); Ctrl-C ends it.",
+                            flush=True,
+                        )
+                        if arguments.open:
+                            webbrowser.open(link)
+
+            await Server(config).serve(sockets=[listener])
 
 
 def _bound(host: str, number: int) -> socket.socket:

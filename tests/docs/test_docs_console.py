@@ -1,0 +1,67 @@
+"""The requests that `docs/console.md` makes with curl, made as written to the console that the page starts."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+import shlex
+import time
+from pathlib import Path
+from urllib.request import Request, urlopen
+
+from pages import ROOT, Block, blocks
+from shell import Shell, same, steps
+
+PAGE = ROOT / "docs" / "console.md"
+
+
+def block_with(text: str) -> Block:
+    (block,) = [block for block in blocks(PAGE) if text in block.code]
+    return block
+
+
+def fetch(command: str, port: int, **variables: str) -> str:
+    """Do what a `curl` command says."""
+    for name, value in variables.items():
+        command = command.replace(f"${name}", value)
+    words = shlex.split(command)
+    assert words[0] == "curl"
+    options = dict(itertools.pairwise(words))
+    (address,) = [word for word in words if word.startswith("localhost:8355/")]
+    name, _, value = options.get("-H", "Accept: */*").partition(": ")
+    url = "http://" + address.replace("8355", str(port), 1)
+    with urlopen(Request(url, data=options["-d"].encode(), headers={name: value}), timeout=30) as reply:
+        return reply.read().decode()
+
+
+def knows_the_robots(port: int, key: str) -> bool:
+    request = Request(f"http://localhost:{port}/api/world", headers={"Authorization": f"Bearer {key}"})
+    with urlopen(request, timeout=30) as reply:
+        return '"elbow"' in reply.read().decode()
+
+
+def test_the_requests_work_as_shown(tmp_path: Path) -> None:
+    (serve,) = [
+        command for command, _ in steps(block_with("urlab console")) if command.startswith("urlab console 'sim:")
+    ]
+    login, *others = steps(block_with("curl"))
+    shell = Shell(tmp_path)
+    try:
+        link = shell.run(serve)
+        token = re.search(r"token=([\w-]+)", link)
+        assert token is not None, link
+        port = shell.ports["--port"]
+        inner = re.fullmatch(r"KEY=\$\((curl .*) \| jq -r \.key\)", login[0])
+        assert inner is not None, login[0]
+        key = json.loads(fetch(inner[1].replace("…", token[1]), port))["key"]
+        assert others
+        deadline = time.monotonic() + 30
+        while not knows_the_robots(port, key):
+            assert time.monotonic() < deadline, "the console does not get to know its robots"
+        for command, output in others:
+            got = fetch(command, port, KEY=key)
+            assert not output or not same(output, got), f"{command}: {got}"
+        shell.close()
+    finally:
+        shell.abandon()
