@@ -47,9 +47,10 @@ RUNG_POLL_S: Final = 0.05
 somebody with a doorbell is."""
 
 AT_WORK_S: Final = 1.0
-# Requests that follow each other so quickly are waited for without sleep: waking up would take as long as the answer.
-BRISK_S: Final = 2e-4
 """How long after a request its client counts as at work."""
+
+BRISK_S: Final = 2e-4
+"""Requests that follow each other so quickly are waited for without sleep: waking up takes as long as an answer."""
 
 STATE_PERIOD_S: Final = 0.1
 PICTURE_PERIOD_S: Final = 10.0
