@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Protocol
 
 import anyio.to_thread
+import msgspec
 import numpy as np
 
 from urlab_client.aio.articulation import URLabArticulation, URLabEntity
@@ -234,6 +235,7 @@ class SimState:
 
     async def adopt(self, hello: HelloOk, *, timeout: Timeout = DEFAULT) -> None:
         """Take over a handshake: load its model, bind the wrappers, bring the server into the wanted step mode."""
+        hello.mjb_base64 = msgspec.Raw()  # it keeps the whole reply in memory
         await self.session.transport.follow(hello)
         loaded = None
         if self._local_model:
@@ -242,7 +244,7 @@ class SimState:
             loaded = await anyio.to_thread.run_sync(self.mirror.load, hello, abandon_on_cancel=True)
         # From here on nothing waits until all is taken over: cancelled or not, model and wrappers belong together.
         # The model's bytes, several times its size, are not needed any more.
-        hello.mjb = hello.mjb_base64 = hello.mjcf_compiled = hello.vfs_assets = None
+        hello.mjb = hello.mjcf_compiled = hello.vfs_assets = None
         played = self.hello is not None and self.hello.manager_present
         with self.mirror.lock:
             if self._local_model:

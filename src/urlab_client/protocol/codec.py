@@ -221,15 +221,21 @@ def _spelled(value: Any) -> Any:
     match value:
         case dict():
             items = cast("dict[str, Any]", value).items()
-            return {f"{key}{_BINARY_SUFFIX}" if isinstance(item, bytes) else key: _spelled(item) for key, item in items}
+            return {f"{key}{_BINARY_SUFFIX}" if _is_binary(item) else key: _spelled(item) for key, item in items}
         case list():
             return [_spelled(item) for item in cast("list[Any]", value)]
+        case msgspec.Raw():
+            return msgspec.msgpack.decode(value)
         case bytes():
             return base64.b64encode(value).decode("ascii")
         case float() if math.isfinite(value):
             return msgspec.Raw(b"%.17g" % value)
         case _:
             return value  # what is not finite becomes null: the plugin's JSON would be invalid
+
+
+def _is_binary(value: Any) -> bool:
+    return isinstance(value, bytes) and not isinstance(value, msgspec.Raw)  # which is a kind of bytes
 
 
 # Widening integers. Structs declare counters as `int` for the people who read them, the wire wants float64. Which

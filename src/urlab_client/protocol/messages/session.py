@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
+import msgspec
 from msgspec import Struct
 
 from urlab_client.protocol.base import Floats, QuatWXYZ, Reply, Request, Vec3, doc
@@ -243,7 +244,10 @@ class HelloOk(Reply, tag="hello_ok", kw_only=True, omit_defaults=True):
     manager_present: Annotated[bool, doc("True while a play session runs.")]
     shm_session_dir: Annotated[str | None, doc("Directory of the shared state region.")] = None
     mjb: Annotated[bytes | None, doc("The compiled model in MuJoCo's binary format.")] = None
-    mjb_base64: Annotated[str | None, doc("The same bytes as text; sent under msgpack as well.")] = None
+    mjb_base64: Annotated[
+        msgspec.Raw,
+        doc("The same bytes as text, sent under msgpack as well; not decoded, as it is larger."),
+    ] = msgspec.Raw()
     mjb_size: Annotated[int | None, doc("Length of `mjb` in bytes.")] = None
     mjcf_compiled: Annotated[str | None, doc("The model as MJCF, with `include_assets`.")] = None
     vfs_assets: Annotated[dict[str, bytes] | None, doc("Asset bytes by bare file name, with `include_assets`.")] = None

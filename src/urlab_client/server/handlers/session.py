@@ -8,6 +8,7 @@ import base64
 import logging
 from typing import Final
 
+import msgspec
 import mujoco
 
 from urlab_client.protocol.enums import ObservationLevel, StepMode
@@ -79,7 +80,7 @@ def handshake(server: ServerCore, session_id: str, *, include_assets: bool = Fal
     with engine.lock:
         reply.mjb = scene.mjb()
         reply.articulations = [_articulation(server, control) for control in engine.controls.values()]
-    reply.mjb_base64 = base64.b64encode(reply.mjb).decode("ascii")
+    reply.mjb_base64 = msgspec.Raw(msgspec.msgpack.encode(base64.b64encode(reply.mjb).decode("ascii")))
     reply.mjb_size = len(reply.mjb)
     reply.entities = {entity.name: _entity(entity) for entity in scene.entities}
     if include_assets:
