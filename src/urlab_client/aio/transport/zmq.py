@@ -17,6 +17,7 @@ from typing import Any, cast
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
+from urlab_client.aio.transport import context as shared_context
 from urlab_client.aio.transport import line
 from urlab_client.aio.transport.base import TransportStats
 from urlab_client.aio.transport.curve import ClientKeys
@@ -178,7 +179,7 @@ class ZmqTransport:
         self._socket.disable_monitor()
         self._monitor.close(linger=0)
         self._socket.close(linger=0)
-        self._context.term()
+        shared_context.give_back(self._context)
 
     def _open(self) -> tuple[asyncio.AbstractEventLoop, zmq.Socket[bytes]]:
         if self._closed:
@@ -190,7 +191,7 @@ class ZmqTransport:
                     "This client belongs to another event loop.", hint="Make one client per loop, or use the façade."
                 )
             return loop, self._socket
-        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        context = shared_context.borrow()
         socket = context.socket(zmq.DEALER)
         line.configure(socket)
         # A request must not wait in a queue for a server that is gone: it would reach the next one.
@@ -206,7 +207,7 @@ class ZmqTransport:
             socket.disable_monitor()
             monitor.close(linger=0)
             socket.close(linger=0)
-            context.term()
+            shared_context.give_back(context)
             if isinstance(error, NotImplementedError):
                 raise URLabError(
                     f"{type(loop).__name__} cannot watch sockets.",

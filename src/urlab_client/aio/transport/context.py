@@ -1,0 +1,67 @@
+"""The ZeroMQ context that all request lines of a process share.
+
+A context has two threads and a handful of descriptors. With one for each of many clients in one event loop, their
+threads, which wake up for every message, would take more of the machine than the clients.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from typing import Final
+
+import zmq
+
+__all__ = ["borrow", "give_back"]
+
+Context = zmq.Context[zmq.Socket[bytes]]
+
+_MOST_SOCKETS: Final = 16_384
+"""ZeroMQ's own limit is 1023, about 340 clients; the table is that of their addresses alone."""
+
+
+class _Shared:
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._context: Context | None = None
+        self._users = 0
+
+    def borrow(self) -> Context:
+        with self._lock:
+            if self._context is None:
+                self._context = zmq.Context()
+                self._context.max_sockets = _MOST_SOCKETS
+            self._users += 1
+            return self._context
+
+    def give_back(self, context: Context) -> None:
+        with self._lock:
+            if context is not self._context:  # this process is a fork of the one that borrowed it
+                return
+            self._users -= 1
+            if self._users:
+                return
+            self._context = None
+        context.term()
+
+
+_shared = _Shared()
+
+
+def _start_over() -> None:
+    global _shared  # noqa: PLW0603  # a fork's copy of the context has no threads behind it
+    _shared = _Shared()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_start_over)
+
+
+def borrow() -> Context:
+    """Return the context, made if need be; to be given back."""
+    return _shared.borrow()
+
+
+def give_back(context: Context) -> None:
+    """Give it back, once all sockets in it that the borrower opened are closed. The last one back ends it."""
+    _shared.give_back(context)
