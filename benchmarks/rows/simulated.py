@@ -53,7 +53,7 @@ def _simulated(*, standing: bool = True) -> Iterator[_Simulated]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "robot.xml"
         path.write_text(robot_mjcf(_JOINTS, standing=standing))
-        ports = [f"--{name}-port=0" for name in ("step", "state", "ctrl", "info")]
+        ports = [f"--{name}-port=0" for name in ("step", "state", "ctrl", "info", "camera")]
         command = [sys.executable, "-m", "urlab_client", "serve", str(path), "--play", "--json", "--until-eof", *ports]
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
             assert process.stdin is not None and process.stdout is not None  # noqa: S101, PT018
