@@ -6,6 +6,7 @@ import doctest
 import os
 import re
 import select
+import shutil
 import signal
 import socket
 import subprocess
@@ -13,7 +14,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from pages import Block
+from pages import ROOT, Block
 
 DEADLINE_S = 100
 
@@ -121,7 +122,9 @@ class Shell:
         self.environment = {**os.environ, "PATH": path, "HOME": str(self.home)}
 
     def provide(self, command: str) -> None:
-        """Put there what a command reads and the reader has: MJCF files, a level."""
+        """Put there what a command reads and the reader has: MJCF files, a level, the examples of a clone."""
+        if " examples/" in command:
+            shutil.copytree(ROOT / "examples", self.folder / "examples", dirs_exist_ok=True)
         for name in re.findall(r"(?<![\w/.-])(\w+)\.xml\b", command):
             (self.folder / f"{name}.xml").write_text(MODEL.format(name), encoding="utf-8")
         for name in re.findall(r"(?<![\w/.-])\w+\.json\b", command):
