@@ -200,6 +200,26 @@ def test_direct_mode_steps_and_shows_what_cameras_see(http: TestClient) -> None:
     assert "direct" in refused.json()["error"]["message"]
 
 
+def test_a_replay_goes_to_any_frame_of_it(http: TestClient) -> None:
+    try:
+        http.post("/api/run", json={"running": False})
+        http.post("/api/ops/set_mode", json={"mode": "direct"})
+        assert "no replay runs" in http.post("/api/replay", json={"frame": 3}).json()["error"]["message"]
+        http.post("/api/ops/recording_start", json={})
+        http.post("/api/ctrl", json={"arm": {"elbow": -0.4}})
+        http.post("/api/step", json={"n_steps": 500})
+        http.post("/api/ops/recording_stop", json={})
+        total = http.post("/api/ops/replay_start", json={}).json()["total_frames"]
+        assert total >= 500
+        for wanted, reached in ((400, 400), (20, 20), (10**6, total - 1), (-5, 0)):
+            assert http.post("/api/replay", json={"frame": wanted}).json() == {"frame": reached, "total": total}
+            assert http.get("/api/status").json()["replay"] == [reached, total]
+        http.post("/api/ops/replay_stop", json={})
+        assert http.post("/api/replay", json={"frame": 3}).status_code == 400
+    finally:
+        http.post("/api/ops/set_mode", json={"mode": "live"})
+
+
 def test_live_pictures_come_as_files_too(http: TestClient) -> None:
     http.post("/api/run", json={"running": True})
     picture = http.get("/api/cameras/arm/overview.jpg")

@@ -7,7 +7,7 @@ import io
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,9 @@ from PIL import Image
 from selenium import webdriver
 from selenium.webdriver.chrome.options import Options
 from selenium.webdriver.chrome.service import Service
+from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.remote.webelement import WebElement
 from selenium.webdriver.support.ui import WebDriverWait
 
 FLAGS = (
@@ -28,6 +31,10 @@ SOLID = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")  # WebGL with
 PATIENCE_S = 40
 RUNNING = "document.querySelector('#play').textContent.includes('Pause')"
 SLIDER = "[data-robot=arm] [data-actuator=elbow]"
+
+TOO_WIDE = """[...document.querySelectorAll('main *, header *')]
+  .filter((one) => !one.closest('.frame, .entries, .actors') && one.getBoundingClientRect().right > innerWidth + 1)
+  .map((one) => one.outerHTML.slice(0, 80))"""
 
 
 @contextlib.contextmanager
@@ -42,7 +49,10 @@ def command(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
 
 
 def serve(*ports: str) -> contextlib.AbstractContextManager[tuple[subprocess.Popen[str], str]]:
-    return command("serve", "arm", "--play", "--unpaused", "--json", "--camera-size", "64x48", *ports)
+    return command(
+        "serve", "arm", "quadruped", "--controller", "quadruped=pd,kp=40,kv=1.5", "--play", "--unpaused", "--json",
+        "--camera-size", "64x48", *ports,
+    )  # fmt: skip
 
 
 class Page:
@@ -60,6 +70,28 @@ class Page:
     def click(self, selector: str) -> None:
         self.until(f"document.querySelector('{selector}')?.disabled === false")
         self.look(f"document.querySelector('{selector}').click()")
+
+    def find(self, selector: str) -> WebElement:
+        return self.driver.find_element("css selector", selector)
+
+    def ask(self, path: str, body: object = None) -> Any:
+        """Ask the console as the page does."""
+        return self.driver.execute_async_script(
+            "const [path, body, done] = arguments; import('/static/link.js').then(({ask}) => "
+            "ask(body === null ? 'GET' : 'POST', path, body ?? undefined)).then(done)",
+            path, body,
+        )  # fmt: skip
+
+    def asked(self, path: str, wanted: Callable[[Any], object], body: object = None) -> None:
+        """Ask until the answer is as wanted."""
+        WebDriverWait(self.driver, PATIENCE_S, 0.05).until(lambda _: wanted(self.ask(path, body)), f"never: {path}")
+
+    def unfold(self, robot: str, title: str) -> None:
+        self.driver.execute_script(
+            "[...document.querySelectorAll(`[data-robot=${arguments[0]}] details`)]"
+            ".find(one => one.firstChild.textContent === arguments[1]).open = true",
+            robot, title,
+        )  # fmt: skip
 
     def slide(self, value: float) -> None:
         self.driver.execute_script(
@@ -127,7 +159,7 @@ def test_a_slider_moves_its_joint(page: Page) -> None:
 
 
 def test_cameras_and_curves_are_drawn(page: Page) -> None:
-    page.until("document.querySelectorAll('.camera').length === 2")
+    page.until("document.querySelectorAll('.camera').length === 4")
     page.until("[...document.querySelectorAll('.camera')].every(one => /fps/.test(one.innerText))")
     pixels = "canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data"
     drawn = f"(canvas => {pixels}.some((value, i) => i % 4 === 1 && value > 90))"  # in colours, not in black
@@ -157,6 +189,154 @@ def test_steps_and_reset_in_direct_mode(page: Page) -> None:
     page.until("document.querySelector('#time').textContent === '0.10 s'")
     page.driver.execute_script(choose.format("live"))
     page.until(RUNNING)
+
+
+def test_gains_are_tuned_by_typing_and_the_next_box_keeps_the_focus(page: Page) -> None:
+    def params() -> Any:
+        robots = {art["key"]: art for art in page.ask("api/world")["articulations"]}
+        return robots["quadruped"]["controller"]["params"]
+
+    page.unfold("quadruped", "Gains")
+    box = page.find("[data-gain='kp/FL_hip']")
+    box.send_keys(Keys.CONTROL, "a")
+    box.send_keys("55", Keys.TAB)
+    following = page.driver.switch_to.active_element
+    assert following.get_attribute("data-gain") == "kv/FL_hip"
+    following.send_keys(Keys.CONTROL, "a")
+    following.send_keys("2")
+    page.asked("api/world", lambda _: params()["kp"]["FL_hip"] == 55)
+    following.send_keys(".5", Keys.ENTER)
+    page.asked("api/world", lambda _: params()["kv"]["FL_hip"] == 2.5)
+    assert following == page.driver.switch_to.active_element
+    assert params()["kp"]["FR_hip"] == 40
+
+
+def test_a_gain_that_is_refused_goes_back_to_what_it_was(page: Page) -> None:
+    program = "fetch('api/lease', {{method: '{}'}}).then(answer => arguments[0](answer.status))"
+    page.asked("api/lease", lambda status: status["mine"], {})
+    page.click("#drive")
+    page.until("document.querySelector('#driver').dataset.who === 'free'")
+    assert page.driver.execute_async_script(program.format("POST")) == 200
+    page.until("document.querySelector('#driver').textContent.includes('a program drives')")
+    page.unfold("quadruped", "Gains")
+    box = page.find("[data-gain='kp/RL_hip']")
+    box.send_keys(Keys.CONTROL, "a")
+    box.send_keys("70", Keys.ENTER)
+    page.until("document.querySelector('#toasts').innerText.includes('has the controls')")
+    page.until("document.querySelector('[data-gain=\"kp/RL_hip\"]').value === '40'")
+    assert page.driver.execute_async_script(program.format("DELETE")) == 200
+
+
+def test_the_twist_pad_commands_while_a_key_is_held(page: Page) -> None:
+    page.unfold("quadruped", "Commanded twist")
+    pad = page.find("[data-robot=quadruped] .pad")
+    page.driver.execute_script("arguments[0].scrollIntoView({block: 'center'}); arguments[0].focus()", pad)
+    ActionChains(page.driver).key_down("w").perform()
+    page.asked("api/status", lambda status: status["twists"].get("quadruped") == [0.5, 0, 0])
+    ActionChains(page.driver).key_up("w").perform()
+    page.asked("api/status", lambda status: status["twists"].get("quadruped") == [0, 0, 0])
+    ActionChains(page.driver).move_to_element_with_offset(pad, 0, -64 + 16).click_and_hold().perform()
+    page.asked("api/status", lambda status: status["twists"]["quadruped"][0] > 0.5)
+    ActionChains(page.driver).release().perform()
+    page.asked("api/status", lambda status: status["twists"]["quadruped"] == [0, 0, 0])
+
+
+def test_actors_are_spawned_moved_and_removed_and_nobody_loses_what_they_type(page: Page) -> None:
+    def where(actor: str) -> Any:
+        actors = page.ask("api/ops/list_actors", {})["actors"]
+        return next((one["location"] for one in actors if one["actor_id"] == actor), None)
+
+    page.until("document.querySelector('#blueprint').options.length > 0")
+    page.find("#actor-id").send_keys("second")
+    page.find("#spawn").click()
+    page.until("document.querySelector('[data-actor=second]') !== null")
+    x = page.find("[data-actor=second] input")
+    x.send_keys(Keys.CONTROL, "a")
+    x.send_keys("1.5")
+    blueprint = page.look("document.querySelector('#blueprint').value")
+    page.ask("api/ops/spawn_actor", {"blueprint": blueprint, "actor_id": "third", "location": [0, 2, 0]})
+    page.until("document.querySelector('[data-actor=third]') !== null")
+    assert x == page.driver.switch_to.active_element
+    assert x.get_attribute("value") == "1.5"
+    page.find("[data-actor=second] button[title^=Move]").click()
+    page.asked("api/ops/list_actors", lambda _: where("second")[0] == 1.5, {})
+    for actor in ("second", "third"):
+        page.find(f"[data-actor={actor}] button[title^=Remove]").click()
+        page.until(f"document.querySelector('[data-actor={actor}]') === null")
+        assert where(actor) is None
+
+
+def test_a_recording_is_made_and_replayed_and_one_can_go_to_any_place_in_it(page: Page) -> None:
+    page.until(RUNNING)
+    page.slide(0.0)
+    page.until(page.elbow_is(0.0))
+    page.click("#record")
+    page.until("document.querySelector('#record').textContent.includes('Stop')")
+    page.slide(0.9)
+    page.until(page.elbow_is(0.9))
+    page.ask("api/ops/configure_controller", {"articulation": "quadruped", "params": {"kp": {"RR_hip": 41}}})
+    assert page.ask("api/status")["recording"], "tuning a controller is no reason to think that it ended"
+    page.click("#record")
+    page.until("document.querySelector('#toasts').innerText.includes('frames')")
+    page.click("#replay")
+    page.until("document.querySelector('#replay').textContent.includes('Stop')")
+    page.until("document.querySelector('#mode').value === 'direct' && +document.querySelector('#timeline').value > 5")
+    page.click("#stop")
+    page.until(f"!({RUNNING})")
+    seek = (
+        "const t = document.querySelector('#timeline'); t.value = Math.round(arguments[0] * t.max);"
+        "t.dispatchEvent(new Event('input', {bubbles: true})); return +t.value"
+    )
+    for share, elbow in ((1.0, 0.9), (0.0, 0.0), (1.0, 0.9)):
+        frame = page.driver.execute_script(seek, share)
+        page.asked("api/status", lambda status, frame=frame: status["replay"][0] == frame)
+        page.until(page.elbow_is(elbow))
+    page.click("#replay")
+    page.until("document.querySelector('#mode').value === 'live'")
+    page.driver.execute_script(
+        "document.querySelector('#play').textContent.includes('Play') && document.querySelector('#play').click()"
+    )
+    page.until(RUNNING)
+
+
+def test_keys_work_and_not_while_somebody_types(page: Page) -> None:
+    body = page.find("body")
+    page.driver.execute_script("document.activeElement.blur()")
+    page.until("document.querySelector('#driver').dataset.who === 'me'")
+    body.send_keys("d")
+    page.until("document.querySelector('#driver').dataset.who === 'free'")
+    body.send_keys("d")
+    page.until("document.querySelector('#driver').dataset.who === 'me'")
+    body.send_keys("?")
+    page.until("document.querySelector('#help').open")
+    page.find("#help button").click()
+    page.until("!document.querySelector('#help').open")
+    field = page.find("#actor-id")
+    field.clear()
+    field.send_keys("d ?")
+    assert field.get_attribute("value") == "d ?"
+    field.clear()
+    assert page.look("document.querySelector('#driver').dataset.who") == "me"
+    assert not page.look("document.querySelector('#help').open")
+
+
+def test_it_fits_a_phone(page: Page) -> None:
+    command = "Emulation.setDeviceMetricsOverride"
+    page.driver.execute_cdp_cmd(command, {"width": 360, "height": 740, "deviceScaleFactor": 2, "mobile": True})
+    try:
+        page.until("innerWidth === 360")
+        page.unfold("quadruped", "Gains")
+        page.unfold("quadruped", "Joints")
+        for place in (0, 1):
+            page.driver.execute_script(f"window.scrollTo(0, {place} * document.body.scrollHeight)")
+            wide = page.look(TOO_WIDE)
+            assert wide == []
+            assert page.look("document.documentElement.scrollWidth") == 360
+            stop = page.look("document.querySelector('#stop').getBoundingClientRect().toJSON()")
+            assert 0 <= stop["top"] <= stop["bottom"] <= 740
+            assert stop["height"] >= 44
+    finally:
+        page.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
 def test_a_second_viewer_drives_only_when_the_first_lets_go(page: Page, tmp_path: Path) -> None:
@@ -192,7 +372,7 @@ def test_the_3d_view_shows_the_robot_and_follows_it(page: Page, tmp_path: Path) 
         def blue() -> bool:  # as parts of the arm are, and nothing else
             return bool(((picture() @ [-1.0, -0.5, 1.0]) > 60).mean() > 0.003)
 
-        wait = WebDriverWait(one.driver, PATIENCE_S, 0.3)
+        wait = WebDriverWait(one.driver, 1.5 * PATIENCE_S, 0.3)
         wait.until(lambda _: blue(), "the arm never appeared")
         before = picture()
         page.slide(1.2)
@@ -213,3 +393,17 @@ def test_a_killed_server_shows_as_such_and_comes_back(
     page.until(RUNNING)
     page.slide(0.4)
     page.until(page.elbow_is(0.4))
+
+
+def test_a_console_that_ends_shows_as_such(
+    console: tuple[dict[str, Any], str, contextlib.ExitStack], tmp_path: Path
+) -> None:
+    ready = console[0]
+    ports = [f"--{n}-port={ready[f'{n}_port']}" for n in ("step", "state")]
+    with contextlib.ExitStack() as stack:
+        process, said = stack.enter_context(command("console", ready["address"], *ports, "--port=0"))
+        link = next(word for word in said.split() if word.startswith("http://"))
+        page = stack.enter_context(opened(tmp_path, link))
+        page.until(f"document.querySelector('{SLIDER}') !== null")
+        process.kill()
+        page.until("document.querySelector('#banner').innerText.includes('console itself')")

@@ -80,6 +80,10 @@ class _Steps(Struct):
     n_steps: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] = 1
 
 
+class _Frame(Struct):
+    frame: int
+
+
 class _Token(Struct):
     token: str
 
@@ -115,6 +119,7 @@ class _Site:
             route("/api/ctrl", self._ctrl, "POST"),
             route("/api/run", self._run, "POST"),
             route("/api/step", self._step, "POST"),
+            route("/api/replay", self._seek, "POST"),
             route("/api/lease", self._lease, "POST", "DELETE"),
             route("/api/connection", self._connection, "POST"),
             route("/api/invitations", self._invite, "POST"),
@@ -182,6 +187,11 @@ class _Site:
     async def _step(self, request: Request) -> Response:
         steps = msgspec.json.decode(await _body(request) or b"{}", type=_Steps)
         return _json(encode(await self.desk.step(self._viewer(request), steps.n_steps)))
+
+    async def _seek(self, request: Request) -> Response:
+        wanted = msgspec.json.decode(await _body(request), type=_Frame).frame
+        frame, total = await self.desk.seek(self._viewer(request), wanted)
+        return _json(encode({"frame": frame, "total": total}))
 
     async def _lease(self, request: Request) -> Response:
         viewer = self._viewer(request)

@@ -55,6 +55,7 @@ _PULSE_S = 0.5
 _CONNECT_S = 3.0
 _KEPT = 300
 _DIGITS = 5
+_SEEK_STEPS = 8  # recordings have about one frame a timestep
 _MOVING_S = 0.4  # a paused server repeats its state ten times a second
 
 
@@ -185,7 +186,7 @@ class Desk:
             return
         self._set_link("connected")
         self._ready.set()
-        self._redescribe()
+        self._begin_anew()
 
     def _take(self, event: ClientEvent) -> None:
         """Act on what happened to the connection."""
@@ -206,12 +207,12 @@ class Desk:
                 self._running = False
             case PlayStarted():
                 if event.articulations or not self.client.session_id:
-                    self._redescribe()
+                    self._begin_anew()
                 else:
                     self._want = "discover"
             case PlayEnded() | SessionOpened():
                 self._running = False
-                self._redescribe()
+                self._begin_anew()
             case _:
                 pass
 
@@ -225,13 +226,17 @@ class Desk:
             self.link = Link(state, reason, time.time())
             self.tell()
 
-    def _redescribe(self) -> None:
-        self.world = describe(self.client, self.world.version + 1, self.studio.missing)
-        self.world_json = encode({"type": "world", "world": self.world})
+    def _begin_anew(self) -> None:
+        """Forget what belonged to the play before."""
         self._seeded.clear()
         self._twists.clear()
         self._recording = self._replaying = False
         self._replay = None
+        self._redescribe()
+
+    def _redescribe(self) -> None:
+        self.world = describe(self.client, self.world.version + 1, self.studio.missing)
+        self.world_json = encode({"type": "world", "world": self.world})
         self.tell()
 
     # State
@@ -387,11 +392,12 @@ class Desk:
             case SetTwist():
                 self._twists[request.articulation] = (reply.linear[0], reply.linear[1], reply.angular[2])
             case RecordingStart():
-                self._recording = True
+                self._recording, self._replaying = True, False  # the server ends the one for the other
             case RecordingStop():
                 self._recording = False
             case ReplayStart():
-                self._replaying, self._replay = True, (0, reply.total_frames)
+                self._recording = False
+                self._replaying, self._replay = reply.total_frames > 0, (0, reply.total_frames)
             case ReplayStop():
                 self._replaying = False
             case _:
@@ -475,6 +481,36 @@ class Desk:
             if self._replaying and reply.replay.current_frame >= reply.replay.total_frames - 1:
                 self._running = False
         return {"time": reply.time, "step": reply.step}
+
+    async def seek(self, viewer: Viewer, frame: int) -> tuple[int, int]:
+        """Go to a frame of the replay, and return the one reached and how many there are.
+
+        No op does that. A replay goes on by what is stepped, though, and begins where it is started: to go back it is
+        started again. The plugin's plays by itself and says not where it is.
+
+        Raises:
+            NotDriving: Somebody else has the controls.
+            ValueError: No replay runs, or the server does not say where it is.
+            URLabError: As the client raises.
+        """
+        if not self._replaying or self._replay is None or self.client.step_mode is not StepMode.DIRECT:
+            raise ValueError("no replay runs in mode direct")
+        self.lease.use(viewer)
+        at, total = self._replay
+        frame = min(max(frame, 0), total - 1)
+        if frame < at:
+            self._follow(ReplayStart(), await self.client.call(ReplayStart()))
+            at = 0
+        for _ in range(_SEEK_STEPS):
+            if at >= frame:
+                break
+            reply = await self.client.step(frame - at)
+            if reply.replay is None:
+                raise ValueError("this server does not say where its replay is")
+            at = reply.replay.current_frame
+            self._replay = at, total
+        self.tell()
+        return self._replay
 
     async def run(self, viewer: Viewer, running: bool) -> None:
         """Let physics run, or stop it, in whatever mode; everybody may stop it.

@@ -193,6 +193,7 @@ _PATHS: dict[str, Any] = {
     "/api/ctrl": _path("post", "ctrl", "Set set-points: `{articulation: {actuator: value}}`. Needs the controls."),
     "/api/run": _path("post", "run", "Let physics run or stop it: `{running: bool}`. Everybody may stop it."),
     "/api/step": _path("post", "step_many", "Step in direct mode: `{n_steps: int}`. Needs the controls."),
+    "/api/replay": _path("post", "seek", "Go to a frame of the replay: `{frame: int}`. Needs the controls."),
     "/api/lease": {
         **_path("post", "take_controls", "Take the controls, or keep them."),
         **_path("delete", "release_controls", "Give the controls back."),

@@ -1,6 +1,6 @@
 // The bar at the top: connection, age, time, play and stop, modes, who drives.
 
-import { $, duration, h, number, text, toast } from "./dom.js";
+import { $, choices, duration, h, text, toast } from "./dom.js";
 import { ask, clock, on, op } from "./link.js";
 
 export const now = { status: null, state: null, socket: false };
@@ -93,8 +93,8 @@ export function makeBar() {
   on("state", (state) => { now.state = state; });
   on("world", async ({ world }) => {
     const answer = world.playing ? await op("list_keyframes", {}, { quiet: true }) : null;
-    ui.keyframe.replaceChildren(h("option", { value: "" }, "start"),
-      ...(answer?.keyframes ?? []).filter((key) => key.name).map((key) => h("option", {}, key.name)));
+    const names = (answer?.keyframes ?? []).map((key) => key.name).filter(Boolean);
+    choices(ui.keyframe, [["", "start"], ...names.map((name) => [name, name])]);
   });
   setInterval(() => {
     if (now.state) {

@@ -13,6 +13,15 @@ export function h(tag, attributes = {}, ...children) {
   return element;
 }
 
+/** Fill a list of choices, `[value, text]` each, and keep what is chosen; one that is the same is left alone. */
+export function choices(select, wanted) {
+  const before = [...select.options].map((option) => [option.value, option.text]);
+  if (JSON.stringify(before) === JSON.stringify(wanted)) return;
+  const chosen = select.value;
+  select.replaceChildren(...wanted.map(([value, shown]) => h("option", { value }, shown)));
+  if (wanted.some(([value]) => value === chosen)) select.value = chosen;
+}
+
 export const $ = (id) => document.getElementById(id);
 
 /** Change text only when it differs: the page is written to sixty times a second. */

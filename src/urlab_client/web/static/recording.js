@@ -1,7 +1,7 @@
 // Recording joint states, and playing them back.
 
-import { $, h, text, toast } from "./dom.js";
-import { on, op } from "./link.js";
+import { $, choices, h, text, toast } from "./dom.js";
+import { ask, on, op } from "./link.js";
 import { now, run } from "./bar.js";
 
 const record = h("button", { id: "record", onclick: toggle }, "● Record");
@@ -10,8 +10,12 @@ const play = h("button", { id: "replay", onclick: replay }, "▶ Replay");
 const save = h("button", { class: "quiet", onclick: saveAs }, "Save");
 const load = h("button", { class: "quiet", onclick: loadFrom }, "Load");
 const file = h("input", { placeholder: "recording.json", "aria-label": "File on the server", size: 12 });
-const line = h("progress", { max: 1, value: 0, "aria-label": "Place in the recording" });
-const frame = h("span", { class: "num" });
+const line = h("input", { id: "timeline", type: "range", min: 0, max: 1, step: 1, value: 0, disabled: true, oninput: () => seek(+line.value),
+  "aria-label": "Place in the recording", title: "Drag to go to another place while it is replayed" });
+const frame = h("span", { class: "num", id: "frame" });
+let before = null; // the mode to go back to
+let wanted = null;
+let seeking = false;
 
 async function toggle() {
   if (now.status?.recording) {
@@ -24,11 +28,30 @@ async function toggle() {
 async function replay() {
   if (now.status?.replaying) {
     await op("replay_stop");
+    if (before && before !== now.status.mode) await op("set_mode", { mode: before });
+    before = null;
     return;
   }
   if (sessions.value && (await op("replay_set_active", { name: sessions.value })) === null) return;
-  if (now.status?.mode === "live" && (await op("set_mode", { mode: "direct" })) === null) return;
-  if (await op("replay_start")) run(true);
+  before = now.status?.mode ?? null;
+  if (before === "live" && (await op("set_mode", { mode: "direct" })) === null) return;
+  const answer = await op("replay_start");
+  if (answer && !answer.total_frames) toast("This recording is empty.");
+  else if (answer) run(true);
+}
+
+/** Go to a place; of those asked for while one is on its way, the newest. */
+async function seek(to) {
+  wanted = to;
+  text(frame, `${to + 1} / ${+line.max + 1}`);
+  if (seeking) return;
+  seeking = true;
+  while (wanted !== null) {
+    const next = wanted;
+    wanted = null;
+    await ask("POST", "api/replay", { frame: next });
+  }
+  seeking = false;
 }
 
 async function saveAs() {
@@ -42,9 +65,7 @@ async function loadFrom() {
 
 async function refresh() {
   const answer = await op("replay_list_sessions", {}, { quiet: true });
-  const chosen = sessions.value;
-  sessions.replaceChildren(...(answer?.sessions ?? []).map((name) => h("option", {}, name)));
-  if (chosen) sessions.value = chosen;
+  choices(sessions, (answer?.sessions ?? []).map((name) => [name, name]));
 }
 
 export function makeRecording() {
@@ -59,8 +80,11 @@ export function makeRecording() {
     text(play, status.replaying ? "■ Stop replay" : "▶ Replay");
     const [at, total] = status.replay ?? [0, 0];
     line.max = Math.max(1, total - 1);
-    line.value = at;
-    text(frame, total ? `${at + 1} / ${total}` : "");
+    line.disabled = !status.replaying;
+    if (!seeking && !line.matches(":active")) {
+      line.value = at;
+      text(frame, total ? `${at + 1} / ${total}` : "");
+    }
     line.parentElement.hidden = !total;
   });
 }

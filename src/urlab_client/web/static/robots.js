@@ -14,7 +14,9 @@ function share(value, [low, high]) {
 class Robot {
   constructor(art) {
     this.key = art.key;
+    this.shape = shape(art);
     this.rows = [];
+    this.boxes = [];
     const joints = art.joints.filter((joint) => joint.kind === "hinge" || joint.kind === "slide");
     const driven = new Set(art.actuators.map((actuator) => actuator.joint));
     this.element = h("section", { class: "card robot", "data-robot": art.key },
@@ -79,8 +81,16 @@ class Robot {
       const value = art.controller.params[gain]?.[actuator.name];
       const box = h("input", { type: "number", min: 0, step: "any", value: value ?? "", "aria-label": `${gain} of ${actuator.name}`,
         disabled: value === undefined, "data-gain": `${gain}/${actuator.name}` });
-      box.addEventListener("change", () => op("configure_controller",
-        { articulation: this.key, params: { [gain]: { [actuator.name]: +box.value } } }));
+      let known = box.value;
+      const take = (params) => {
+        known = String(params[gain]?.[actuator.name] ?? "");
+        if (document.activeElement !== box) box.value = known;
+      };
+      box.addEventListener("change", async () => {
+        const body = { articulation: this.key, params: { [gain]: { [actuator.name]: +box.value } } };
+        if (box.value === "" || (await op("configure_controller", body)) === null) box.value = known;
+      });
+      this.boxes.push(take);
       return h("td", {}, box);
     })));
     return h("table", { class: "gains" }, head, ...rows);
@@ -121,6 +131,11 @@ class Robot {
       "What a policy on the server reads as its command. It moves nothing by itself.")));
   }
 
+  /** Take over what may change while the robot stays the same; not what somebody is typing. */
+  update(art) {
+    for (const take of this.boxes) take(art.controller?.params ?? {});
+  }
+
   draw(state) {
     for (const row of this.rows) row(state);
   }
@@ -134,13 +149,22 @@ export function makeRobots() {
   on("world", ({ world }) => {
     const open = new Set([...document.querySelectorAll(".robot details[open]")].map(place));
     const before = document.querySelector(".robot") !== null;
-    robots = world.articulations.map((art) => new Robot(art));
+    const old = robots;
+    robots = world.articulations.map((art) => old.find((robot) => robot.shape === shape(art)) ?? new Robot(art));
+    robots.forEach((robot, i) => robot.update(world.articulations[i]));
+    if (old.length === robots.length && old.every((robot, i) => robot === robots[i])) return;
     $("robots").replaceChildren(...robots.map((robot) => robot.element));
     if (before) for (const details of document.querySelectorAll(".robot details")) details.open = open.has(place(details));
   });
   on("state", (state) => {
     for (const robot of robots) if (state.articulations[robot.key]) robot.draw(state.articulations[robot.key]);
   });
+}
+
+/** What a robot's panel is built of; the rest is values. */
+function shape(art) {
+  const { controller, ...rest } = art;
+  return JSON.stringify([rest, controller && [controller.kind, GAINS.map((gain) => Object.keys(controller.params[gain] ?? {}))]]);
 }
 
 const place = (details) => `${details.closest(".robot").dataset.robot}/${details.firstChild.textContent}`;

@@ -1,6 +1,6 @@
 // The level: what stands in it, spawning, moving, removing; and what touches what.
 
-import { $, h, number, text, toast } from "./dom.js";
+import { $, choices, h, number, text, toast } from "./dom.js";
 import { on, op } from "./link.js";
 import { fold } from "./robots.js";
 
@@ -13,6 +13,7 @@ function xyz(values) {
   return values.map((value, i) => h("input", { type: "number", step: 0.1, value: +value.toFixed(3), "aria-label": "xyz"[i] }));
 }
 
+const rows = new Map();
 const read = (inputs) => inputs.map((input) => +input.value || 0);
 
 function done(answer) {
@@ -27,15 +28,38 @@ async function refresh() {
   ]);
   $("scene").classList.toggle("empty", !list);
   if (!list) return;
-  actors.replaceChildren(...list.actors.map(row));
-  const chosen = blueprint.value;
-  blueprint.replaceChildren(...(blueprints?.blueprints ?? []).map((one) => h("option", { value: one.class_path }, one.short_name)));
-  if (chosen) blueprint.value = chosen;
+  const seen = new Set();
+  list.actors.forEach((actor, i) => {
+    const key = JSON.stringify([actor.name, actor.actor_id]);
+    seen.add(key);
+    if (!rows.has(key)) rows.set(key, new Row(actor));
+    const row = rows.get(key);
+    row.update(actor);
+    if (actors.children[i] !== row.element) actors.insertBefore(row.element, actors.children[i] ?? null);
+  });
+  for (const [key, row] of rows) {
+    if (seen.has(key)) continue;
+    row.element.remove();
+    rows.delete(key);
+  }
+  choices(blueprint, (blueprints?.blueprints ?? []).map((one) => [one.blueprint_class_path, one.blueprint_short_name]));
 }
 
-function row(actor) {
+/** One actor of the list; it stays while the actor does, so that nobody loses what they are typing. */
+class Row {
+  constructor(actor) {
+    this.where = xyz(actor.location);
+    this.element = actorRow(actor, this.where);
+  }
+
+  update(actor) {
+    if (this.where.includes(document.activeElement)) return;
+    this.where.forEach((input, i) => { input.value = +actor.location[i].toFixed(3); });
+  }
+}
+
+function actorRow(actor, where) {
   const target = actor.actor_id ? { target: actor.actor_id } : { target: actor.name, target_by: "actor_name" };
-  const where = xyz(actor.location);
   return h("div", { class: "actor", "data-actor": actor.actor_id || actor.name },
     h("span", { class: "name", title: actor.name }, actor.actor_id || actor.name,
       h("span", { class: "tag" }, actor.is_light ? "light" : actor.is_articulation ? "robot" : "mesh")),
