@@ -88,8 +88,8 @@ FRAMES_DEADLINE_S: Final = 30.0
 
 _PROBE_DEADLINE_S: Final = 60.0
 
-_SLICES: Final = 20
-_STACKS: Final = 10
+_SLICES: Final = 16
+_STACKS: Final = 8
 """How finely round shapes are drawn when it has to be fast; MuJoCo's own numbers are 28 and 16."""
 
 _OPAQUE: Final = np.array(0xFF000000, "<u4")
