@@ -1,8 +1,8 @@
 """A server that answers at once over shared memory, and over ZeroMQ what is not for shared memory, in a child process.
 
 With a doorbell it sleeps until it is rung, unless requests follow each other quickly, as `urlab serve` does. Without
-one it is like the plugin and looks every 100 microseconds. It can also write pictures into a camera region, as many as
-it is told. The child is this very file run as a script; it ends when its standard input closes.
+one it is like the plugin and looks every 100 microseconds. It can also write pictures into a camera region, as often
+as it is told. The child is this very file run as a script; it ends when its standard input closes.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _PR_SET_TIMERSLACK = 29
 
 @contextlib.contextmanager
 def memory_server(
-    answers: Mapping[str, bytes], directory: Path, *, bell: bool, camera: tuple[str, int, int] | None = None
+    answers: Mapping[str, bytes], directory: Path, *, bell: bool, camera: tuple[str, int, int, float] | None = None
 ) -> Iterator[int]:
     """Run the server; yield its port.
 
@@ -41,7 +41,7 @@ def memory_server(
         answers: Reply by op; `hello` is made to point at `directory`.
         directory: Where the regions go.
         bell: Whether to have a doorbell.
-        camera: File name, width and height of a camera whose pictures are written all the time.
+        camera: File name, width, height and pictures per second of a camera that is written all the time.
     """
     hello = msgspec.msgpack.decode(answers["hello"]) | {"shm_session_dir": str(directory), "manager_present": True}
     material = dict(answers) | {"hello": msgspec.msgpack.encode(hello)}
@@ -97,22 +97,22 @@ class _Memory:
         return True
 
 
-def _write_pictures(directory: Path, camera: tuple[str, int, int]) -> None:
-    file, width, height = camera
+def _write_pictures(directory: Path, camera: tuple[str, int, int, float]) -> None:
+    file, width, height, rate = camera
     region = _region(directory / file, shm.camera_stride(width, height))
     pictures = [bytes([i]) * (width * height * 4) for i in range(4)]
     due = time.perf_counter()
     while True:
         for picture in pictures:
             region.publish(picture)
-            due += 1 / 2000
+            due = max(due + 1 / rate, time.perf_counter())  # what was missed is not made up for
             time.sleep(max(0.0, due - time.perf_counter()))
 
 
 def _main() -> None:
     stdin = sys.stdin.buffer
     material = stdin.read(int.from_bytes(stdin.read(8), "big"))
-    kinds = tuple[dict[str, bytes], str, bool, tuple[str, int, int] | None]
+    kinds = tuple[dict[str, bytes], str, bool, tuple[str, int, int, float] | None]
     by_name, folder, bell, camera = msgspec.msgpack.decode(material, type=kinds)
     answers = {name.encode(): reply for name, reply in by_name.items()}
     directory = Path(folder)

@@ -340,7 +340,9 @@ class ZmqTransport:
         elif value == _MECHANISM_MISMATCH:
             why, hint = "the server uses no CURVE keys", "Leave out server_key, or start the server with --server-key."
         elif self._keys is not None and self._rejections >= _CERTAIN:
-            why, hint = "the server does not have the key it should have", "Compare with: urlab keys show FILE."
+            # A server without keys that is first to notice may cut the line before it can be told from one with others.
+            why = "the server does not have the key it should have, or uses no CURVE keys"
+            hint = "Compare with: urlab keys show FILE."
         else:
             return
         self._given_up = event is not zmq.Event.HANDSHAKE_FAILED_NO_DETAIL
