@@ -212,7 +212,7 @@ def encode_reply(reply: Struct, *, json: bool = False) -> bytes:
         widen(reply)
     if not json:
         return _encoder.encode(reply)
-    plain = msgspec.to_builtins(reply, builtin_types=(bytes,), enc_hook=_to_wire)
+    plain = msgspec.to_builtins(reply, builtin_types=(bytes, msgspec.Raw), enc_hook=_to_wire)
     return msgspec.json.encode(_spelled(plain))
 
 
