@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -54,16 +55,30 @@ def numbers_of(frame: bytes) -> list[object]:
     return walk(msgspec.msgpack.decode(frame))
 
 
+def plain(value: Any) -> Any:
+    """Return a reply without structs, arrays and what stays encoded."""
+    match value:
+        case msgspec.Struct():
+            return plain({name: getattr(value, name) for name in value.__struct_fields__})
+        case dict():
+            return {key: plain(item) for key, item in value.items()}
+        case list() | tuple() | np.ndarray():
+            return [plain(item) for item in value]
+        case msgspec.Raw():
+            return None
+        case _:
+            return value
+
+
 @pytest.mark.parametrize("name", OPS_BY_NAME)
 @pytest.mark.parametrize("json", [False, True])
 def test_every_reply_survives_the_wire(name: str, json: bool) -> None:
     op = OPS[name]
     reply = filled(op.reply)
-    plain = msgspec.to_builtins(reply, enc_hook=lambda a: a.tolist(), builtin_types=(bytes,))
-    frame = encode_reply(reply, json=json)
-    decoded = decode_reply(op, op.reply, frame)
+    before = plain(reply)
+    decoded = decode_reply(op, op.reply, encode_reply(reply, json=json))
     assert type(decoded) is op.reply
-    assert msgspec.to_builtins(decoded, enc_hook=lambda a: a.tolist(), builtin_types=(bytes,)) == plain
+    assert plain(decoded) == before
 
 
 @pytest.mark.parametrize("name", OPS_BY_NAME)

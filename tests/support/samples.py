@@ -28,6 +28,8 @@ def sample(kind: Any) -> Any:
             return 0.5
         case msgspec.inspect.BytesType():
             return b"\x00\xffbytes"
+        case msgspec.inspect.RawType():
+            return msgspec.Raw(msgspec.msgpack.encode("text"))
         case msgspec.inspect.CustomType():
             return np.array([0.25, -1.0])
         case msgspec.inspect.TupleType(item_types=items):

@@ -42,6 +42,7 @@ MAX_REQUEST_BYTES = 64 * 1024 * 1024
 MAX_REPLY_BYTES = 2 * 1024 * 1024 * 1024
 
 _BINARY_SUFFIX = "__b64__"
+_COPY_SUFFIX = "_base64"  # a second copy of what is there as binary; see `HelloOk.mjb_base64`
 
 R = TypeVar("R", bound=Reply)
 Buffer = bytes | bytearray | memoryview
@@ -196,6 +197,7 @@ def _restore_binary(value: Any) -> Any:
             if key.endswith(_BINARY_SUFFIX) and isinstance(item, str)
             else _restore_binary(item)
             for key, item in items
+            if not (key.endswith(_COPY_SUFFIX) and key.removesuffix(_COPY_SUFFIX) + _BINARY_SUFFIX in value)
         }
     if isinstance(value, list):
         return [_restore_binary(item) for item in cast("list[Any]", value)]
@@ -221,7 +223,7 @@ def _spelled(value: Any) -> Any:
     match value:
         case dict():
             items = cast("dict[str, Any]", value).items()
-            return {f"{key}{_BINARY_SUFFIX}" if _is_binary(item) else key: _spelled(item) for key, item in items}
+            return {f"{key}{_BINARY_SUFFIX}" if isinstance(item, bytes) else key: _spelled(item) for key, item in items}
         case list():
             return [_spelled(item) for item in cast("list[Any]", value)]
         case msgspec.Raw():
@@ -232,10 +234,6 @@ def _spelled(value: Any) -> Any:
             return msgspec.Raw(b"%.17g" % value)
         case _:
             return value  # what is not finite becomes null: the plugin's JSON would be invalid
-
-
-def _is_binary(value: Any) -> bool:
-    return isinstance(value, bytes) and not isinstance(value, msgspec.Raw)  # which is a kind of bytes
 
 
 # Widening integers. Structs declare counters as `int` for the people who read them, the wire wants float64. Which
