@@ -228,6 +228,27 @@ def test_gains_last_as_long_as_the_run(quadruped: URLabClient) -> None:
     assert {name: dict(controller.params[name]) for name in before} == before
 
 
+def test_stepping_by_hand_is_the_same(quadruped: URLabClient) -> None:
+    robot = quadruped.articulations["quadruped"]
+    ends: list[list[float]] = []
+    policy = policy_of(WALK, lambda seen: seen[:2])
+    run_blocking(quadruped, policy, seconds=0.4)
+    ends.append(robot.qpos_array.tolist())
+
+    before = {name: dict(values) for name, values in robot.controller.params.items() if isinstance(values, dict)}
+    robot.controller.set_gains(**policy.bind(robot).gains())
+    robot.ctrl_array[:] = 0.0
+    quadruped.reset()
+    policy.reset()
+    for _ in range(20):
+        policy.act(robot)
+        quadruped.step(policy.spec.decimation)
+    ends.append(robot.qpos_array.tolist())
+    robot.controller.set_gains(**before)
+    assert ends[0] == ends[1]
+    assert ends[0][0] != 0.0
+
+
 def test_a_clients_own_pd_law_moves_a_robot_as_the_servers_does(quadruped: URLabClient) -> None:
     wave = [np.array([np.sin(n), np.cos(2 * n)]) for n in range(20)]
     ends = []
@@ -334,7 +355,6 @@ def test_a_fall_is_counted_and_the_robot_starts_again(quadruped: URLabClient) ->
 
 
 async def test_in_live_mode_actions_keep_the_pace_of_the_simulation(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("urlab_client.integrations.policy.runner._STANDSTILL_S", 0.3)
     times: list[float] = []
     async with aio.URLabClient(QUADRUPED, step_mode="live") as client:
         await client.discover()
@@ -346,6 +366,7 @@ async def test_in_live_mode_actions_keep_the_pace_of_the_simulation(monkeypatch:
         assert np.diff(times).min() > 0
         assert client.articulations["quadruped"].get_qpos()["FL_thigh"] == pytest.approx(0.5, abs=0.15)
 
+        monkeypatch.setattr("urlab_client.integrations.policy.runner._STANDSTILL_S", 0.3)
         tasks: list[asyncio.Task[Any]] = []
         loop = asyncio.get_running_loop()
 

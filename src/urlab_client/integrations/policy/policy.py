@@ -91,8 +91,6 @@ class Policy:
                     raise PolicyFileError(
                         f"{network.path} has {there} {kind}, but {self.source} declares {declared} ({key})."
                     )
-        if mapping.action_size != len(self._action):
-            self.reset()
         self._robot, self._mapping = robot, mapping
         return mapping
 
