@@ -101,7 +101,7 @@ def test_a_run_is_recorded_and_told_as_a_table(capsys: pytest.CaptureFixture[str
     assert urlab(arguments) == 0
     said = capsys.readouterr().out
     assert "quadruped, direct mode, 1.0 s of simulation" in said
-    assert "actions/s" in said
+    assert "steps/s" in said
     table = read_run(tmp_path / "walk.mcap").table()
     assert table.columns["quadruped/qpos"].values[-1][0] > 0.1
     assert urlab(arguments) == 2

@@ -9,6 +9,7 @@ import sys
 from collections.abc import AsyncGenerator, Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
+from urllib.parse import urlencode
 
 import msgspec
 import numpy as np
@@ -193,8 +194,8 @@ def _where(arguments: RunPolicyArguments, policy: Policy) -> tuple[str, str | No
         return arguments.address, arguments.robot
     model = arguments.robot or policy.spec.robot
     actor = Path(model).stem  # what a server calls the actor of a file
-    controller = f"?controller={actor}=pd" if policy.spec.action.via == "controller" else ""
-    return f"sim://{model}{controller}", actor
+    options = {"controller": f"{actor}=pd"} if policy.spec.action.via == "controller" else {}
+    return f"sim://{model}{'?' if options else ''}{urlencode(options)}", actor
 
 
 def _others(policy: Policy) -> dict[str, Policy]:
@@ -247,7 +248,9 @@ def _print(runs: dict[str, PolicyRun]) -> None:
         show_edge=False,
     )
     table.add_column("outputs")
-    for heading in ("mean\nreward", "forward\n(m)", "velocity\nerror (m/s)", "falls", "late\nactions", "actions/s"):
+    live = last.step_mode is StepMode.LIVE
+    speed = "late\nactions" if live else "physics\nsteps/s"
+    for heading in ("mean\nreward", "forward\n(m)", "velocity\nerror (m/s)", "falls", "actions/s", speed):
         table.add_column(heading, justify="right")
     for name, found in runs.items():
         table.add_row(
@@ -256,8 +259,8 @@ def _print(runs: dict[str, PolicyRun]) -> None:
             f"{found.forward:.2f}",
             f"{found.velocity_error:.3f}",
             str(found.falls),
-            str(found.late) if found.step_mode is StepMode.LIVE else "",
             f"{found.actions / found.wall_time:.0f}",
+            str(found.late) if live else f"{found.steps_per_second:.0f}",
         )
     console = Console()
     (console if console.is_terminal else Console(width=100)).print(table)

@@ -217,7 +217,7 @@ class _Run:
         self._result = PolicyRun(articulation=robot.prefix, step_mode=client.step_mode)
         self._rewards = 0.0
         self._squared_error = 0.0
-        self._velocity: Floats = np.zeros(2)
+        self._velocity: Floats = np.zeros(2)  # commanded minus actual, smoothed
         self._start: Floats = np.zeros(3)
         self._heading: Floats = np.array([1.0, 0.0])
         self._travelled = (0.0, 0.0)
@@ -230,7 +230,7 @@ class _Run:
         if self._live:
             await client.runtime.set_paused(False)
         started = loop.time()
-        while result.sim_time < seconds - period / 2:
+        while not result.actions or result.sim_time < seconds - period / 2:
             last_action = self._policy.action
             if self._live:
                 await self._live_action()
@@ -242,16 +242,14 @@ class _Run:
             if self._mapping.fallen(RobotState.of(self._robot)):
                 result.falls += 1
                 await self._restart()
-        if not result.falls:
-            result.upright_time = result.sim_time
         return result
 
     async def _restart(self) -> None:
         """Put the simulation at its start; the policy forgets."""
         self._travelled = (self._result.distance, self._result.forward)
-        self._robot.ctrl_array[self._mapping.ctrl] = self._mapping.targets(np.zeros(self._mapping.action_size))
         await self._client.reset(self._policy.spec.keyframe)
         self._policy.reset()
+        self._velocity = np.zeros(2)
         self._last_time = self._began = self._client.sim_time
         self._due = self._began
         if self._robot.has_free_base:
@@ -306,7 +304,7 @@ class _Run:
             way = state.qpos[:2] - self._start[:2]
             result.distance = self._travelled[0] + float(np.hypot(*way))
             result.forward = self._travelled[1] + float(way @ self._heading)
-            error = state.linear_velocity[:2] - policy.command[:2]
+            error = policy.command[:2] - state.linear_velocity[:2]
             # Steps make the base sway; what counts is where it goes.
             self._velocity += min(1.0, elapsed / _SMOOTHING_S) * (error - self._velocity)
             self._squared_error += float(self._velocity @ self._velocity)
