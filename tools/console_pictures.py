@@ -22,7 +22,8 @@ from selenium.webdriver.support.ui import WebDriverWait
 
 IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
 FLAGS = (
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+    "--headless", "--no-sandbox", "--disable-quic", "--no-first-run", "--window-size=1440,1000",
+    "--use-angle=swiftshader", "--enable-unsafe-swiftshader",  # the 3-D view, without a graphics card
     "--disable-background-networking", "--disable-component-update", "--disable-sync", "--hide-scrollbars",
 )  # fmt: skip
 SHOTS = {
@@ -66,7 +67,7 @@ def main() -> None:
     folder: Path = parser.parse_args().folder
     with console() as link, browser() as driver:
         driver.get(link)
-        wait = WebDriverWait(driver, 60)
+        wait = WebDriverWait(driver, 120)
 
         def until(script: str) -> None:
             wait.until(lambda d: d.execute_script(f"return {script}"))
@@ -74,6 +75,7 @@ def main() -> None:
         until("document.querySelectorAll('[data-robot]').length == 2")
         driver.execute_script(MOVE)
         driver.execute_script("document.querySelectorAll('#contacts details, .robot details')[0].open = true")
+        until("document.querySelector('.stage iframe')?.contentWindow.eval('currentModelCrc') > 0")
         until("window.moved > 5")
         for name, (width, height, scheme) in SHOTS.items():
             driver.execute_cdp_cmd(
@@ -82,6 +84,7 @@ def main() -> None:
             metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600}
             driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
             until(f"innerWidth == {json.dumps(width)}")
+            driver.execute_script(f"document.querySelector('#view-box').open = {json.dumps(width >= 600)}")
             before = driver.execute_script("return window.moved")
             until(f"window.moved > {before} + 2")
             until("[...document.querySelectorAll('.camera')].some(one => /fps/.test(one.innerText))")

@@ -51,7 +51,7 @@ class Robot {
       // Not while somebody moves it here: what comes is older than what they do.
       if (target != null && performance.now() - held > 700 && !slider.matches(":active")) slider.value = target;
       const where = follows ? state.qpos?.[joint.index] : state.ctrl?.[actuator.index];
-      mark.style.left = `${100 * share(where ?? 0, range)}%`;
+      mark.style.left = `calc(8px + ${share(where ?? 0, range)} * (100% - 16px))`; // as far as the thumb's middle goes
       text(shown, number(where));
     });
     return h("label", { class: "line" }, h("span", { class: "name", title: actuator.kind ?? "" }, actuator.name),
