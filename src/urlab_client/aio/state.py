@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Protocol
 
 import anyio.to_thread
-import msgspec
 import numpy as np
 
 from urlab_client.aio.articulation import URLabArticulation, URLabEntity
@@ -37,6 +36,7 @@ from urlab_client.protocol.errors import (
 )
 from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.protocol.messages.session import (
+    NOT_SENT,
     ArticulationInfo,
     CameraFrame,
     CameraInfo,
@@ -235,7 +235,7 @@ class SimState:
 
     async def adopt(self, hello: HelloOk, *, timeout: Timeout = DEFAULT) -> None:
         """Take over a handshake: load its model, bind the wrappers, bring the server into the wanted step mode."""
-        hello.mjb_base64 = msgspec.Raw()  # it keeps the whole reply in memory
+        hello.mjb_base64 = NOT_SENT  # it keeps the whole reply in memory
         await self.session.transport.follow(hello)
         loaded = None
         if self._local_model:

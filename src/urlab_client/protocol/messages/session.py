@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import msgspec
 from msgspec import Struct
@@ -10,6 +10,7 @@ from msgspec import Struct
 from urlab_client.protocol.base import Floats, QuatWXYZ, Reply, Request, Vec3, doc
 
 __all__ = [
+    "NOT_SENT",
     "ArticulationCommand",
     "ArticulationInfo",
     "ArticulationState",
@@ -37,6 +38,10 @@ __all__ = [
     "StepOk",
     "TwistState",
 ]
+
+
+NOT_SENT: Final = msgspec.Raw()
+"""Stands in an undecoded field for what is not there; a field is left out when it holds this very object."""
 
 
 class ErrorReply(Reply, tag="error", kw_only=True, omit_defaults=True):
@@ -247,7 +252,7 @@ class HelloOk(Reply, tag="hello_ok", kw_only=True, omit_defaults=True):
     mjb_base64: Annotated[
         msgspec.Raw,
         doc("The same bytes as text, sent under msgpack as well; not decoded, as it is larger."),
-    ] = msgspec.Raw()
+    ] = NOT_SENT
     mjb_size: Annotated[int | None, doc("Length of `mjb` in bytes.")] = None
     mjcf_compiled: Annotated[str | None, doc("The model as MJCF, with `include_assets`.")] = None
     vfs_assets: Annotated[dict[str, bytes] | None, doc("Asset bytes by bare file name, with `include_assets`.")] = None
