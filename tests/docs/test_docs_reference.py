@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import re
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import msgspec
 import pytest
 from pages import ROOT
 
@@ -42,15 +44,18 @@ def test_it_is_current() -> None:
 
 
 def test_check_finds_a_stale_file_and_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    output = tmp_path / "reference" / "ops.md"
-    assert gen_docs.main(["--check"], output) == 1
-    assert not output.exists()
+    folder = tmp_path / "reference"
+    assert gen_docs.main(["--check"], folder) == 1
+    assert not folder.exists()
     assert "stale: run python tools/gen_docs.py" in capsys.readouterr().err
-    assert gen_docs.main([], output) == 0
-    assert gen_docs.main(["--check"], output) == 0
-    output.write_text(output.read_text() + "An edit by hand.\n")
-    assert gen_docs.main(["--check"], output) == 1
-    assert output.read_text().endswith("An edit by hand.\n")
+    assert gen_docs.main([], folder) == 0
+    for page in sorted(folder.iterdir()):
+        assert gen_docs.main(["--check"], folder) == 0
+        before = page.read_text()
+        page.write_text(before + "An edit by hand.\n")
+        assert gen_docs.main(["--check"], folder) == 1
+        assert page.read_text().endswith("An edit by hand.\n")
+        page.write_text(before)
 
 
 def test_every_op_has_a_row_of_full_width() -> None:
@@ -81,3 +86,41 @@ def test_an_op_without_a_method_is_refused() -> None:
     op: Any = Elsewhere()
     with pytest.raises(TypeError, match="levitate: RuntimeNamespace has no async method levitate"):
         gen_docs.method(op)
+
+
+@pytest.mark.parametrize("op", OPS.values(), ids=lambda op: op.name)
+def test_every_field_of_an_op_has_a_row_with_type_default_and_meaning(op: Any) -> None:
+    text = (ROOT / "docs" / "reference" / "protocol.md").read_text(encoding="utf-8")
+    section = re.split(r"^##+ ", text.split(f"\n### `{op.name}`\n")[1], flags=re.MULTILINE)[0]
+    request, reply = section.split(f"\nReply `{op.reply_name}`:\n")
+    assert f"Category `{op.needs.value}`." in request
+    assert all(f"`{code}`" in request for code in op.errors)
+    for part, struct in ((request, op.request), (reply, op.reply)):
+        table = [re.split(r"(?<!\\)\|", line)[1:-1] for line in part.splitlines() if line.startswith("| `")]
+        expected = {f.encode_name for f in msgspec.structs.fields(struct)} - {"session_id"}
+        assert {row[0].strip(" `") for row in table} == expected
+        assert all(len(row) == 4 and all(cell.strip() for cell in row) for row in table)
+
+
+PUBLIC = ("urlab_client", "urlab_client.aio", "urlab_client.sync", "urlab_client.server", *gen_docs.around())
+
+
+@pytest.mark.parametrize("module", PUBLIC)
+def test_every_public_name_is_in_the_reference(module: str) -> None:
+    # mkdocstrings fills in what these lines name, and the strict build of the site fails where it finds nothing.
+    pages = sorted((ROOT / "docs" / "reference").glob("*.md"))
+    lines = [line for page in pages for line in re.findall(r"^::: (\S+)$", page.read_text("utf-8"), re.MULTILINE)]
+    assert len(set(lines)) == len(lines), "something is in the reference twice"
+    in_tables = {cls.__name__ for cls in RPC_ERRORS.values()} | {"__version__"}
+    names = {name: where for name, where in gen_docs.exports(module).items() if not name.startswith("pytest_")}
+    missing = [name for name, where in names.items() if where not in lines and name not in in_tables]
+    assert not missing, f"a page in docs/reference lacks {[f'::: {names[name]}' for name in missing]}"
+
+
+def test_where_public_names_are_defined_is_found() -> None:
+    import urlab_client.server
+
+    assert set(gen_docs.exports("urlab_client.server")) == set(urlab_client.server.__all__)
+    for name, where in gen_docs.exports("urlab_client.server").items():
+        module, _, attribute = where.rpartition(".")
+        assert getattr(importlib.import_module(module), attribute) is getattr(urlab_client.server, name)
