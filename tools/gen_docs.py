@@ -37,18 +37,17 @@ client and the simulated server run on. [adding-an-op.md](../adding-an-op.md) sh
 
 LEGEND = """\
 - **Method** is the same in both flavours; the async one is awaited.
-- **Request** gives the fields on the wire; those in [brackets] may be left out. [What travels](protocol.md) has their
-  types, defaults and units, and the reply's fields.
+- **Op** leads to its [fields](protocol.md): types, defaults and units of request and reply, and the codes of its own
+  errors.
 - **Needs**: *nothing*; an *editor* (a packaged build answers `unknown_op`); a running *play* session (else
   `no_active_manager`).
 - **Lost reply**: when the connection breaks after the request was sent, *read* ops are sent again within the same
   deadline; *write* ops raise `OutcomeUnknown` and are never sent twice. See [reliability](../reliability.md).
 - **Timeout**: what a call waits for at least. Where there is none, the client's default holds: `rcv_timeout_ms`,
   5 seconds.
-- **Simulated**: whether the simulated server executes it; otherwise it answers `unsupported`.
 """
 
-ERRORS = "- **Errors**: codes of its own. Any op can get those of the envelope: {}."
+ERRORS = "Besides its own errors any op can answer those of the envelope: {}."
 
 
 BAR = "\\|"
@@ -92,29 +91,18 @@ def method(op: Op) -> str:
     return code(call)
 
 
-def request_fields(op: Op) -> str:
-    import msgspec
-
-    fields = [f for f in msgspec.structs.fields(op.request) if f.name != "session_id"]
-    ordered = sorted(fields, key=lambda field: not field.required)
-    return ", ".join(code(f.encode_name) if f.required else f"[{code(f.encode_name)}]" for f in ordered)
-
-
-def op_rows(ops: Iterable[Op], served: Iterable[str]) -> Iterator[list[str]]:
+def op_rows(ops: Iterable[Op]) -> Iterator[list[str]]:
     from urlab_client.protocol.base import Needs
 
     needs = {Needs.NOTHING: "nothing", Needs.EDITOR: "editor", Needs.MANAGER: "play"}
     for op in ops:
         yield [
-            code(op.name),
+            f"[{code(op.name)}](protocol.md#{op.name})",
             method(op),
             first_sentence(op.request.__doc__),
-            request_fields(op),
             needs[op.needs],
             str(op.effect),
             "" if op.timeout is None else f"{op.timeout:g} s",
-            "yes" if op.name in served else "no",
-            ", ".join(map(code, op.errors)),
         ]
 
 
@@ -154,15 +142,16 @@ def render() -> str:
     namespaces: dict[str, list[Op]] = {}
     for op in OPS.values():
         namespaces.setdefault(op.ns, []).append(op)
-    served = HANDLERS.handlers
+    missing = ", ".join(code(name) for name in OPS if name not in HANDLERS.handlers)
+    served = f"all but {missing}, which it answers with `unsupported`" if missing else "all of them"
     lines = [HEADER, "## Ops", ""]
-    lines.append(f"{len(OPS)} ops, of which the simulated server of this version executes {len(served)}.\n")
+    lines.append(f"{len(OPS)} ops. The simulated server of this version executes {served}.\n")
     envelope = ERRORS.format(", ".join(map(code, ENVELOPE_ERRORS)))
-    lines += [LEGEND + textwrap.fill(envelope, 120, subsequent_indent="  "), ""]
-    head = ["Op", "Method", "What it does", "Request", "Needs", "Lost reply", "Timeout", "Simulated", "Errors"]
+    lines += [LEGEND, textwrap.fill(envelope, 120), ""]
+    head = ["Op", "Method", "What it does", "Needs", "Lost reply", "Timeout"]
     for namespace, ops in namespaces.items():
         lines += [f"### {code(f'client.{namespace}' if namespace else 'client')}", ""]
-        lines += [*table(head, op_rows(ops, served)), ""]
+        lines += [*table(head, op_rows(ops)), ""]
     lines += [
         "## Errors that a server answers",
         "",
@@ -225,7 +214,7 @@ def wire_type(hint: Any, structs: list[type[Any]]) -> str:
             structs.append(hint)
         name = f"[{hint.__name__}](#{hint.__name__.lower()})"
     else:
-        name = PLAIN[hint]
+        name = "anything" if hint is msgspec.Raw else PLAIN[hint]
     return name
 
 
@@ -241,7 +230,8 @@ def default(field: Any) -> str:
     if field.required:
         return "required"
     value = field.default if field.default is not msgspec.NODEFAULT else field.default_factory()
-    return "absent" if value is None else code(json.dumps(msgspec.to_builtins(value)))
+    nothing = value is None or isinstance(value, msgspec.Raw)
+    return "absent" if nothing else code(json.dumps(msgspec.to_builtins(value)))
 
 
 def field_table(struct: type[Any], structs: list[type[Any]]) -> Iterator[str]:
