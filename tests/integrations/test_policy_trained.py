@@ -19,7 +19,7 @@ from urlab_client.integrations.policy import OnnxNetwork, PolicyFileError, load,
 ROOT = Path(__file__).parents[2]
 NETWORK = ROOT / "examples/policies/quadruped.onnx"
 QUADRUPED = "sim://quadruped?controller=quadruped=pd"
-SECONDS = 6.0
+SECONDS = 4.0
 
 
 def run_policy(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
