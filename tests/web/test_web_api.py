@@ -239,6 +239,8 @@ def test_the_viewer_gets_the_model_and_the_state_that_is_shown(http: TestClient)
     parts = [http.get(f"/viewer/model?offset_bytes={at}&size_bytes={half + 1}").content for at in (0, half + 1)]
     binary, *_ = state_payload.parse_model_bundle(b"".join(parts))
     assert len(b"".join(parts)) == size
+    assert http.get("/viewer/model?offset_bytes=half").status_code == 400
+    assert http.get("/viewer/model?crc32=1").status_code == 404
     with (
         http.websocket_connect("ws://localhost/viewer/state") as viewer,
         http.websocket_connect("ws://localhost/api/live") as live,

@@ -141,7 +141,7 @@ class _Site:
 
         return [
             Route("/viewer/", page),
-            Route("/viewer/model", self._model),
+            Route("/viewer/model", _answering(self._model)),
             WebSocketRoute("/viewer/state", self._poses),
             WebSocketRoute("/viewer/ui", self._taken),
             Mount("/viewer/assets", _Checked(directory=shipped.assets)),
@@ -369,8 +369,9 @@ class _Site:
                 tasks.cancel_scope.cancel()
 
     async def _taken(self, socket: WebSocket) -> None:
-        await socket.accept()
-        await socket.close(studio.TAKEN, "this page watches")
+        with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # gone already
+            await socket.accept()
+            await socket.close(studio.TAKEN, "this page watches")
 
     # Viewers
 
