@@ -111,6 +111,7 @@ def test_openapi_describes_every_op_that_is_served(http: TestClient) -> None:
     speed = document["components"]["schemas"]["SetSimSpeed"]
     assert speed["required"] == ["percent"]
     assert set(speed["properties"]) == {"percent"}
+    assert set(document["components"]["schemas"]["BeginPieOk"]["properties"]) == {"op", "state", "compile_error"}
     named = json.dumps(document).split('"#/components/schemas/')[1:]
     assert {part.partition('"')[0] for part in named} <= set(document["components"]["schemas"])
 

@@ -30,6 +30,14 @@ __all__ = ["encode", "openapi", "parse", "perform", "served"]
 
 _UNSERVED = frozenset({Hello})  # the application holds the session
 
+# The handshake in it is the application's, too.
+_STARTED = msgspec.defstruct(
+    BeginPieOk.__name__,
+    [(one.name, one.type) for one in msgspec.structs.fields(BeginPieOk) if one.name != "handshake_payload"],
+    tag_field="op",
+    tag=BeginPieOk.__struct_config__.tag,
+)
+
 
 def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray):
@@ -103,7 +111,8 @@ def _controller(client: URLabClient, key: str) -> URLabController | None:
 def openapi() -> bytes:
     """Return the OpenAPI 3.1 document of the whole HTTP API."""
     ops = [op for op in OPS.values() if op.request not in _UNSERVED]
-    structs = [struct for op in ops for struct in (op.request, op.reply)]
+    replies = [_STARTED if op.reply is BeginPieOk else op.reply for op in ops]
+    structs = [*(op.request for op in ops), *replies]
     _, components = msgspec.json.schema_components(
         structs, schema_hook=_array_schema, ref_template="#/components/schemas/{name}"
     )
