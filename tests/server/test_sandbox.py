@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import struct
 from collections.abc import Callable, Iterator
@@ -11,6 +12,8 @@ from typing import Any
 import pytest
 from wire import Wire
 
+from urlab_client import ImportFailed, URLabTimeoutError
+from urlab_client.aio import URLabClient
 from urlab_client.server import Limits, SimulatedServer
 
 Serve = Callable[..., Wire]
@@ -217,3 +220,26 @@ def test_pictures_of_a_model_that_lie_about_their_size(count: int, wire: Wire, f
     model = folder / "root" / "lies.xml"
     model.write_text('<mujoco><asset><texture name="t" type="2d" file="lies.png"/></asset></mujoco>')
     assert "lies" in refusal(wire, model)
+
+
+async def test_physics_and_streams_go_on_while_a_model_compiles(folder: Path) -> None:
+    bomb = folder / "root" / "slow.xml"
+    bomb.write_text(f"<mujoco>{HUNGRY['replicate']}</mujoco>")
+    limits = Limits(model_cpu_s=2, model_wall_s=30)
+    async with (
+        SimulatedServer("arm", play=True, unpaused=True, model_roots=[bomb.parent], limits=limits) as server,
+        URLabClient(**server.client_options(), step_mode="live") as client,
+    ):
+        await client.discover()
+        compiling = asyncio.create_task(client.scene.import_xml(str(bomb), timeout=60))
+        await asyncio.sleep(0)  # it has its turn before the next call
+        with pytest.raises(URLabTimeoutError, match="another call held"):
+            await client.scene.current_level(timeout=0.1)
+        async with client.state_stream("all") as states:
+            for _ in range(20):
+                await states.receive()
+        assert client.connected
+        assert not compiling.done()
+        with pytest.raises(ImportFailed, match="the limit model_"):
+            await compiling
+        await client.scene.current_level()
