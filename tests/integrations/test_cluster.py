@@ -145,6 +145,19 @@ async def test_a_killed_worker_loses_and_doubles_no_episode(expected: dict[int, 
     assert gone(tmp_path / "killed")
 
 
+def test_tasks_give_the_same_episodes_and_are_run_again_by_ray(expected: dict[int, Any], tmp_path: Path) -> None:
+    import ray
+
+    from urlab_client.cluster import run_episode
+
+    task = ray.remote(run_episode).options(num_cpus=1, max_retries=1)
+    policy = dies_once(tmp_path / "killed")
+    got = ray.get([task.remote(policy, "sim://arm", i, **OPTIONS) for i in range(3)], timeout=90)
+    for i, episode in enumerate(got):
+        same(episode, expected[i])
+    assert gone(tmp_path / "killed")
+
+
 def test_a_lease_comes_back_from_a_killed_worker(cluster: Any, tmp_path: Path) -> None:
     from urlab_client.cluster import LeaseLost, LeasePool, rollouts
 

@@ -1,4 +1,4 @@
-"""Rollouts on a Ray cluster: episodes run by actors, each on a simulated server of its own or on a leased address.
+"""Rollouts on a Ray cluster: episodes by actors or tasks, each on a simulated server of its own or a leased address.
 
 Needs the extra `ray`. The driver calls `ray.init()` before anything here.
 """
@@ -12,5 +12,16 @@ for _module in ("ray", "gymnasium"):
 from urlab_client.cluster.episodes import Episode, Policy, RolloutError  # noqa: E402
 from urlab_client.cluster.leases import Lease, LeaseLost, LeasePool  # noqa: E402
 from urlab_client.cluster.rollouts import Rollouts, rollouts  # noqa: E402
+from urlab_client.cluster.worker import run_episode  # noqa: E402
 
-__all__ = ["Episode", "Lease", "LeaseLost", "LeasePool", "Policy", "RolloutError", "Rollouts", "rollouts"]
+__all__ = [
+    "Episode",
+    "Lease",
+    "LeaseLost",
+    "LeasePool",
+    "Policy",
+    "RolloutError",
+    "Rollouts",
+    "rollouts",
+    "run_episode",
+]

@@ -8,16 +8,17 @@ import sys
 import time
 from collections.abc import Mapping
 from importlib import import_module
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from urlab_client.cluster.episodes import Episode, Job, Policy
+from urlab_client.cluster.episodes import Episode, Job, Policy, seed_of
 from urlab_client.cluster.leases import Lease
 from urlab_client.integrations.gym.env import URLabEnv
 from urlab_client.sync.client import URLabClient
 
-__all__ = ["Worker"]
+__all__ = ["Worker", "run_episode"]
 
 _ray: Any = import_module("ray")  # Any: Ray's hints leave every remote call unknown
 
@@ -55,10 +56,16 @@ class Worker:
                 try:
                     return self._run(policy, job, lease)
                 finally:
-                    self._close()  # before somebody else gets the address
+                    self.close()  # before somebody else gets the address
         except BaseException:
-            self._close()  # the next attempt starts afresh
+            self.close()  # the next attempt starts afresh
             raise
+
+    def close(self) -> None:
+        """End the simulated server. Idempotent."""
+        env, self._env = self._env, None
+        if env is not None:
+            env.close()
 
     def _run(self, policy: Policy, job: Job, lease: Lease | None) -> Episode:
         started, clock = time.time(), time.perf_counter()
@@ -98,7 +105,7 @@ class Worker:
     def _environment(self, address: str) -> URLabEnv:
         if self._env is not None and self._address == address:
             return self._env
-        self._close()
+        self.close()
         client = URLabClient(address, **self._client_options)
         try:
             client.discover()
@@ -109,7 +116,40 @@ class Worker:
         self._address = address
         return self._env
 
-    def _close(self) -> None:
-        env, self._env = self._env, None
-        if env is not None:
-            env.close()
+
+def run_episode(
+    policy: Policy,
+    scene: str,
+    episode: int,
+    *,
+    seed: int = 0,
+    max_episode_steps: int = 200,
+    env_options: Mapping[str, Any] = MappingProxyType({}),
+    client_options: Mapping[str, Any] = MappingProxyType({}),
+) -> Episode:
+    """Run one episode of a run in this process: as a Ray task, `ray.remote(run_episode).remote(policy, scene, i)`.
+
+    A simulated server is started for it and ended after it. The result has the arrays, bit for bit, of the episode
+    that `rollouts` hands out for the same arguments, so Ray may run the task again wherever it likes.
+
+    Args:
+        policy: See `rollouts`, here and for all other arguments.
+        scene: `sim://MODEL` address.
+        episode: Id of the episode.
+        seed: Seed of the run.
+        max_episode_steps: Actions after which the episode is truncated.
+        env_options: Further options of `URLabEnv`.
+        client_options: Further options of the client.
+
+    Returns:
+        The episode. Its `attempt` is 1: Ray does not say how often it tried.
+
+    Raises:
+        URLabError: The server failed.
+    """
+    worker = Worker({**env_options, "max_episode_steps": max_episode_steps}, client_options, lease_timeout=0.0)
+    job = Job(id=episode, seed=seed_of(seed, episode), scene=scene, attempt=1, holder="", leases=None)
+    try:
+        return worker.run(policy, job)
+    finally:
+        worker.close()
