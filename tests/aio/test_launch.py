@@ -109,6 +109,24 @@ def test_the_server_dies_with_its_client() -> None:
     assert ready, "the server outlived its client by ten seconds"
 
 
+def test_a_blocking_client_starts_servers_under_uvloops_policy() -> None:
+    script = (
+        "import asyncio, os, signal, uvloop, urlab_client\n"
+        "asyncio.set_event_loop_policy(uvloop.EventLoopPolicy())\n"
+        "with urlab_client.URLabClient('sim://ball', step_mode='direct') as client:\n"
+        "    client.discover()\n"
+        "    process = client._aio._transport._process\n"
+        "    os.kill(process.pid, signal.SIGKILL)\n"
+        "    client._portal.call(process.wait())\n"
+        "    client.discover()\n"
+        "    print(process.returncode, client.step().step)\n"
+        "    process = client._aio._transport._process\n"
+        "print(process.returncode)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.stdout.split(), done.returncode) == (["-9", "1", "0"], 0), done.stderr
+
+
 @pytest.mark.parametrize(
     ("address", "arguments"),
     [

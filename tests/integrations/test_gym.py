@@ -48,10 +48,14 @@ def without_advice() -> Iterator[None]:
         yield
 
 
-@pytest.mark.parametrize("space_mode", ["flat", "dict"])
-def test_gymnasiums_checker_finds_nothing(make_env: MakeEnv, space_mode: str) -> None:
+@pytest.mark.parametrize(
+    "options",
+    [{"space_mode": "flat"}, {"space_mode": "dict"}, {"space_mode": "dict", "cameras": ["quadruped/side"]}],
+    ids=["flat", "dict", "cameras"],
+)
+def test_gymnasiums_checker_finds_nothing(make_env: MakeEnv, options: dict[str, Any]) -> None:
     with without_advice():
-        check_env(make_env(space_mode=space_mode, n_substeps=2, reset_noise=0.05), skip_close_check=True)
+        check_env(make_env(n_substeps=2, reset_noise=0.05, **options), skip_close_check=True)
 
 
 @pytest.mark.parametrize("task_id", TASKS)

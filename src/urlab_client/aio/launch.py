@@ -11,8 +11,10 @@ import contextlib
 import logging
 import os
 import signal
+import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Sequence
 from urllib.parse import parse_qsl
 
@@ -73,7 +75,7 @@ class LaunchedTransport:
         self._arguments = serve_arguments(address)
         if shm and not any(argument.startswith("--shm-dir") for argument in self._arguments):
             self._arguments.append(f"--shm-dir={_memory_directory()}")
-        self._process: asyncio.subprocess.Process | None = None
+        self._process: asyncio.subprocess.Process | _Watched | None = None
         self._drain: asyncio.Task[None] | None = None
         self._inner: ZmqTransport | None = None
         self._state_port: int | None = None
@@ -156,9 +158,7 @@ class LaunchedTransport:
         if self._closed:
             raise ClientClosed(f"The client of {self._address} is closed.", hint="Make a new client.")
         command = [sys.executable, "-m", "urlab_client", "serve", *_DEFAULTS, *self._arguments]
-        process = await asyncio.create_subprocess_exec(
-            *command, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE
-        )
+        process = await _start(command)
         self._process = process
         try:
             line = await self._first_line(process, op)
@@ -175,7 +175,7 @@ class LaunchedTransport:
         self._state_port = ready.state_port
         return transport
 
-    async def _first_line(self, process: asyncio.subprocess.Process, op: Op) -> bytes:
+    async def _first_line(self, process: asyncio.subprocess.Process | _Watched, op: Op) -> bytes:
         """Return the ready line, or raise what the server said instead."""
         output, errors = process.stdout, process.stderr
         if output is None or errors is None:
@@ -194,6 +194,64 @@ class LaunchedTransport:
         )
 
 
+async def _start(command: Sequence[str]) -> asyncio.subprocess.Process | _Watched:
+    pipe = subprocess.PIPE
+    if sys.platform != "win32" and sys.version_info < (3, 12):
+        try:
+            asyncio.get_event_loop_policy().get_child_watcher()
+        except NotImplementedError:
+            if isinstance(asyncio.get_running_loop(), asyncio.SelectorEventLoop):
+                process = _Watched(subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe))  # noqa: ASYNC220, S603
+                try:
+                    await process.connect()
+                except BaseException:
+                    process.kill()
+                    raise
+                return process
+    return await asyncio.create_subprocess_exec(*command, stdin=pipe, stdout=pipe, stderr=pipe)
+
+
+class _Watched:
+    """A process whose end a thread waits for; what is used of `asyncio.subprocess.Process`.
+
+    Up to Python 3.11 asyncio's own loop starts processes only with a child watcher of the loop policy, and uvloop's
+    policy has none.
+    """
+
+    def __init__(self, process: subprocess.Popen[bytes]) -> None:
+        self.pid = process.pid
+        self.stdin = process.stdin
+        self.stdout = asyncio.StreamReader()
+        self.stderr = asyncio.StreamReader()
+        self._process = process
+        self._loop = asyncio.get_running_loop()
+        self._ended = asyncio.Event()
+        threading.Thread(target=self._watch, name="urlab-server-end", daemon=True).start()
+
+    async def connect(self) -> None:
+        """Make the pipes readable."""
+        for reader, pipe in ((self.stdout, self._process.stdout), (self.stderr, self._process.stderr)):
+            await self._loop.connect_read_pipe(lambda reader=reader: asyncio.StreamReaderProtocol(reader), pipe)
+
+    @property
+    def returncode(self) -> int | None:
+        """The exit code; None while the process runs."""
+        return self._process.returncode
+
+    def kill(self) -> None:
+        """Kill the process."""
+        self._process.kill()
+
+    async def wait(self) -> None:
+        """Wait for the end."""
+        await self._ended.wait()
+
+    def _watch(self) -> None:
+        self._process.wait()
+        with contextlib.suppress(RuntimeError):  # the loop is closed
+            self._loop.call_soon_threadsafe(self._ended.set)
+
+
 def _memory_directory() -> str:
     """Return where regions are best: in memory, where the system has a directory there."""
     memory = "/dev/shm"  # noqa: S108 - the server makes a directory of its own in it, for its user alone
@@ -206,7 +264,7 @@ _DEFAULTS: Sequence[str] = (
 )  # fmt: skip
 
 
-def _kill(process: asyncio.subprocess.Process) -> None:
+def _kill(process: asyncio.subprocess.Process | _Watched) -> None:
     if process.returncode is not None:
         return
     if sys.platform == "win32":

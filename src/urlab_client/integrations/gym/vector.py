@@ -208,6 +208,7 @@ class URLabVectorEnv(Vectorized):
             if isinstance(result, TimeoutError) and not isinstance(result, URLabError):
                 results[i] = TimeoutError(f"environment {i} did not answer within {self._step_timeout:g} s")
             elif isinstance(result, Exception):
+                result.add_note(f"environment {i} at {self._sessions[i].address}")
                 results[i] = result
             elif isinstance(result, BaseException):
                 raise result
