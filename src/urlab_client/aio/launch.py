@@ -198,7 +198,7 @@ async def _start(command: Sequence[str]) -> asyncio.subprocess.Process | _Watche
     pipe = subprocess.PIPE
     if sys.platform != "win32" and sys.version_info < (3, 12):
         try:
-            asyncio.get_event_loop_policy().get_child_watcher()
+            asyncio.get_event_loop_policy().get_child_watcher()  # pyright: ignore[reportDeprecated] - not there
         except NotImplementedError:
             if isinstance(asyncio.get_running_loop(), asyncio.SelectorEventLoop):
                 process = _Watched(subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe))  # noqa: ASYNC220, S603
