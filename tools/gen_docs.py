@@ -36,7 +36,7 @@ client and the simulated server run on. [adding-an-op.md](../adding-an-op.md) sh
 """
 
 LEGEND = """\
-- **Method** is the same in both flavours; the async one is awaited.
+- **Method**, of what the heading says, is the same in both flavours; the async one is awaited.
 - **Op** leads to its [fields](protocol.md): types, defaults and units of request and reply, and the codes of its own
   errors.
 - **Needs**: *nothing*; an *editor* (a packaged build answers `unknown_op`); a running *play* session (else
@@ -83,7 +83,7 @@ def method(op: Op) -> str:
         name = call.rpartition(".")[2].removesuffix("()")
     else:
         owner, name = flavour.URLabClient, op.method
-        call = ".".join(part for part in ("client", op.ns, f"{op.method}()") if part)
+        call = f"{op.method}()"
         if op.ns:
             owner = get_type_hints(getattr(owner, op.ns).fget)["return"]
     if not inspect.iscoroutinefunction(getattr(owner, name, None)):

@@ -1,0 +1,33 @@
+"""Every picture on the pages is made by a script of the repository, and every one that is made is on a page."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from pathlib import Path
+
+from pages import ROOT, pages, prose
+
+BY_HAND = {"layers.svg", "request.svg"}
+"""Drawings that are text: their source is what is shown."""
+
+
+def made() -> dict[str, tuple[str, str]]:
+    spec = importlib.util.spec_from_file_location("pictures", ROOT / "tools" / "pictures.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.PICTURES
+
+
+def test_every_picture_has_a_script() -> None:
+    shown = {Path(name).name for page in pages() for name in re.findall(r"!\[[^]]*\]\(([^)]+)\)", prose(page))}
+    assert {path.name for path in (ROOT / "docs" / "images").iterdir()} == shown
+    assert shown - BY_HAND == set(made()), "enter what makes a picture in tools/pictures.py"
+
+
+def test_the_scripts_make_what_they_are_said_to() -> None:
+    for name, (script, left) in made().items():
+        source = (ROOT / script).read_text(encoding="utf-8")
+        assert f'"{left or Path(name).stem}' in source or f'"{name}"' in source, f"{script} does not speak of {name}"
