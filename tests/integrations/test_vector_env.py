@@ -105,6 +105,7 @@ def test_a_killed_server_is_reported_by_index_and_replaced_while_the_others_go_o
     assert truncated.tolist() == [True, False]
     assert not terminated.any()
     assert isinstance(infos["error"][0], urlab_client.URLabConnectionError)
+    assert infos["error"][0].__notes__[-1] == "environment 0 at sim://arm"
     assert infos["_error"].tolist() == [True, False]
     assert infos["step_count"][1] == 2
     assert np.isfinite(observations).all()
