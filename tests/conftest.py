@@ -9,19 +9,27 @@ from hypothesis import settings
 settings.register_profile("urlab", deadline=None)
 settings.load_profile("urlab")
 
-HAS_RAY = importlib.util.find_spec("ray") is not None
+# Marker of the tests that need an extra which the test command does not install -> its modules, and what to install.
+OPTIONAL = {"ray": (("ray",), "ray"), "view": (("foxglove", "rerun"), "foxglove,rerun")}
+
+MISSING = {
+    marker: extras
+    for marker, (modules, extras) in OPTIONAL.items()
+    if any(importlib.util.find_spec(module) is None for module in modules)
+}
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out what needs Ray where it is not installed: counted as deselected. CI has a step that installs it."""
-    if HAS_RAY:
-        return
-    left_out = [item for item in items if item.get_closest_marker("ray")]
+    """Leave out what needs such an extra where it is not installed: counted as deselected. CI has steps for them."""
+    left_out = [item for item in items if any(item.get_closest_marker(marker) for marker in MISSING)]
     if left_out:
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if item not in left_out]
 
 
-def pytest_report_header() -> str | None:
+def pytest_report_header() -> list[str]:
     """Say what is left out."""
-    return None if HAS_RAY else "tests marked `ray` are deselected: pip install -e '.[ray]' to run them"
+    return [
+        f"tests marked `{marker}` are deselected: pip install -e '.[{extras}]' to run them"
+        for marker, extras in MISSING.items()
+    ]

@@ -100,6 +100,12 @@ def test_code_that_needs_ray_runs(page: Path, tmp_path: Path) -> None:
     run_python(page, python_blocks(page, "needs: ray"), tmp_path, **environment)
 
 
+@pytest.mark.view
+@pytest.mark.parametrize("page", sorted({block.page for block in marked("needs: view")}), ids=shown)
+def test_code_that_needs_rerun_or_foxglove_runs(page: Path, tmp_path: Path) -> None:
+    run_python(page, python_blocks(page, "needs: view"), tmp_path)
+
+
 @pytest.mark.parametrize("page", sorted({block.page for block in marked("test")}), ids=shown)
 def test_marked_tests_pass(page: Path, tmp_path: Path) -> None:
     for block in marked("test"):
@@ -134,7 +140,7 @@ def test_no_block_is_left_out() -> None:
         kind = block.directive.partition(":")[0]
         if block.language == "python":
             assert kind in {"", "test", "needs", "use", "append", "insert", "shows"}, f"{block} does not run"
-            assert kind != "needs" or block.directive == "needs: ray", f"{block}: nothing runs it"
+            assert kind != "needs" or block.directive in {"needs: ray", "needs: view"}, f"{block}: nothing runs it"
         elif block.language == "text":
             assert kind in {"as is", "append"}, f"{block} is nobody's output: say why, `<!-- as is: REASON -->`"
         else:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 # Examples that need an extra which the test command does not install, by the marker of their tests.
-MARKED = {"ray_rollouts": pytest.mark.ray}
+MARKED = {"ray_rollouts": pytest.mark.ray, "view_rerun": pytest.mark.view}
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.py"))
 

@@ -24,9 +24,7 @@ from mcap.reader import make_reader
 
 import urlab_client
 from urlab_client.aio import URLabClient as AsyncClient
-from urlab_client.integrations.record import RecordingError, Run, read_run, record
-from urlab_client.integrations.record import writer as writing
-from urlab_client.integrations.record.messages import (
+from urlab_client.integrations.feed.messages import (
     ArticulationMessage,
     CameraCalibration,
     CompressedImage,
@@ -37,6 +35,8 @@ from urlab_client.integrations.record.messages import (
     encode,
     schema_of,
 )
+from urlab_client.integrations.record import RecordingError, Run, read_run, record
+from urlab_client.integrations.record import writer as writing
 from urlab_client.integrations.record.reader import _state
 from urlab_client.server import SimulatedServer
 

@@ -13,7 +13,21 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
 
-from urlab_client.cli import console, convert, demo, doctor, info, keys, ping, plot, record, run_policy, serve, snapshot
+from urlab_client.cli import (
+    console,
+    convert,
+    demo,
+    doctor,
+    info,
+    keys,
+    ping,
+    plot,
+    record,
+    run_policy,
+    serve,
+    snapshot,
+    view,
+)
 from urlab_client.cli._arguments import Parser
 from urlab_client.cli._failure import CommandError, one_line
 from urlab_client.protocol.errors import URLabError
@@ -60,7 +74,7 @@ def _parser() -> Parser:
     )
     parser.add_argument("--version", action="version", version=f"urlab_client {version('urlab-client')}")
     commands = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND", required=True)
-    for module in (serve, console, ping, doctor, demo, keys, snapshot, record, info, convert, plot, run_policy):
+    for module in (serve, console, ping, doctor, demo, keys, snapshot, record, info, convert, plot, run_policy, view):
         module.add_parser(commands)
     return parser
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-import logging
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -12,21 +10,14 @@ from typing import Literal, Self, overload
 
 import anyio.to_thread
 
-from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient as AsyncClient
-from urlab_client.aio.state import SimState
-from urlab_client.integrations.record.scene import Scene
-from urlab_client.integrations.record.writer import Picture, RecorderStats, Schedule, State, WriterOptions, WriterThread
-from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.errors import ClientClosed, StreamOverflow, URLabError
-from urlab_client.protocol.messages.session import ResetOk, StateReply, StepOk
-from urlab_client.protocol.messages.streams import StateSnapshot
+from urlab_client.integrations.feed.follower import Follower
+from urlab_client.integrations.record.writer import RecorderStats, WriterOptions, WriterThread
+from urlab_client.protocol.errors import ClientClosed, URLabError
 from urlab_client.sync._portal import Portal, aio_of
 from urlab_client.sync.client import URLabClient
 
 __all__ = ["AsyncRecorder", "Recorder", "record"]
-
-log = logging.getLogger("urlab_client.record")
 
 _MIB = 1 << 20
 _LIVE_ITEMS = 10_000
@@ -47,20 +38,13 @@ class AsyncRecorder:
         pose_hz: float,
         options: Callable[[], WriterOptions],
     ) -> None:
-        self._client = client
-        self._state: SimState = client._state  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
-        self._wanted_cameras = cameras
-        self._camera_ns = round(_NS / camera_hz)
-        self._pictures = Schedule(self._camera_ns)
-        self._needs_model = pose_hz > 0
+        needs = ", or pass pose_hz=0" if pose_hz > 0 else None
+        self._follower = Follower(
+            client, name=f"record {path}", cameras=cameras, camera_hz=camera_hz, needs_model=needs, buffer=_LIVE_ITEMS
+        )
         self._options = options
         self._path = path
         self._writer: WriterThread | None = None
-        self._scene: Scene | None = None
-        self._described: object = None
-        self._expected = False
-        self._tasks: list[asyncio.Task[None]] = []
-        self._live = False
 
     @property
     def path(self) -> Path:
@@ -82,26 +66,20 @@ class AsyncRecorder:
     async def __aenter__(self) -> Self:
         if self._writer is not None:
             raise URLabError("A recorder records once.", hint="Call record() again.")
-        if self._state.hello is None:
-            raise URLabError(
-                "record: what there is to record is not known yet.", hint="Call discover() first, during play."
-            )
-        self._current()
+        self._follower.check()
         self._writer = WriterThread(self._path, self._options())
         await anyio.to_thread.run_sync(self._writer.open)
-        self._state.observers.append(self)
-        if self._state.mode is StepMode.LIVE:
-            self._listen()
+        self._follower.start(self._writer.put)
         return self
 
     async def __aexit__(
         self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self._detach()
-        for outcome in await asyncio.gather(*self._tasks, return_exceptions=True):
-            if isinstance(outcome, Exception):
-                log.warning("%s: a stream was not recorded to its end: %s", self._path, outcome)
+        self._follower.detach()
         writer = self._writer
+        if writer is not None:
+            writer.end()  # from here on it finishes the file, whatever becomes of the caller
+        await self._follower.ended()
         if writer is None:
             return
         try:
@@ -112,148 +90,9 @@ class AsyncRecorder:
 
     def finish(self) -> None:
         """Finish the file when the client's loop is gone already. Blocks."""
-        if self in self._state.observers:
-            self._state.observers.remove(self)
+        self._follower.forget()
         if self._writer is not None:
             self._writer.close()
-
-    # What the client calls
-
-    def on_state(self, reply: StateReply | StateSnapshot) -> None:
-        """Take a state over; see `StateObserver`."""
-        live = self._state.mode is StepMode.LIVE
-        if live is not self._live:
-            if live:
-                self._listen()
-            else:
-                self._ignore()
-        if not live:
-            self._put(reply)
-
-    def wanted_pictures(self, asked: bool | dict[str, str | None], n_steps: int) -> bool | dict[str, str | None]:
-        """Add the cameras to a step when their next picture is due; see `StateObserver`."""
-        state = self._state
-        if state.mode is StepMode.LIVE or not self._wanted_cameras:
-            return asked
-        timestep = 0.0 if state.mirror.model is None else state.mirror.model.opt.timestep
-        then = round((state.sim_time + max(n_steps, 1) * timestep) * _NS)
-        self._expected = self._pictures.due(then)
-        if asked is True or not self._expected:
-            return asked
-        chosen = dict(asked or {})
-        known = {id(state.camera(name)) for name in chosen}
-        for view, camera in self._current().cameras.items():
-            if view not in known:
-                chosen[camera.name] = "sync"
-        return chosen or False
-
-    # Inside
-
-    def _current(self) -> Scene:
-        """Return the scene, described anew when there was another handshake."""
-        model = self._state.mirror.model
-        if self._scene is None or model is not self._described:
-            self._described = model
-            try:
-                self._scene = self._describe()
-            except (KeyError, URLabError) as error:
-                if self._scene is None:
-                    raise
-                # The client goes on, and so does the recording, with what it knows.
-                log.warning("%s: the new scene lacks what is recorded: %s", self._path, error)
-        return self._scene
-
-    def _describe(self) -> Scene:
-        state = self._state
-        if self._needs_model and state.mirror.model is None:
-            raise URLabError(
-                "record: poses are computed with the local model, and there is none.",
-                hint="Call discover() during play, with local_model=True, or pass pose_hz=0.",
-            )
-        return Scene.of(state, self._views())
-
-    def _views(self) -> list[tuple[str, URLabCameraView]]:
-        state = self._state
-        every = {
-            f"{key}/{name}": view for key, art in state.articulations.items() for name, view in art.cameras.items()
-        }
-        every |= dict(state.global_cameras)
-        if self._wanted_cameras == "all":
-            return list(every.items())
-        names = {id(view): name for name, view in every.items()}
-        chosen: dict[int, tuple[str, URLabCameraView]] = {}
-        for wanted in self._wanted_cameras:
-            view = state.camera(wanted)
-            if view is None:
-                raise KeyError(f"no camera {wanted!r}; there are: {', '.join(every) or 'none'}")
-            chosen[id(view)] = names[id(view)], view
-        return list(chosen.values())
-
-    def _put(self, reply: StateReply | StateSnapshot) -> None:
-        writer = self._writer
-        if writer is None:
-            return
-        state, scene = self._state, self._current()
-        clock, wall = reply.sim_time, reply.wall_time
-        nanoseconds = round(reply.time * _NS) if clock is None else clock.sec * _NS + clock.nsec
-        wall_ns = state.recv_wall_time_ns if wall is None else wall.sec * _NS + wall.nsec
-        set_points = {key: record.ctrl.tolist() for key, record in state.records.items()}
-        writer.put(State(scene, reply, set_points, nanoseconds, isinstance(reply, ResetOk), wall_ns))
-        if isinstance(reply, StepOk) and reply.cameras and self._expected:
-            self._expected = False
-            for name, frame in reply.cameras.items():
-                camera = scene.cameras.get(id(state.camera(name)))
-                if camera is not None:
-                    writer.put(Picture(camera, frame, nanoseconds, wall_ns))
-
-    def _listen(self) -> None:
-        """Follow the streams, as live mode brings nothing by replies."""
-        self._live = True
-        scene = self._current()
-        self._tasks = [asyncio.create_task(self._follow_states(), name="urlab-record")]
-        self._tasks += [asyncio.create_task(self._follow_camera(view), name="urlab-record") for view in scene.cameras]
-
-    def _ignore(self) -> None:
-        self._live = False
-        for task in self._tasks:
-            task.cancel()
-
-    def _detach(self) -> None:
-        if self in self._state.observers:
-            self._state.observers.remove(self)
-        self._ignore()
-        if self._writer is not None:
-            self._writer.end()  # from here on it finishes the file, whatever becomes of the caller
-
-    async def _follow_states(self) -> None:
-        last: float | None = None
-        async with self._client.state_stream("all", buffer=_LIVE_ITEMS, timeout=None) as states:
-            while True:
-                try:
-                    snapshot = await states.receive(timeout=None)
-                except StreamOverflow as lost:
-                    log.warning("%s: %s", self._path, lost)
-                    continue
-                except ClientClosed:
-                    return
-                if (
-                    self._state.mode is StepMode.LIVE and snapshot.time != last
-                ):  # while paused the same state comes with every tick
-                    last = snapshot.time
-                    self._put(snapshot)
-
-    async def _follow_camera(self, identity: int) -> None:
-        camera = self._current().cameras[identity]
-        schedule = Schedule(self._camera_ns)
-        async with camera.view.frames("latest", timeout=None) as frames:
-            while True:
-                try:
-                    sample = await frames.receive(timeout=None)
-                except ClientClosed:
-                    return
-                nanoseconds = round((self._state.sim_time if sample.sim_time is None else sample.sim_time) * _NS)
-                if self._writer is not None and schedule.due(nanoseconds):
-                    self._writer.put(Picture(camera, sample.pixels, nanoseconds, sample.recv_wall_time_ns))
 
 
 class Recorder:

@@ -15,34 +15,29 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import IO, cast
 
-import numpy as np
 from mcap.writer import CompressionType, Writer
 from msgspec import Struct
-from PIL import Image
 
-from urlab_client.integrations.record.messages import (
+from urlab_client.integrations.feed.messages import (
     ArticulationMessage,
-    CompressedImage,
     ContactsMessage,
     EntityMessage,
     FrameTransforms,
     GapMessage,
     JointStates,
-    RawImage,
     Time,
     encode,
     schema_name,
     schema_of,
     values,
 )
-from urlab_client.integrations.record.scene import CameraLayout, Scene, Simulation, calibration, to_metadata
-from urlab_client.protocol.enums import CameraMode
+from urlab_client.integrations.feed.samples import Clock, Picture, Schedule, State, picture_message
+from urlab_client.integrations.feed.scene import Scene, Simulation, calibration, to_metadata
 from urlab_client.protocol.errors import URLabError
-from urlab_client.protocol.messages.session import CameraFrame, EntityState, StateReply, StepOk
+from urlab_client.protocol.messages.session import CameraFrame, EntityState, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.protocol.rows import Pixels, decode_camera
 
-__all__ = ["FORMAT", "Picture", "RecorderStats", "RecordingError", "Schedule", "State", "WriterOptions", "WriterThread"]
+__all__ = ["FORMAT", "RecorderStats", "RecordingError", "WriterOptions", "WriterThread"]
 
 log = logging.getLogger("urlab_client.record")
 
@@ -52,33 +47,10 @@ FORMAT = "1"
 _WAKE_S = 0.02  # in batches: a thread that wakes for each state would take the interpreter from who steps each time
 _CHUNK_BYTES = 1 << 20
 _STATE_BYTES = 1 << 10  # what a state is taken to occupy besides its arrays
-_FALLBACK_NS = 1_000_000
 
 
 class RecordingError(URLabError):
     """A recording could not be written to its end, or is not one."""
-
-
-@dataclass(frozen=True, slots=True)
-class State:
-    """One state on its way into the file."""
-
-    scene: Scene
-    reply: StateReply | StateSnapshot
-    set_points: dict[str, list[float]]
-    nanoseconds: int
-    restarts: bool
-    wall_ns: int
-
-
-@dataclass(frozen=True, slots=True)
-class Picture:
-    """One picture on its way into the file; without a time of its own it belongs to the last state before it."""
-
-    camera: CameraLayout
-    frame: CameraFrame | Pixels
-    nanoseconds: int | None
-    wall_ns: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,43 +96,6 @@ class RecorderStats(Struct, kw_only=True, frozen=True):
     dropped_frames: int
     waiting_bytes: int
     file_bytes: int
-
-
-class Schedule:
-    """Says when something is due that happens at most once in each period of simulation time."""
-
-    def __init__(self, period_ns: int) -> None:
-        self._period = period_ns
-        self._slack = period_ns // 100  # times are rounded on their way
-        self._next = 0
-
-    def due(self, now: int) -> bool:
-        """Return whether it is due at `now`, nanoseconds, and wait for the next period if so."""
-        now += self._slack
-        if self._next - self._period <= now < self._next:
-            return False
-        self._next = now - now % self._period + self._period  # also when time was set back
-        return True
-
-
-@dataclass(slots=True)
-class _Clock:
-    """The recording's clock: simulation time that goes on where a reset sets it back."""
-
-    offset: int = 0
-    last: int | None = None
-    sim: int = 0
-    step: int = _FALLBACK_NS
-    episode: int = 0
-
-    def advance(self, sim: int, restarts: bool) -> int:
-        if self.last is not None and (restarts or sim < self.sim):
-            self.offset = self.last + self.step - sim
-            self.episode += 1
-        elif sim > self.sim:
-            self.step = sim - self.sim
-        self.sim, self.last = sim, self.offset + sim
-        return self.last
 
 
 class WriterThread:
@@ -324,7 +259,7 @@ class _Sink:
     options: WriterOptions
     states: int = 0
     frames: int = 0
-    _clock: _Clock = field(default_factory=_Clock)
+    _clock: Clock = field(default_factory=Clock)
     _schemas: dict[type[Struct], int] = field(default_factory=dict[type[Struct], int])
     _topics: dict[tuple[str, str], _Topic] = field(default_factory=dict[tuple[str, str], _Topic])
     _scene: Scene | None = None
@@ -424,36 +359,11 @@ class _Sink:
         sim = clock.sim if item.nanoseconds is None else item.nanoseconds
         now = max(0, clock.offset + sim)
         stamp, topic = Time.of(now), f"/camera/{camera.name}"
-        pixels = (
-            decode_camera(item.frame.data, camera.view.mode, item.frame.width, item.frame.height).pixels
-            if isinstance(item.frame, CameraFrame)
-            else item.frame
-        )
-        height, width = pixels.shape[:2]
-        if pixels.dtype == np.float32:
-            depths = np.ascontiguousarray(pixels, "<f4").tobytes()
-            message: Struct = RawImage(stamp, camera.name, width, height, "32FC1", 4 * width, depths)
-        else:
-            lossy = camera.view.mode == CameraMode.REAL and self.options.image_format == "jpeg"
-            message = CompressedImage(
-                stamp, camera.name, self._compressed(pixels, camera, lossy), "jpeg" if lossy else "png"
-            )
+        quality = self.options.jpeg_quality if self.options.image_format == "jpeg" else None
         metadata = {"mode": str(camera.view.mode)}
-        self._add(topic, message, now, item.wall_ns, metadata)
+        self._add(topic, picture_message(item, stamp, quality), now, item.wall_ns, metadata)
         self._add(f"{topic}/calibration", calibration(camera, stamp), now, item.wall_ns, {})
         self.frames += 1
-
-    def _compressed(self, pixels: Pixels, camera: CameraLayout, lossy: bool) -> bytes:
-        target = io.BytesIO()
-        if camera.view.mode == CameraMode.REAL:
-            image = Image.fromarray(np.ascontiguousarray(pixels[..., :3]))
-        else:
-            image = Image.fromarray(np.ascontiguousarray(pixels[..., [2, 1, 0, 3]]))
-        if lossy:
-            image.save(target, "JPEG", quality=self.options.jpeg_quality)
-        else:
-            image.save(target, "PNG", compress_level=1)
-        return target.getvalue()
 
     def _use(self, scene: Scene) -> None:
         self._scene = scene

@@ -14,7 +14,7 @@ from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.layout import FREE, ArticulationLayout
 from urlab_client.aio.mirror import model_names
 from urlab_client.aio.state import SimState
-from urlab_client.integrations.record.messages import (
+from urlab_client.integrations.feed.messages import (
     CameraCalibration,
     ContactMessage,
     FrameTransform,
@@ -142,8 +142,6 @@ class Simulation:
         self, articulations: Mapping[str, ArticulationState], entities: Mapping[str, EntityState], *, forces: bool
     ) -> None:
         """Take over a state and compute what follows from it."""
-        import mujoco  # noqa: PLC0415
-
         data = self._data
         for key, state in articulations.items():
             layout = self._scene.layouts.get(key)
@@ -163,12 +161,37 @@ class Simulation:
             elif offsets is not None and entity.qpos is not None and entity.qvel is not None:
                 data.qpos[offsets[0] : offsets[0] + 7] = entity.qpos
                 data.qvel[offsets[1] : offsets[1] + 6] = entity.qvel
+        self._compute(forces)
+
+    def start_from(self, qpos: Floats, qvel: Floats, *, forces: bool) -> None:
+        """Take over whole arrays of joint positions and velocities and compute what follows from them."""
+        self._data.qpos[:], self._data.qvel[:] = qpos, qvel
+        self._compute(forces)
+
+    def _compute(self, forces: bool) -> None:
+        import mujoco  # noqa: PLC0415
+
         if forces:
-            mujoco.mj_forward(self._model, data)
+            mujoco.mj_forward(self._model, self._data)
         else:
-            mujoco.mj_kinematics(self._model, data)
-            mujoco.mj_comPos(self._model, data)
-            mujoco.mj_camlight(self._model, data)
+            mujoco.mj_kinematics(self._model, self._data)
+            mujoco.mj_comPos(self._model, self._data)
+            mujoco.mj_camlight(self._model, self._data)
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The model."""
+        return self._model
+
+    @property
+    def data(self) -> mujoco.MjData:
+        """What was computed last."""
+        return self._data
+
+    @property
+    def bodies(self) -> list[str]:
+        """Name of each body, which is that of its frame."""
+        return self._bodies
 
     def joints(self) -> list[JointState]:
         """Return all named hinge and slide joints."""

@@ -1,0 +1,231 @@
+"""`urlab view`: a simulation shown in MuJoCo's window, in a browser, in Rerun or in Foxglove."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import signal
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from urlab_client.cli import console
+from urlab_client.cli._arguments import Commands, add_keys, port, seconds
+from urlab_client.cli._failure import CommandError
+from urlab_client.cli._mujoco import import_mujoco
+from urlab_client.protocol.enums import StepMode
+
+if TYPE_CHECKING:
+    from urlab_client.aio import URLabClient
+    from urlab_client.integrations.view import AsyncView
+
+__all__ = ["add_parser", "run"]
+
+_LOOK_S = 0.05
+_CONSOLE_PORT = 8355
+_FOXGLOVE_PORT = 8765
+_RERUN_PORT = 9090
+
+
+class ViewArguments(argparse.Namespace):
+    """What the command line says."""
+
+    address: str
+    where: str
+    save: Path | None
+    connect: str | None
+    page: bool
+    step_port: int
+    state_port: int
+    port: int | None
+    step_mode: StepMode
+    seconds: float | None
+    camera: list[str]
+    camera_hz: float
+    sensors: bool
+    max_hz: float
+    server_key: str | None
+    client_key: str | None
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command to the parser."""
+    parser = commands.add_parser(
+        "view",
+        help="see a simulation: MuJoCo's window, a browser, Rerun, Foxglove",
+        description="Show a play session while it goes on. In live mode physics runs by itself and is watched; in "
+        "direct mode this command resets and steps it, with all set-points zero. Opens a session, which takes the "
+        "server over from the client that drives it; a program of your own can call rerun_view(client) and its "
+        "siblings instead. Ctrl-C ends it. --rerun needs the extra 'urlab-client[rerun]', --foxglove "
+        "'urlab-client[foxglove]', --web 'urlab-client[web]'.",
+    )
+    parser.add_argument(
+        "address",
+        nargs="?",
+        default="tcp://localhost",
+        metavar="ADDRESS",
+        help="tcp://HOST, tcp://HOST:PORT or sim://MODEL (default: %(default)s)",
+    )
+    where = parser.add_mutually_exclusive_group()
+    parser.set_defaults(where="viewer")
+    for name, text in (
+        ("viewer", "MuJoCo's own window, which needs a display (default)"),
+        ("web", "the console's page with MuJoCo's web viewer, for browsers"),
+        ("rerun", "Rerun's window; with --save a file, with --connect one elsewhere, with --page a browser's"),
+        ("foxglove", "a server that Foxglove connects to"),
+    ):
+        where.add_argument(f"--{name}", dest="where", action="store_const", const=name, help=text)
+    parser.add_argument("--save", type=Path, metavar="FILE", help="with --rerun: write an .rrd file, show nothing")
+    parser.add_argument("--connect", metavar="URL", help="with --rerun: send to a viewer, rerun+http://HOST:9876/proxy")
+    parser.add_argument("--page", action="store_true", help="with --rerun: serve Rerun's page for browsers")
+    parser.add_argument("--port", type=port, metavar="PORT", help="of what --web, --foxglove or --page serves")
+    parser.add_argument("--step-port", type=port, default=5559, metavar="PORT", help="RPC port (default: %(default)s)")
+    parser.add_argument(
+        "--state-port", type=port, default=5555, metavar="PORT", help="state stream (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--step-mode",
+        type=StepMode,
+        choices=[StepMode.LIVE, StepMode.DIRECT],
+        default=StepMode.LIVE,
+        help="live or direct (default: %(default)s)",
+    )
+    parser.add_argument("--seconds", type=seconds, metavar="S", help="simulated seconds (default: until Ctrl-C)")
+    parser.add_argument(
+        "--camera",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="a camera to show in Rerun or Foxglove, as ARTICULATION/CAMERA, or 'all'; may be repeated",
+    )
+    parser.add_argument(
+        "--camera-hz", type=seconds, default=10.0, metavar="HZ", help="pictures per second (default: %(default)s)"
+    )
+    parser.add_argument("--sensors", action="store_true", help="show sensors' readings in Rerun or Foxglove")
+    parser.add_argument(
+        "--max-hz", type=seconds, default=30.0, metavar="HZ", help="states shown per second (default: %(default)s)"
+    )
+    add_keys(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: ViewArguments) -> int:
+    """Show it until told to stop.
+
+    Raises:
+        CommandError: An option cannot be honoured, or a library is missing.
+    """
+    if arguments.where != "rerun" and (arguments.save or arguments.connect or arguments.page):
+        raise CommandError("--save, --connect and --page go with --rerun")
+    if sum(map(bool, (arguments.save, arguments.connect, arguments.page))) > 1:
+        raise CommandError("give one of --save, --connect and --page")
+    if arguments.where == "web":
+        return console.run(_console_arguments(arguments))
+    if arguments.where == "viewer":
+        from urlab_client.integrations.view.window import missing_for_window  # noqa: PLC0415
+
+        missing = missing_for_window()
+        if missing:
+            raise CommandError(f"{missing}; without a window, use --web, --rerun --page or --foxglove")
+    else:
+        import_mujoco()
+    try:
+        asyncio.run(_view(arguments))
+    except (ImportError, ValueError) as error:
+        raise CommandError(str(error)) from None
+    except KeyError as error:
+        raise CommandError(str(error.args[0])) from None
+    return 0
+
+
+def _console_arguments(arguments: ViewArguments) -> console.ConsoleArguments:
+    if arguments.camera or arguments.sensors or arguments.seconds is not None:
+        raise CommandError("--web shows everything until Ctrl-C: --camera, --sensors and --seconds do not go with it")
+    return console.ConsoleArguments(
+        address=arguments.address,
+        step_port=arguments.step_port,
+        state_port=arguments.state_port,
+        host="127.0.0.1",
+        port=_CONSOLE_PORT if arguments.port is None else arguments.port,
+        allow_host=[],
+        open=False,
+        server_key=arguments.server_key,
+        client_key=arguments.client_key,
+    )
+
+
+async def _view(arguments: ViewArguments) -> None:
+    from urlab_client.aio import URLabClient  # noqa: PLC0415
+
+    client = URLabClient(
+        arguments.address,
+        step_port=arguments.step_port,
+        state_port=arguments.state_port,
+        step_mode=arguments.step_mode,
+        server_key=arguments.server_key,
+        client_key=arguments.client_key,
+    )
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    async with client:
+        await client.discover()
+        if arguments.step_mode is StepMode.DIRECT:
+            await client.reset()
+        view = _make(client, arguments)
+        loop.add_signal_handler(signal.SIGINT, stop.set)
+        try:
+            async with view:
+                print(_said(arguments, view), flush=True)
+                await _until_done(client, view, arguments, stop)
+        finally:
+            loop.remove_signal_handler(signal.SIGINT)
+    if view.error is not None:
+        raise CommandError(f"the view has ended: {view.error}")
+    stats = view.stats
+    print(f"{stats.states} states, {stats.frames} pictures shown; {stats.dropped_states} states left out")
+
+
+def _make(client: URLabClient, arguments: ViewArguments) -> AsyncView:
+    from urlab_client.integrations.view import foxglove_view, rerun_view, window_view  # noqa: PLC0415
+
+    cameras = "all" if "all" in arguments.camera else arguments.camera
+    if arguments.where == "viewer":
+        return window_view(client, max_hz=arguments.max_hz)
+    if arguments.where == "foxglove":
+        return foxglove_view(
+            client,
+            port=_FOXGLOVE_PORT if arguments.port is None else arguments.port,
+            cameras=cameras,
+            camera_hz=arguments.camera_hz,
+            sensors=arguments.sensors,
+            max_hz=arguments.max_hz,
+        )
+    return rerun_view(
+        client,
+        save=arguments.save,
+        connect=arguments.connect,
+        web=arguments.page,
+        web_port=_RERUN_PORT if arguments.port is None else arguments.port,
+        cameras=cameras,
+        camera_hz=arguments.camera_hz,
+        sensors=arguments.sensors,
+        max_hz=arguments.max_hz,
+    )
+
+
+def _said(arguments: ViewArguments, view: AsyncView) -> str:
+    where = arguments.save or arguments.connect or view.address or f"the {arguments.where} window"
+    return f"{arguments.address} is shown: {where}; Ctrl-C ends it."
+
+
+async def _until_done(client: URLabClient, view: AsyncView, arguments: ViewArguments, stop: asyncio.Event) -> None:
+    direct = arguments.step_mode is StepMode.DIRECT
+    if not direct:
+        await client.runtime.set_paused(False)
+    start = client.sim_time
+    while not (stop.is_set() or view.closed):
+        if arguments.seconds is not None and client.sim_time - start >= arguments.seconds - 1e-9:
+            return
+        if direct:
+            await client.step()
+        else:
+            await asyncio.sleep(_LOOK_S)

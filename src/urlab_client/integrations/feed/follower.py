@@ -1,0 +1,231 @@
+"""Follows a client: each state and picture that it gets, by replies or by streams, is handed on."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+from urlab_client.aio.cameras import URLabCameraView
+from urlab_client.aio.client import URLabClient
+from urlab_client.aio.state import SimState
+from urlab_client.integrations.feed.samples import Picture, Schedule, State
+from urlab_client.integrations.feed.scene import Scene
+from urlab_client.protocol.enums import StepMode
+from urlab_client.protocol.errors import ClientClosed, StreamOverflow, URLabError
+from urlab_client.protocol.messages.session import ResetOk, StateReply, StepOk
+from urlab_client.protocol.messages.streams import StateSnapshot
+
+__all__ = ["Follower"]
+
+log = logging.getLogger("urlab_client.feed")
+
+_NS = 1_000_000_000
+
+
+class Follower:
+    """Hands on what a client goes through: by replies in `direct` and `puppet` mode, by the streams in `live` mode.
+
+    Args:
+        client: The client, after `discover()`.
+        name: What this is for, in errors and in the log.
+        cameras: Names of cameras, or `all`.
+        camera_hz: Pictures per second of simulation time, at most.
+        needs_model: What to do where there is no local model, as advice in the error; None if none is needed.
+        buffer: How many published states may wait, so that none is missed; 0 for the newest alone.
+    """
+
+    def __init__(
+        self,
+        client: URLabClient,
+        *,
+        name: str,
+        cameras: Sequence[str] | Literal["all"],
+        camera_hz: float,
+        needs_model: str | None,
+        buffer: int,
+    ) -> None:
+        self._client = client
+        self._state: SimState = client._state  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
+        self._name = name
+        self._wanted_cameras = cameras
+        self._camera_ns = round(_NS / camera_hz)
+        self._pictures = Schedule(self._camera_ns)
+        self._needs_model = needs_model
+        self._buffer = buffer
+        self._put: Callable[[State | Picture], None] | None = None
+        self._scene: Scene | None = None
+        self._described: object = None
+        self._expected = False
+        self._tasks: list[asyncio.Task[None]] = []
+        self._live = False
+
+    def check(self) -> Scene:
+        """Describe what there is.
+
+        Raises:
+            URLabError: Nothing is known yet, or the local model is missing.
+            KeyError: An unknown camera.
+        """
+        if self._state.hello is None:
+            raise URLabError(
+                f"{self._name}: what there is to see is not known yet.", hint="Call discover() first, during play."
+            )
+        return self._current()
+
+    def start(self, put: Callable[[State | Picture], None]) -> None:
+        """Hand on what comes from now on; `put` is called on the event loop and must be quick."""
+        self._put = put
+        self._state.observers.append(self)
+        if self._state.mode is StepMode.LIVE:
+            self._listen()
+
+    def detach(self) -> None:
+        """Hand on nothing more. Idempotent."""
+        self.forget()
+        self._ignore()
+
+    def forget(self) -> None:
+        """Hand on nothing more, when the client's loop is gone already. Idempotent."""
+        if self in self._state.observers:
+            self._state.observers.remove(self)
+        self._put = None
+
+    async def ended(self) -> None:
+        """Wait until nothing of it runs."""
+        for outcome in await asyncio.gather(*self._tasks, return_exceptions=True):
+            if isinstance(outcome, Exception):
+                log.warning("%s: a stream was not followed to its end: %s", self._name, outcome)
+
+    # What the client calls
+
+    def on_state(self, reply: StateReply | StateSnapshot) -> None:
+        """Take a state over; see `StateObserver`."""
+        live = self._state.mode is StepMode.LIVE
+        if live is not self._live:
+            if live:
+                self._listen()
+            else:
+                self._ignore()
+        if not live:
+            self._hand_on(reply)
+
+    def wanted_pictures(self, asked: bool | dict[str, str | None], n_steps: int) -> bool | dict[str, str | None]:
+        """Add the cameras to a step when their next picture is due; see `StateObserver`."""
+        state = self._state
+        if state.mode is StepMode.LIVE or not self._wanted_cameras:
+            return asked
+        timestep = 0.0 if state.mirror.model is None else state.mirror.model.opt.timestep
+        then = round((state.sim_time + max(n_steps, 1) * timestep) * _NS)
+        self._expected = self._pictures.due(then)
+        if asked is True or not self._expected:
+            return asked
+        chosen = dict(asked or {})
+        known = {id(state.camera(name)) for name in chosen}
+        for view, camera in self._current().cameras.items():
+            if view not in known:
+                chosen[camera.name] = "sync"
+        return chosen or False
+
+    # Inside
+
+    def _current(self) -> Scene:
+        """Return the scene, described anew when there was another handshake."""
+        model = self._state.mirror.model
+        if self._scene is None or model is not self._described:
+            self._described = model
+            try:
+                self._scene = self._describe()
+            except (KeyError, URLabError) as error:
+                if self._scene is None:
+                    raise
+                # The client goes on, and so does this, with what it knows.
+                log.warning("%s: the new scene lacks what is followed: %s", self._name, error)
+        return self._scene
+
+    def _describe(self) -> Scene:
+        state = self._state
+        if self._needs_model is not None and state.mirror.model is None:
+            raise URLabError(
+                f"{self._name}: poses are computed with the local model, and there is none.",
+                hint=f"Call discover() during play, with local_model=True{self._needs_model}.",
+            )
+        return Scene.of(state, self._views())
+
+    def _views(self) -> list[tuple[str, URLabCameraView]]:
+        state = self._state
+        every = {
+            f"{key}/{name}": view for key, art in state.articulations.items() for name, view in art.cameras.items()
+        }
+        every |= dict(state.global_cameras)
+        if self._wanted_cameras == "all":
+            return list(every.items())
+        names = {id(view): name for name, view in every.items()}
+        chosen: dict[int, tuple[str, URLabCameraView]] = {}
+        for wanted in self._wanted_cameras:
+            view = state.camera(wanted)
+            if view is None:
+                raise KeyError(f"no camera {wanted!r}; there are: {', '.join(every) or 'none'}")
+            chosen[id(view)] = names[id(view)], view
+        return list(chosen.values())
+
+    def _hand_on(self, reply: StateReply | StateSnapshot) -> None:
+        put = self._put
+        if put is None:
+            return
+        state, scene = self._state, self._current()
+        clock, wall = reply.sim_time, reply.wall_time
+        nanoseconds = round(reply.time * _NS) if clock is None else clock.sec * _NS + clock.nsec
+        wall_ns = state.recv_wall_time_ns if wall is None else wall.sec * _NS + wall.nsec
+        set_points = {key: record.ctrl.tolist() for key, record in state.records.items()}
+        put(State(scene, reply, set_points, nanoseconds, isinstance(reply, ResetOk), wall_ns))
+        if isinstance(reply, StepOk) and reply.cameras and self._expected:
+            self._expected = False
+            for name, frame in reply.cameras.items():
+                camera = scene.cameras.get(id(state.camera(name)))
+                if camera is not None:
+                    put(Picture(camera, frame, nanoseconds, wall_ns))
+
+    def _listen(self) -> None:
+        """Follow the streams, as live mode brings nothing by replies."""
+        self._live = True
+        scene = self._current()
+        self._tasks = [asyncio.create_task(self._follow_states(), name="urlab-feed")]
+        self._tasks += [asyncio.create_task(self._follow_camera(view), name="urlab-feed") for view in scene.cameras]
+
+    def _ignore(self) -> None:
+        self._live = False
+        for task in self._tasks:
+            task.cancel()
+
+    async def _follow_states(self) -> None:
+        last: float | None = None
+        policy = "all" if self._buffer else "latest"
+        async with self._client.state_stream(policy, buffer=max(self._buffer, 1), timeout=None) as states:
+            while True:
+                try:
+                    snapshot = await states.receive(timeout=None)
+                except StreamOverflow as lost:
+                    log.warning("%s: %s", self._name, lost)
+                    continue
+                except ClientClosed:
+                    return
+                if (
+                    self._state.mode is StepMode.LIVE and snapshot.time != last
+                ):  # while paused the same state comes with every tick
+                    last = snapshot.time
+                    self._hand_on(snapshot)
+
+    async def _follow_camera(self, identity: int) -> None:
+        camera = self._current().cameras[identity]
+        schedule = Schedule(self._camera_ns)
+        async with camera.view.frames("latest", timeout=None) as frames:
+            while True:
+                try:
+                    sample = await frames.receive(timeout=None)
+                except ClientClosed:
+                    return
+                nanoseconds = round((self._state.sim_time if sample.sim_time is None else sample.sim_time) * _NS)
+                if self._put is not None and schedule.due(nanoseconds):
+                    self._put(Picture(camera, sample.pixels, nanoseconds, sample.recv_wall_time_ns))

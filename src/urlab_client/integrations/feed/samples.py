@@ -1,0 +1,113 @@
+"""One state, one picture; when something is due; the clock of a run. No I/O."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+
+import numpy as np
+
+from urlab_client.integrations.feed.messages import CompressedImage, RawImage, Time
+from urlab_client.integrations.feed.scene import CameraLayout, Scene
+from urlab_client.protocol.enums import CameraMode
+from urlab_client.protocol.messages.session import CameraFrame, StateReply
+from urlab_client.protocol.messages.streams import StateSnapshot
+from urlab_client.protocol.rows import Pixels, decode_camera
+
+__all__ = ["Clock", "Picture", "Schedule", "State", "compressed", "picture_message"]
+
+_FALLBACK_NS = 1_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """One state on its way to whoever keeps or shows it."""
+
+    scene: Scene
+    reply: StateReply | StateSnapshot
+    set_points: dict[str, list[float]]
+    nanoseconds: int
+    restarts: bool
+    wall_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """One picture on its way likewise; without a time of its own it belongs to the last state before it."""
+
+    camera: CameraLayout
+    frame: CameraFrame | Pixels
+    nanoseconds: int | None
+    wall_ns: int
+
+    def pixels(self) -> Pixels:
+        """Return the picture as an array, as `CameraSample.pixels` is."""
+        frame = self.frame
+        if isinstance(frame, CameraFrame):
+            return decode_camera(frame.data, self.camera.view.mode, frame.width, frame.height).pixels
+        return frame
+
+
+class Schedule:
+    """Says when something is due that happens at most once in each period of simulation time."""
+
+    def __init__(self, period_ns: int) -> None:
+        self._period = period_ns
+        self._slack = period_ns // 100  # times are rounded on their way
+        self._next = 0
+
+    def due(self, now: int) -> bool:
+        """Return whether it is due at `now`, nanoseconds, and wait for the next period if so."""
+        now += self._slack
+        if self._next - self._period <= now < self._next:
+            return False
+        self._next = now - now % self._period + self._period  # also when time was set back
+        return True
+
+
+@dataclass(slots=True)
+class Clock:
+    """The clock of a run: simulation time that goes on where a reset sets it back."""
+
+    offset: int = 0
+    last: int | None = None
+    sim: int = 0
+    step: int = _FALLBACK_NS
+    episode: int = 0
+
+    def advance(self, sim: int, restarts: bool) -> int:
+        """Take the next state's simulation time over, nanoseconds, and return the run's."""
+        if self.last is not None and (restarts or sim < self.sim):
+            self.offset = self.last + self.step - sim
+            self.episode += 1
+        elif sim > self.sim:
+            self.step = sim - self.sim
+        self.sim, self.last = sim, self.offset + sim
+        return self.last
+
+
+def compressed(pixels: Pixels, mode: str, jpeg_quality: int | None) -> bytes:
+    """Return a picture of bytes as JPEG, or as PNG without a quality."""
+    from PIL import Image  # noqa: PLC0415  # whoever shows poses alone does without
+
+    target = io.BytesIO()
+    if mode == CameraMode.REAL:
+        image = Image.fromarray(np.ascontiguousarray(pixels[..., :3]))
+    else:
+        image = Image.fromarray(np.ascontiguousarray(pixels[..., [2, 1, 0, 3]]))
+    if jpeg_quality is not None:
+        image.save(target, "JPEG", quality=jpeg_quality)
+    else:
+        image.save(target, "PNG", compress_level=1)
+    return target.getvalue()
+
+
+def picture_message(picture: Picture, stamp: Time, jpeg_quality: int | None) -> CompressedImage | RawImage:
+    """Return a picture as a message: depths as they are, colours as JPEG if there is a quality, all others as PNG."""
+    pixels, name, mode = picture.pixels(), picture.camera.name, picture.camera.view.mode
+    if pixels.dtype == np.float32:
+        height, width = pixels.shape[:2]
+        depths = np.ascontiguousarray(pixels, "<f4").tobytes()
+        return RawImage(stamp, name, width, height, "32FC1", 4 * width, depths)
+    quality = jpeg_quality if mode == CameraMode.REAL else None
+    return CompressedImage(stamp, name, compressed(pixels, mode, quality), "png" if quality is None else "jpeg")

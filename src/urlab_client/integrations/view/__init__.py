@@ -1,0 +1,12 @@
+"""Seeing a simulation while it goes on: in Rerun, in Foxglove, in MuJoCo's own window.
+
+Rerun needs the extra `rerun`, Foxglove the extra `foxglove`, the window a display. All coordinates are MuJoCo's world:
+metres, right-handed, z up.
+"""
+
+from urlab_client.integrations.view.foxglove_view import foxglove_view
+from urlab_client.integrations.view.rerun_view import rerun_view
+from urlab_client.integrations.view.view import AsyncView, View, ViewStats
+from urlab_client.integrations.view.window import window_view
+
+__all__ = ["AsyncView", "View", "ViewStats", "foxglove_view", "rerun_view", "window_view"]

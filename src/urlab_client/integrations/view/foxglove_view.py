@@ -1,0 +1,377 @@
+"""A view in Foxglove: a WebSocket server that its application connects to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Literal, overload
+
+import numpy as np
+from msgspec import Struct
+
+from urlab_client.aio.client import URLabClient as AsyncClient
+from urlab_client.integrations._extras import need
+from urlab_client.integrations.feed.messages import (
+    ArticulationMessage,
+    ContactsMessage,
+    FrameTransforms,
+    JointStates,
+    Time,
+    encode,
+    schema_name,
+    schema_of,
+    values,
+)
+from urlab_client.integrations.feed.samples import Picture, State, picture_message
+from urlab_client.integrations.feed.scene import Scene, Simulation, calibration, to_metadata
+from urlab_client.integrations.view.geometry import Kind, Shape, shapes_of
+from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewOptions, make_view
+from urlab_client.protocol.errors import URLabError
+from urlab_client.sync.client import URLabClient
+
+if TYPE_CHECKING:
+    import foxglove
+    from foxglove import messages as fox
+    from foxglove.channels import SceneUpdateChannel
+    from foxglove.websocket import ChannelView, Client, WebSocketServer
+
+__all__ = ["foxglove_view"]
+
+_JPEG_QUALITY = 80
+_NEWTON_M = 0.002  # length of a contact's arrow for each newton
+_BACKLOG = 64  # messages that may wait for one browser; older ones are dropped
+
+
+class _Foxglove:
+    """Shows moments to whoever is connected."""
+
+    def __init__(self, *, host: str, port: int, sensors: bool) -> None:
+        self._host, self._port = host, port
+        self._sensors = sensors
+        self._server: WebSocketServer | None = None
+        self._context: foxglove.Context | None = None
+        self._scene_channel: SceneUpdateChannel | None = None
+        self._contact_channel: SceneUpdateChannel | None = None
+        self._channels: dict[tuple[str, str], foxglove.Channel] = {}
+        self._shapes: list[Shape] = []
+        self._last: Moment | None = None
+        self._joined = False
+
+    @property
+    def address(self) -> str:
+        """Where the server listens."""
+        if self._server is None:
+            return ""
+        host = f"[{self._host}]" if ":" in self._host else self._host
+        return f"ws://{host}:{self._server.port}"
+
+    def open(self) -> None:
+        """See `Sink`."""
+        import foxglove  # noqa: PLC0415
+        from foxglove.channels import SceneUpdateChannel  # noqa: PLC0415
+        from foxglove.websocket import ServerListener  # noqa: PLC0415
+
+        sink = self
+
+        class Listener(ServerListener):
+            def on_subscribe(self, client: Client, channel: ChannelView) -> None:
+                del client, channel
+                sink._joined = True
+
+        self._context = foxglove.Context()
+        self._scene_channel = SceneUpdateChannel("/scene", context=self._context)
+        self._contact_channel = SceneUpdateChannel("/contact_markers", context=self._context)
+        try:
+            self._server = foxglove.start_server(
+                name="urlab",
+                host=self._host,
+                port=self._port,
+                context=self._context,
+                server_listener=Listener(),
+                message_backlog_size=_BACKLOG,
+            )
+        except RuntimeError as error:
+            raise URLabError(f"foxglove_view: port {self._port} of {self._host} cannot be used: {error}") from None
+
+    def use(self, simulation: Simulation, scene: Scene) -> None:
+        """See `Sink`."""
+        self._shapes = shapes_of(simulation.model, simulation.bodies)
+        del scene
+        if self._server is not None and self._last is not None:
+            self._server.clear_session()
+        for key in [key for key in self._channels if key[1]]:
+            self._channels.pop(key).close()  # the layout in its metadata is another one now
+        self._joined = True
+
+    def show(self, moment: Moment) -> None:
+        """See `Sink`."""
+        self._last = moment
+        stamp, simulation = Time.of(moment.ns), moment.simulation
+        self._send("/tf", FrameTransforms(simulation.transforms(stamp)), moment.ns)
+        joints = simulation.joints()
+        if joints:
+            self._send("/joint_states", JointStates(stamp, joints), moment.ns)
+        if moment.state is not None:
+            self._send_states(moment, moment.state)
+        if moment.contacts:
+            self._send_contacts(moment)
+
+    def show_picture(self, picture: Picture, ns: int) -> None:
+        """See `Sink`."""
+        stamp, topic = Time.of(ns), f"/camera/{picture.camera.name}"
+        self._send(topic, picture_message(picture, stamp, _JPEG_QUALITY), ns)
+        self._send(f"{topic}/calibration", calibration(picture.camera, stamp), ns)
+
+    def idle(self) -> bool:
+        """See `Sink`."""
+        if self._joined and self._last is not None:
+            self._joined = False
+            self._send_geometry(self._last.ns)
+            self.show(self._last)  # or who joins while time stands still sees nothing
+        return True
+
+    def close(self) -> None:
+        """See `Sink`."""
+        for channel in self._channels.values():
+            channel.close()
+        if self._server is not None:
+            self._server.stop()
+
+    def _send(self, topic: str, message: Struct, ns: int, metadata: dict[str, str] | None = None) -> None:
+        import foxglove  # noqa: PLC0415
+
+        kind = type(message)
+        key = topic, (metadata or {}).get("layout", "")
+        channel = self._channels.get(key)
+        if channel is None:
+            schema = foxglove.Schema(name=schema_name(kind), encoding="jsonschema", data=schema_of(kind))
+            channel = foxglove.Channel(
+                topic, schema=schema, message_encoding="json", context=self._context, metadata=metadata or {}
+            )
+            self._channels[key] = channel
+        if channel.has_sinks():
+            channel.log(encode(message), log_time=ns)
+
+    def _send_states(self, moment: Moment, item: State) -> None:
+        reply = item.reply
+        for key, state in reply.per_articulation.items():
+            names = moment.scene.names.get(key)
+            message = ArticulationMessage(
+                timestamp=Time.of(moment.ns),
+                sim_time=reply.time,
+                sample=reply.step,
+                step=reply.step,
+                episode=moment.episode,
+                wall_time=Time.of(moment.wall_ns),
+                qpos=state.qpos.tolist(),
+                qvel=state.qvel.tolist(),
+                set_points=item.set_points.get(key, []),
+                ctrl=values(state.ctrl),
+                act=values(state.act),
+                sensors=(state.sensors or {}) if self._sensors else {},
+            )
+            self._send(f"/state/{key}", message, moment.ns, to_metadata(names) if names else {})
+
+    def _send_geometry(self, ns: int) -> None:
+        from foxglove import messages as fox  # noqa: PLC0415
+
+        by_body: dict[str, list[Shape]] = {}
+        for shape in self._shapes:
+            by_body.setdefault(shape.body, []).append(shape)
+        if self._scene_channel is not None:
+            everything = fox.SceneEntityDeletion(type=fox.SceneEntityDeletionType.All)
+            update = fox.SceneUpdate(
+                deletions=[everything], entities=[_entity(body, shapes) for body, shapes in by_body.items()]
+            )
+            self._scene_channel.log(update, log_time=ns)
+
+    def _send_contacts(self, moment: Moment) -> None:
+        from foxglove import messages as fox  # noqa: PLC0415
+
+        contacts = moment.simulation.contacts()
+        self._send("/contacts", ContactsMessage(Time.of(moment.ns), contacts), moment.ns)
+        channel = self._contact_channel
+        if channel is None or not channel.has_sinks():
+            return
+        red = fox.Color(r=1.0, g=0.2, b=0.1, a=1.0)
+        points: list[fox.SpherePrimitive] = []
+        arrows: list[fox.ArrowPrimitive] = []
+        for contact in contacts:
+            at = fox.Vector3(x=contact.position.x, y=contact.position.y, z=contact.position.z)
+            size = fox.Vector3(x=0.016, y=0.016, z=0.016)
+            points.append(fox.SpherePrimitive(pose=fox.Pose(position=at), size=size, color=red))
+            force = np.array([contact.force.x, contact.force.y, contact.force.z])
+            newtons = float(np.linalg.norm(force))
+            if newtons > 0:
+                arrows.append(
+                    fox.ArrowPrimitive(
+                        pose=fox.Pose(position=at, orientation=_along(force / newtons)),
+                        shaft_length=0.8 * _NEWTON_M * newtons,
+                        shaft_diameter=0.008,
+                        head_length=0.2 * _NEWTON_M * newtons,
+                        head_diameter=0.016,
+                        color=red,
+                    )
+                )
+        entity = fox.SceneEntity(id="contacts", frame_id="world", spheres=points, arrows=arrows)
+        channel.log(fox.SceneUpdate(entities=[entity]), log_time=moment.ns)
+
+
+def _along(direction: np.ndarray[tuple[int], np.dtype[np.float64]]) -> fox.Quaternion:
+    """Return the shortest turn of the x axis, along which arrows point, into a direction of length 1."""
+    from foxglove import messages as fox  # noqa: PLC0415
+
+    x, y, z = direction.tolist()
+    if x < -1 + 1e-9:
+        return fox.Quaternion(x=0.0, y=0.0, z=1.0, w=0.0)
+    scale = float(np.sqrt(2 * (1 + x)))
+    return fox.Quaternion(x=0.0, y=-z / scale, z=y / scale, w=scale / 2)
+
+
+def _entity(body: str, shapes: Sequence[Shape]) -> fox.SceneEntity:
+    from foxglove import messages as fox  # noqa: PLC0415
+
+    cubes: list[fox.CubePrimitive] = []
+    spheres: list[fox.SpherePrimitive] = []
+    cylinders: list[fox.CylinderPrimitive] = []
+    models: list[fox.ModelPrimitive] = []
+    for shape in shapes:
+        pose, (x, y, z) = _pose(shape), shape.size
+        red, green, blue, alpha = shape.rgba
+        colour = fox.Color(r=red, g=green, b=blue, a=alpha)
+        match shape.kind:
+            case Kind.BOX:
+                cubes.append(fox.CubePrimitive(pose=pose, size=fox.Vector3(x=2 * x, y=2 * y, z=2 * z), color=colour))
+            case Kind.ELLIPSOID:
+                size = fox.Vector3(x=2 * x, y=2 * y, z=2 * z)
+                spheres.append(fox.SpherePrimitive(pose=pose, size=size, color=colour))
+            case Kind.CYLINDER | Kind.CAPSULE:
+                size = fox.Vector3(x=2 * x, y=2 * x, z=2 * y)
+                cylinders.append(
+                    fox.CylinderPrimitive(pose=pose, size=size, bottom_scale=1.0, top_scale=1.0, color=colour)
+                )
+                if shape.kind is Kind.CAPSULE:
+                    ball = fox.Vector3(x=2 * x, y=2 * x, z=2 * x)
+                    ends = [_pose(shape, end) for end in (-y, y)]
+                    spheres += [fox.SpherePrimitive(pose=end, size=ball, color=colour) for end in ends]
+            case Kind.MESH:
+                models.append(
+                    fox.ModelPrimitive(
+                        pose=pose,
+                        scale=fox.Vector3(x=1.0, y=1.0, z=1.0),
+                        color=colour,
+                        override_color=True,
+                        media_type="model/stl",
+                        data=_stl(shape),
+                    )
+                )
+    return fox.SceneEntity(
+        id=body,
+        frame_id=body,
+        frame_locked=True,
+        cubes=cubes,
+        spheres=spheres,
+        cylinders=cylinders,
+        models=models,
+    )
+
+
+def _pose(shape: Shape, along_z: float = 0.0) -> fox.Pose:
+    """Return a shape's pose in its body's frame, or that of a point on the shape's z axis."""
+    from foxglove import messages as fox  # noqa: PLC0415
+
+    w, x, y, z = shape.orientation
+    axis = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
+    at = np.asarray(shape.position) + along_z * axis
+    return fox.Pose(
+        position=fox.Vector3(x=float(at[0]), y=float(at[1]), z=float(at[2])),
+        orientation=fox.Quaternion(x=x, y=y, z=z, w=w),
+    )
+
+
+_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
+
+
+def _stl(shape: Shape) -> bytes:
+    """Return a mesh as a binary STL file."""
+    if shape.vertices is None or shape.triangles is None:
+        return b""
+    corners = shape.vertices[shape.triangles]
+    facets = np.zeros(len(corners), _FACET)
+    facets["corners"] = corners
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    facets["normal"] = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
+    return bytes(80) + len(facets).to_bytes(4, "little") + facets.tobytes()
+
+
+@overload
+def foxglove_view(
+    client: AsyncClient,
+    *,
+    host: str = ...,
+    port: int = ...,
+    cameras: Sequence[str] | Literal["all"] = ...,
+    camera_hz: float = ...,
+    contacts: bool = ...,
+    sensors: bool = ...,
+    max_hz: float = ...,
+) -> AsyncView: ...
+@overload
+def foxglove_view(
+    client: URLabClient,
+    *,
+    host: str = ...,
+    port: int = ...,
+    cameras: Sequence[str] | Literal["all"] = ...,
+    camera_hz: float = ...,
+    contacts: bool = ...,
+    sensors: bool = ...,
+    max_hz: float = ...,
+) -> View: ...
+def foxglove_view(
+    client: AsyncClient | URLabClient,
+    *,
+    host: str = "127.0.0.1",
+    port: int = 8765,
+    cameras: Sequence[str] | Literal["all"] = (),
+    camera_hz: float = 10.0,
+    contacts: bool = True,
+    sensors: bool = False,
+    max_hz: float = 30.0,
+) -> AsyncView | View:
+    """Serve what a client goes through to Foxglove: a context manager, of the client's own flavour.
+
+    Foxglove connects to the view's `address`. Topics and frames are those of a recording (`record`): `/tf`,
+    `/joint_states`, `/state/ARTICULATION`, `/contacts`, `/camera/NAME`; besides, `/scene` has the bodies' geometry and
+    `/contact_markers` arrows of 2 mm per newton. Frames are in `world`: metres, right-handed, z up. The newest state is
+    shown, at most `max_hz` times per second; what came between is left out and counted, so stepping never waits. After
+    another handshake the new scene replaces the old one.
+
+    Args:
+        client: A client after `discover()`, during play, with its local model.
+        host: Interface to listen on. The server asks nobody for a password: others than this machine's own show the
+            simulation to whoever reaches them.
+        port: Port to listen on; 0 for any free one.
+        cameras: Cameras whose pictures to show, `ARTICULATION/CAMERA` or a scene-level name; `all` for each of them.
+            In `direct` mode they are drawn with the step in which they are due, which takes longer then.
+        camera_hz: Pictures per second of simulation time, at most.
+        contacts: Show contacts, computed from the state with the client's own model.
+        sensors: Send sensors' readings in `/state/ARTICULATION`.
+        max_hz: States shown per second of wall time, at most.
+
+    Raises:
+        ImportError: The extra `foxglove` is not installed.
+        ValueError: An option is out of range.
+
+    Entering the block raises `URLabError` when the port cannot be used, before `discover()` or without a local model,
+    and `KeyError` for an unknown camera.
+    """
+    need("foxglove", "PIL", extra="foxglove")
+    options = ViewOptions(
+        cameras=cameras if isinstance(cameras, str) else tuple(cameras),
+        camera_hz=camera_hz,
+        max_hz=max_hz,
+        contacts=contacts,
+        sensors=sensors,
+    )
+    return make_view(client, _Foxglove(host=host, port=port, sensors=sensors), options, "foxglove_view")

@@ -1,0 +1,144 @@
+"""What a compiled model looks like: its visible geoms as primitives and triangles, in the frames of their bodies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from urlab_client.aio.mirror import model_names
+
+if TYPE_CHECKING:
+    import mujoco
+
+__all__ = ["Kind", "Shape", "shapes_of"]
+
+_VISIBLE_GROUPS = 3  # as MuJoCo's viewers: 0 to 2 are shown, collision geometry is by custom in 3
+_PLANE_M = 20.0  # size of what MuJoCo draws without end
+_PLANE_THICKNESS_M = 0.001
+
+
+class Kind(StrEnum):
+    """What a shape is, and what its size means, metres."""
+
+    BOX = "box"
+    """Half of each side."""
+    ELLIPSOID = "ellipsoid"
+    """Half of each axis."""
+    CAPSULE = "capsule"
+    """Radius, and half of the length along z without the caps."""
+    CYLINDER = "cylinder"
+    """Radius, and half of the length along z."""
+    MESH = "mesh"
+    """Nothing: vertices say it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """One geom.
+
+    Attributes:
+        body: Name of its body's frame.
+        name: Its own name, or one made of its number.
+        kind: What it is.
+        size: Three numbers; see `Kind`.
+        position: In the body's frame, metres.
+        orientation: In the body's frame, (w, x, y, z).
+        rgba: Colour, each 0 to 1.
+        vertices: Of a mesh, (n, 3), metres.
+        triangles: Of a mesh, (m, 3), indices of vertices.
+    """
+
+    body: str
+    name: str
+    kind: Kind
+    size: tuple[float, float, float]
+    position: tuple[float, float, float]
+    orientation: tuple[float, float, float, float]
+    rgba: tuple[float, float, float, float]
+    vertices: NDArray[np.float32] | None = None
+    triangles: NDArray[np.uint32] | None = None
+
+
+def shapes_of(model: mujoco.MjModel, bodies: list[str]) -> list[Shape]:
+    """Return what MuJoCo's viewers show of a model by default.
+
+    Args:
+        model: The model.
+        bodies: Name of each body.
+    """
+    names = model_names(model, "geom")
+    found: list[Shape] = []
+    for geom in range(model.ngeom):
+        rgba = model.geom_rgba[geom]
+        material = int(model.geom_matid[geom])
+        if material >= 0 and np.allclose(rgba, 0.5):  # a material counts where the geom has no colour of its own
+            rgba = model.mat_rgba[material]
+        if int(model.geom_group[geom]) >= _VISIBLE_GROUPS or rgba[3] == 0:
+            continue
+        outline = _outline(model, geom)
+        if outline is None:
+            continue
+        kind, size, vertices, triangles = outline
+        found.append(
+            Shape(
+                body=bodies[int(model.geom_bodyid[geom])],
+                name=names[geom] or f"geom_{geom}",
+                kind=kind,
+                size=size,
+                position=tuple(model.geom_pos[geom].tolist()),
+                orientation=tuple(model.geom_quat[geom].tolist()),
+                rgba=tuple(rgba.tolist()),
+                vertices=vertices,
+                triangles=triangles,
+            )
+        )
+    return found
+
+
+_Outline = tuple[Kind, tuple[float, float, float], NDArray[np.float32] | None, NDArray[np.uint32] | None]
+
+
+def _outline(model: mujoco.MjModel, geom: int) -> _Outline | None:
+    import mujoco  # noqa: PLC0415
+
+    x, y, z = model.geom_size[geom].tolist()
+    types, data = mujoco.mjtGeom, int(model.geom_dataid[geom])
+    solids: dict[int, tuple[Kind, tuple[float, float, float]]] = {
+        types.mjGEOM_PLANE: (Kind.BOX, (x or _PLANE_M, y or _PLANE_M, _PLANE_THICKNESS_M)),
+        types.mjGEOM_SPHERE: (Kind.ELLIPSOID, (x, x, x)),
+        types.mjGEOM_CAPSULE: (Kind.CAPSULE, (x, y, 0.0)),
+        types.mjGEOM_ELLIPSOID: (Kind.ELLIPSOID, (x, y, z)),
+        types.mjGEOM_CYLINDER: (Kind.CYLINDER, (x, y, 0.0)),
+        types.mjGEOM_BOX: (Kind.BOX, (x, y, z)),
+    }
+    kind = int(model.geom_type[geom])
+    if kind in solids:
+        return *solids[kind], None, None
+    if kind == types.mjGEOM_MESH:
+        first, face = int(model.mesh_vertadr[data]), int(model.mesh_faceadr[data])
+        vertices = model.mesh_vert[first : first + int(model.mesh_vertnum[data])].astype(np.float32)
+        triangles = model.mesh_face[face : face + int(model.mesh_facenum[data])].astype(np.uint32)
+        return Kind.MESH, (0.0, 0.0, 0.0), vertices, triangles
+    if kind == types.mjGEOM_HFIELD:
+        return Kind.MESH, (0.0, 0.0, 0.0), *_height_field(model, data)
+    return None  # signed distance fields are drawn by MuJoCo's plugins alone
+
+
+def _height_field(model: mujoco.MjModel, field: int) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+    rows, columns, start = int(model.hfield_nrow[field]), int(model.hfield_ncol[field]), int(model.hfield_adr[field])
+    x: float
+    y: float
+    top: float
+    x, y, top, _ = model.hfield_size[field].tolist()
+    heights = model.hfield_data[start : start + rows * columns].reshape(rows, columns)
+    vertices = np.empty((rows, columns, 3), np.float32)
+    vertices[..., 0] = np.linspace(-x, x, columns)
+    vertices[..., 1] = np.linspace(-y, y, rows)[:, None]
+    vertices[..., 2] = top * heights
+    index = np.arange(rows * columns, dtype=np.uint32).reshape(rows, columns)
+    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]))
+    return vertices.reshape(-1, 3), np.concatenate([np.stack([a, b, c], axis=-1), np.stack([b, d, c], axis=-1)])

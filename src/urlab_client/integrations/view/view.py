@@ -1,0 +1,347 @@
+"""A view: what a client goes through, shown by a thread that takes the newest state and lets the others go."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Literal, Protocol, Self, overload
+
+import anyio.to_thread
+import numpy as np
+from msgspec import Struct
+
+from urlab_client.aio.client import URLabClient as AsyncClient
+from urlab_client.integrations.feed.follower import Follower
+from urlab_client.integrations.feed.samples import Clock, Picture, State
+from urlab_client.integrations.feed.scene import Scene, Simulation
+from urlab_client.protocol.base import Floats
+from urlab_client.protocol.errors import ClientClosed, URLabError
+from urlab_client.protocol.messages.session import EntityState, StepOk
+from urlab_client.protocol.messages.streams import StateSnapshot
+from urlab_client.sync._portal import Portal, aio_of
+from urlab_client.sync.client import URLabClient
+
+__all__ = ["AsyncView", "Moment", "Sink", "View", "ViewOptions", "ViewStats", "make_view"]
+
+log = logging.getLogger("urlab_client.view")
+
+_NS = 1_000_000_000
+
+
+class ViewStats(Struct, kw_only=True, frozen=True):
+    """Counters of a view.
+
+    Attributes:
+        states: States shown.
+        frames: Pictures shown.
+        dropped_states: States that a newer one replaced before they could be shown.
+        dropped_frames: Likewise pictures.
+    """
+
+    states: int
+    frames: int
+    dropped_states: int
+    dropped_frames: int
+
+
+@dataclass(frozen=True, slots=True)
+class ViewOptions:
+    """What to show, and how often."""
+
+    cameras: Sequence[str] | Literal["all"]
+    camera_hz: float
+    max_hz: float
+    contacts: bool
+    sensors: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """What is shown at once.
+
+    Attributes:
+        ns: Simulation time, nanoseconds, which goes on where a reset sets it back.
+        wall_ns: UTC.
+        step: Step counter of the session.
+        scene: Names.
+        simulation: Poses and contacts.
+        episode: Number of resets before.
+        contacts: Whether contacts were asked for.
+        state: What the server said; None of the first moment, which is the client's own state.
+    """
+
+    ns: int
+    wall_ns: int
+    step: int
+    scene: Scene
+    simulation: Simulation
+    episode: int
+    contacts: bool
+    state: State | None
+
+
+class Sink(Protocol):
+    """Where a view shows things. Used by the view's thread alone, except `open` and `address`."""
+
+    @property
+    def address(self) -> str:
+        """Where what is served can be seen; empty when nothing is."""
+        ...
+
+    def open(self) -> None:
+        """Get ready.
+
+        Raises:
+            OSError: A file or port cannot be used.
+            URLabError: Something else is missing.
+        """
+        ...
+
+    def use(self, simulation: Simulation, scene: Scene) -> None:
+        """Show this scene from now on instead of the one before."""
+        ...
+
+    def show(self, moment: Moment) -> None:
+        """Show a state."""
+        ...
+
+    def show_picture(self, picture: Picture, ns: int) -> None:
+        """Show a picture taken at `ns` of the view's clock."""
+        ...
+
+    def idle(self) -> bool:
+        """Do what is to be done without a new state; return whether anybody can still look."""
+        ...
+
+    def close(self) -> None:
+        """Finish."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class _Start:
+    """The state that the client has when the view starts."""
+
+    scene: Scene
+    qpos: Floats
+    qvel: Floats
+    nanoseconds: int
+    step: int
+
+
+class AsyncView:
+    """A view that is open between `async with` and its end. Made by `rerun_view` and its siblings."""
+
+    def __init__(self, client: AsyncClient, sink: Sink, options: ViewOptions, name: str) -> None:
+        self._client = client
+        self._sink = sink
+        self._options = options
+        self._name = name
+        self._follower = Follower(
+            client, name=name, cameras=options.cameras, camera_hz=options.camera_hz, needs_model="", buffer=0
+        )
+        self._states: deque[State | _Start] = deque(maxlen=1)
+        self._pictures: dict[int, Picture] = {}
+        self._counts = {"states": 0, "frames": 0, "dropped_states": 0, "dropped_frames": 0}
+        self._clock = Clock()
+        self._simulation: Simulation | None = None
+        self._scene: Scene | None = None
+        self._shown: int = 0
+        self._stop = threading.Event()
+        self._gone = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="urlab-view", daemon=True)
+        self._error: Exception | None = None
+        self._opened = False
+
+    @property
+    def stats(self) -> ViewStats:
+        """Counters up to now, from any thread."""
+        return ViewStats(**self._counts)
+
+    @property
+    def address(self) -> str:
+        """Where what is served can be seen; empty before the block, and where nothing is served."""
+        return self._sink.address
+
+    @property
+    def closed(self) -> bool:
+        """Whether nothing is shown any more: the window was closed, or showing failed, or the block has ended."""
+        return self._gone.is_set()
+
+    @property
+    def error(self) -> Exception | None:
+        """What showing failed with; the simulation goes on without the view."""
+        return self._error
+
+    async def __aenter__(self) -> Self:
+        if self._opened:
+            raise URLabError("A view opens once.", hint="Call the function that made it again.")
+        scene = self._follower.check()
+        self._opened = True
+        await anyio.to_thread.run_sync(self._sink.open)
+        state = self._client._state  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
+        with state.mirror.lock:
+            data = state.mirror.data
+            qpos, qvel = (np.zeros(0), np.zeros(0)) if data is None else (data.qpos.copy(), data.qvel.copy())
+        self._states.append(_Start(scene, qpos, qvel, round(self._client.sim_time * _NS), self._client.step_count))
+        self._thread.start()
+        self._follower.start(self._put)
+        return self
+
+    async def __aexit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._follower.detach()
+        self._stop.set()
+        await self._follower.ended()
+        await anyio.to_thread.run_sync(self._thread.join, abandon_on_cancel=True)
+
+    def finish(self) -> None:
+        """End when the client's loop is gone already. Blocks."""
+        self._follower.forget()
+        self._stop.set()
+        self._thread.join()
+
+    # On the client's loop
+
+    def _put(self, item: State | Picture) -> None:
+        if self._gone.is_set():
+            return
+        if isinstance(item, State):
+            if self._states:
+                self._counts["dropped_states"] += 1
+            self._states.append(item)  # in place of the one that waits
+        else:
+            if id(item.camera.view) in self._pictures:
+                self._counts["dropped_frames"] += 1
+            self._pictures[id(item.camera.view)] = item
+
+    # In the thread
+
+    def _run(self) -> None:
+        period = 1 / self._options.max_hz
+        pause = 0.0
+        try:
+            # Looking at intervals, not at each state: whoever steps would lose the interpreter each time.
+            while not self._stop.wait(pause):
+                started = time.monotonic()
+                self._drain()
+                if not self._sink.idle():
+                    return
+                took = time.monotonic() - started
+                pause = max(period - took, took)  # at most half of a processor's time
+            self._drain()
+        except Exception as error:  # noqa: BLE001  # whatever it was, the simulation goes on
+            self._error = error
+            log.warning("%s: the view has ended: %s", self._name, error)
+        finally:
+            self._gone.set()
+            try:
+                self._sink.close()
+            except Exception as error:  # noqa: BLE001
+                self._error = self._error or error
+                log.warning("%s: the view could not be closed well: %s", self._name, error)
+
+    def _drain(self) -> None:
+        if self._states:
+            self._show(self._states.popleft())
+        while self._pictures:
+            _, picture = self._pictures.popitem()
+            ns = self._shown if picture.nanoseconds is None else max(0, self._clock.offset + picture.nanoseconds)
+            self._sink.show_picture(picture, ns)
+            self._counts["frames"] += 1
+
+    def _show(self, item: State | _Start) -> None:
+        simulation = self._simulation
+        if simulation is None or item.scene is not self._scene:
+            if item.scene.model is None:
+                return  # what follows has no model; the last scene stays
+            simulation = Simulation(item.scene, item.scene.model)
+            self._simulation, self._scene = simulation, item.scene
+            self._sink.use(simulation, item.scene)
+        state = item if isinstance(item, State) else None
+        contacts = self._options.contacts
+        if isinstance(item, State):
+            reply = item.reply
+            entities: dict[str, EntityState] = {}
+            if isinstance(reply, StepOk | StateSnapshot):
+                entities = dict(reply.entities or {})
+            simulation.take(reply.per_articulation, entities, forces=contacts)
+            step, wall_ns, restarts = reply.step, item.wall_ns, item.restarts
+        else:
+            simulation.start_from(item.qpos, item.qvel, forces=contacts)
+            step, wall_ns, restarts = item.step, time.time_ns(), False
+        self._shown = self._clock.advance(item.nanoseconds, restarts)
+        self._sink.show(
+            Moment(self._shown, wall_ns, step, item.scene, simulation, self._clock.episode, contacts, state)
+        )
+        self._counts["states"] += 1
+
+
+class View:
+    """A view that is open between `with` and its end. Made by `rerun_view` and its siblings."""
+
+    def __init__(self, view: AsyncView, portal: Portal) -> None:
+        self._aio = view
+        self._portal = portal
+
+    @property
+    def stats(self) -> ViewStats:
+        """Counters up to now."""
+        return self._aio.stats
+
+    @property
+    def address(self) -> str:
+        """Where what is served can be seen; empty before the block, and where nothing is served."""
+        return self._aio.address
+
+    @property
+    def closed(self) -> bool:
+        """Whether nothing is shown any more: the window was closed, or showing failed, or the block has ended."""
+        return self._aio.closed
+
+    @property
+    def error(self) -> Exception | None:
+        """What showing failed with; the simulation goes on without the view."""
+        return self._aio.error
+
+    def __enter__(self) -> Self:
+        self._portal.call(self._aio.__aenter__())
+        return self
+
+    def __exit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        try:
+            self._portal.call(self._aio.__aexit__(exc_type, exc, traceback))
+        except ClientClosed:
+            self._aio.finish()
+
+
+@overload
+def make_view(client: AsyncClient, sink: Sink, options: ViewOptions, name: str) -> AsyncView: ...
+@overload
+def make_view(client: URLabClient, sink: Sink, options: ViewOptions, name: str) -> View: ...
+@overload
+def make_view(client: AsyncClient | URLabClient, sink: Sink, options: ViewOptions, name: str) -> AsyncView | View: ...
+def make_view(client: AsyncClient | URLabClient, sink: Sink, options: ViewOptions, name: str) -> AsyncView | View:
+    """Return a view of the client's own flavour.
+
+    Raises:
+        ValueError: An option is out of range.
+    """
+    for key, value in (("max_hz", options.max_hz), ("camera_hz", options.camera_hz)):
+        if not 0 < value <= 1000:
+            raise ValueError(f"{key} is above 0 and at most 1000, not {value}")
+    if isinstance(options.cameras, str) and options.cameras != "all":
+        raise ValueError(f"cameras is a sequence of names or 'all', not {options.cameras!r}")
+    core = aio_of(client) if isinstance(client, URLabClient) else client
+    view = AsyncView(core, sink, options, name)
+    if isinstance(client, URLabClient):
+        return View(view, client._portal)  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
+    return view

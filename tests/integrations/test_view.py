@@ -1,0 +1,275 @@
+"""Views of real robots: what Rerun and Foxglove are told is what MuJoCo says, and stepping never waits for them."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import json
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import urlab_client
+from urlab_client.aio import URLabClient as AsyncClient
+from urlab_client.integrations.view import foxglove_view, rerun_view, window_view
+from urlab_client.integrations.view import view as viewing
+from urlab_client.integrations.view.geometry import Kind, shapes_of
+from urlab_client.server import SimulatedServer
+
+pytestmark = pytest.mark.view
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[SimulatedServer]:
+    with SimulatedServer("quadruped", "arm", play=True) as made:
+        yield made
+
+
+@pytest.fixture
+def client(server: SimulatedServer) -> Iterator[urlab_client.URLabClient]:
+    with urlab_client.URLabClient(**server.client_options(), step_mode="direct") as made:
+        made.discover()
+        made.reset()
+        yield made
+
+
+def rows(path: Path, entity: str, component: str) -> list[tuple[dict[str, Any], Any]]:
+    """Times and values of a component of an entity, as Rerun reads them."""
+    from rerun.chunk import RrdReader
+
+    found = []
+    for chunk in RrdReader(str(path)).stream().to_chunks():
+        if chunk.entity_path != entity:
+            continue
+        batch = chunk.to_record_batch()
+        names = [name for name in batch.schema.names if name.endswith(component)]
+        for name in names:
+            for row in range(batch.num_rows):
+                times = {time: batch.column(time).cast("int64")[row].as_py() for time in chunk.timeline_names}
+                found.append((times, batch.column(name)[row].as_py()))
+    return sorted(found, key=lambda item: item[0].get("sim_time", -1))
+
+
+def test_rerun_is_told_poses_joints_and_contacts(client: urlab_client.URLabClient, tmp_path: Path) -> None:
+    client.step(n_steps=500)
+    path = tmp_path / "run.rrd"
+    with rerun_view(client, save=path, sensors=True) as view:
+        client.step(n_steps=3)
+        time = client.sim_time
+        arm = client.articulations["arm"]
+        body = next(iter(client.articulations["quadruped"].bodies))
+        expected = client.articulations["quadruped"].root_pos_w
+        position = arm.get_qpos()
+    assert view.stats.states >= 1
+    assert view.error is None
+    times, last = rows(path, f"/world/quadruped_{body}", "Transform3D:translation")[-1]
+    assert np.allclose(np.ravel(last), expected, atol=1e-6)  # Rerun's are 32-bit
+    assert times["sim_time"] == round(time * 1e9)
+    assert {"sim_time", "wall_time", "step"} <= times.keys()
+    for name, value in position.items():
+        assert rows(path, f"/joints/arm/{name}", "Scalars:scalars")[-1][1] == [value]
+    contacts = rows(path, "/world/contacts/points", "Points3D:positions")[-1][1]
+    forces = rows(path, "/world/contacts/forces", "Arrows3D:vectors")[-1][1]
+    assert len(contacts) == len(forces) > 3
+    assert all(force[2] > 0 for force in forces)
+
+
+def test_geometry_is_the_models(client: urlab_client.URLabClient) -> None:
+    model = client.model
+    names = [model.body(i).name or f"body_{i}" for i in range(model.nbody)]
+    shapes = {(shape.body, shape.name): shape for shape in shapes_of(model, names)}
+    visible = [i for i in range(model.ngeom) if model.geom_group[i] < 3 and model.geom_rgba[i][3] > 0]
+    assert len(shapes) == len(visible) > 10
+    for i in visible:
+        shape = shapes[names[model.geom_bodyid[i]], model.geom(i).name or f"geom_{i}"]
+        assert shape.position == tuple(model.geom_pos[i])
+        if shape.kind is Kind.CAPSULE:
+            assert shape.size[:2] == tuple(model.geom_size[i][:2])
+
+
+def test_height_fields_and_meshes_become_triangles() -> None:
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><asset>
+        <hfield name="h" nrow="2" ncol="3" size="1 2 3 0.1" elevation="0 0 0 1 1 1"/>
+        <mesh name="m" vertex="0 0 0  1 0 0  0 1 0  0 0 1"/></asset>
+        <worldbody><geom type="hfield" hfield="h"/><geom type="mesh" mesh="m"/></worldbody></mujoco>"""
+    )
+    field, mesh = shapes_of(model, ["world"])
+    assert field.vertices is not None
+    assert field.triangles is not None
+    assert mesh.vertices is not None
+    assert field.vertices.min(axis=0).tolist() == [-1, -2, 0]
+    assert field.vertices.max(axis=0).tolist() == [1, 2, 3]
+    corners = field.vertices[field.triangles]
+    assert (np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2] > 0).all()  # seen from above
+    assert mesh.vertices.shape == (4, 3)
+
+
+def test_stepping_never_waits_and_the_newest_state_is_shown(
+    client: urlab_client.URLabClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    going = threading.Event()
+    drain: Callable[[Any], None] = viewing.AsyncView._drain
+
+    def slowly(self: Any) -> None:
+        assert going.wait(30)
+        drain(self)
+
+    monkeypatch.setattr(viewing.AsyncView, "_drain", slowly)
+    path = tmp_path / "run.rrd"
+    with rerun_view(client, save=path) as view:
+        for _ in range(100):
+            client.step()
+        assert view.stats.dropped_states == 100  # the first state, that of the start, and all but the last
+        going.set()
+        time = client.sim_time
+    body = next(iter(client.articulations["quadruped"].bodies))
+    shown = rows(path, f"/world/quadruped_{body}", "Transform3D:translation")
+    assert [times["sim_time"] for times, _ in shown] == [round(time * 1e9)]
+
+
+async def test_live_mode_is_followed_and_another_scene_replaces_the_first(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    with SimulatedServer("arm", play=True) as first:
+        ports = first.client_options()
+        async with AsyncClient(**ports, step_mode="live") as client:
+            await client.discover()
+            await client.runtime.set_paused(False)
+            async with rerun_view(client, save=path) as view, asyncio.timeout(30):
+                while view.stats.states < 5:  # noqa: ASYNC110
+                    await asyncio.sleep(0.01)
+                await client.session.end_pie()
+                await client.session.begin_pie()
+                await client.discover()
+                await client.runtime.set_paused(False)
+                before = view.stats.states
+                while view.stats.states < before + 5:  # noqa: ASYNC110
+                    await asyncio.sleep(0.01)
+    assert view.error is None
+    assert len(rows(path, "/joints/arm/elbow", "Scalars:scalars")) >= 5
+
+
+def test_a_window_without_a_display_says_what_is_missing(
+    client: urlab_client.URLabClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(urlab_client.URLabError, match="no display: neither DISPLAY"), window_view(client):
+        pass
+
+
+def test_wrong_arguments_are_refused(client: urlab_client.URLabClient, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="max_hz"):
+        rerun_view(client, save=tmp_path / "a.rrd", max_hz=0)
+    with pytest.raises(ValueError, match="one of save, connect and web"):
+        rerun_view(client, save=tmp_path / "a.rrd", web=True)
+    with pytest.raises(KeyError, match="arm/wrist"), rerun_view(client, save=tmp_path / "a.rrd", cameras=["nose"]):
+        pass
+    with pytest.raises(OSError, match="missing"), rerun_view(client, save=tmp_path / "missing" / "a.rrd"):
+        pass
+    with foxglove_view(client, port=0) as view:
+        port = int(view.address.rpartition(":")[2])
+        with pytest.raises(urlab_client.URLabError, match=str(port)), foxglove_view(client, port=port):
+            pass
+
+
+# Foxglove
+
+
+def scene_update(schema: str, data: bytes) -> Any:
+    """Decode a message of protobuf with the schema that was advertised with it."""
+    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+
+    files = descriptor_pb2.FileDescriptorSet.FromString(base64.b64decode(schema))
+    pool = descriptor_pool.DescriptorPool()
+    waiting = list(files.file)
+    while waiting:
+        ready = next(f for f in waiting if not any(other.name in f.dependency for other in waiting))
+        pool.Add(ready)
+        waiting.remove(ready)
+    kind = message_factory.GetMessageClass(pool.FindMessageTypeByName("foxglove.SceneUpdate"))
+    return kind.FromString(data)
+
+
+class Foxglove:
+    """What a browser gets to see: channels by topic, the newest message of each."""
+
+    def __init__(self, socket: Any) -> None:
+        self.socket = socket
+        self.channels: dict[str, dict[str, Any]] = {}
+        self.topics: dict[int, str] = {}
+        self.newest: dict[str, bytes] = {}
+
+    async def until(self, *topics: str) -> None:
+        """Read until there is a message of each topic, later than this call."""
+        for topic in topics:
+            self.newest.pop(topic, None)
+        while not all(topic in self.newest for topic in topics):
+            message = await self.socket.recv()
+            if isinstance(message, bytes):
+                if message[0] == 1:
+                    self.newest[self.topics[int.from_bytes(message[1:5], "little")]] = message[13:]
+                continue
+            told = json.loads(message)
+            if told["op"] == "advertise":
+                await self._subscribe(told["channels"])
+
+    async def _subscribe(self, channels: list[dict[str, Any]]) -> None:
+        for channel in channels:
+            self.channels[channel["topic"]] = channel
+            self.topics[channel["id"]] = channel["topic"]
+        wanted = [{"id": channel["id"], "channelId": channel["id"]} for channel in channels]
+        await self.socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+
+
+async def test_foxglove_is_told_frames_geometry_joints_and_contacts(server: SimulatedServer) -> None:
+    from websockets.asyncio.client import connect
+
+    async with AsyncClient(**server.client_options(), step_mode="direct") as client, asyncio.timeout(60):
+        await client.discover()
+        await client.reset()
+        await client.step(n_steps=500)
+        async with (
+            foxglove_view(client, port=0) as view,
+            connect(view.address, subprotocols=["foxglove.sdk.v1"], max_size=None) as socket,
+        ):
+            seen = Foxglove(socket)
+            await seen.until("/tf", "/scene")
+            await client.step()
+            await seen.until("/tf", "/scene", "/joint_states", "/contacts", "/contact_markers", "/state/arm")
+            robot, arm = client.articulations["quadruped"], client.articulations["arm"]
+            body = f"quadruped_{next(iter(robot.bodies))}"
+            frames = {f["child_frame_id"]: f for f in json.loads(seen.newest["/tf"])["transforms"]}
+            assert list(frames[body]["translation"].values()) == robot.root_pos_w.tolist()
+            assert frames[body]["parent_frame_id"] == "world"
+            joints = {j["name"]: j["position"] for j in json.loads(seen.newest["/joint_states"])["joints"]}
+            assert all(joints[f"arm_{name}"] == value for name, value in arm.get_qpos().items())
+            assert json.loads(seen.newest["/state/arm"])["sim_time"] == client.sim_time
+            kinds = {topic: channel["schemaName"] for topic, channel in seen.channels.items()}
+            schema = seen.channels["/scene"]["schema"]
+    assert kinds == {
+        "/tf": "foxglove.FrameTransforms",
+        "/joint_states": "foxglove.JointStates",
+        "/scene": "foxglove.SceneUpdate",
+        "/contact_markers": "foxglove.SceneUpdate",
+        "/contacts": "urlab.Contacts",
+        "/state/arm": "urlab.ArticulationState",
+        "/state/quadruped": "urlab.ArticulationState",
+    }
+    update = scene_update(schema, seen.newest["/scene"])
+    entities = {entity.id: entity for entity in update.entities}
+    assert entities[body].frame_id == body
+    assert entities.keys() <= frames.keys() | {"world"}
+    drawn = [e for e in update.entities for _ in (*e.cubes, *e.spheres, *e.cylinders, *e.models)]
+    assert len(drawn) > 10
+    contacts = json.loads(seen.newest["/contacts"])["contacts"]
+    (markers,) = scene_update(schema, seen.newest["/contact_markers"]).entities
+    assert len(markers.spheres) == len(contacts) > 3
+    for sphere, contact in zip(markers.spheres, contacts, strict=True):
+        assert [getattr(sphere.pose.position, axis) for axis in "xyz"] == list(contact["position"].values())
