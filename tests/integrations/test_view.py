@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import contextlib
 import json
 import threading
 from collections.abc import Callable, Iterator
@@ -134,25 +135,33 @@ def test_stepping_never_waits_and_the_newest_state_is_shown(
     assert [times["sim_time"] for times, _ in shown] == [round(time * 1e9)]
 
 
-async def test_live_mode_is_followed_and_another_scene_replaces_the_first(tmp_path: Path) -> None:
+async def until(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(30):
+        while not condition():  # noqa: ASYNC110
+            await asyncio.sleep(0.01)
+
+
+async def test_live_mode_is_followed_and_another_servers_robots_replace_the_first(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
-    with SimulatedServer("arm", play=True) as first:
-        ports = first.client_options()
-        async with AsyncClient(**ports, step_mode="live") as client:
+    first = SimulatedServer("arm", play=True)
+    with contextlib.ExitStack() as servers:
+        servers.enter_context(first)
+        options = first.client_options()
+        ports = {name: number for name, number in options.items() if name.endswith("_port")}
+        async with AsyncClient(**options, step_mode="live") as client:
             await client.discover()
             await client.runtime.set_paused(False)
-            async with rerun_view(client, save=path) as view, asyncio.timeout(30):
-                while view.stats.states < 5:  # noqa: ASYNC110
-                    await asyncio.sleep(0.01)
-                await client.session.end_pie()
-                await client.session.begin_pie()
+            async with rerun_view(client, save=path) as view:
+                await until(lambda: view.stats.states >= 5)
+                servers.close()
+                servers.enter_context(SimulatedServer("quadruped", play=True, **ports))
                 await client.discover()
                 await client.runtime.set_paused(False)
                 before = view.stats.states
-                while view.stats.states < before + 5:  # noqa: ASYNC110
-                    await asyncio.sleep(0.01)
+                await until(lambda: view.stats.states >= before + 5)
     assert view.error is None
     assert len(rows(path, "/joints/arm/elbow", "Scalars:scalars")) >= 5
+    assert len(rows(path, "/joints/quadruped/FL_hip", "Scalars:scalars")) >= 5
 
 
 def test_a_window_without_a_display_says_what_is_missing(
