@@ -314,7 +314,7 @@ def exports(module: str) -> dict[str, str]:
 
 def around() -> list[str]:
     """Return the public modules beside clients and server."""
-    packages = sorted(path.parent.name for path in (SRC / "urlab_client" / "integrations").glob("*/__init__.py"))
+    packages = sorted(path.parent.name for path in (SRC / "urlab_client" / "integrations").glob("[!_]*/__init__.py"))
     integrations = [f"urlab_client.integrations.{name}" for name in packages]
     at = integrations.index("urlab_client.integrations.record") + 1
     return [

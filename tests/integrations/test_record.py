@@ -24,7 +24,7 @@ from mcap.reader import make_reader
 
 import urlab_client
 from urlab_client.aio import URLabClient as AsyncClient
-from urlab_client.integrations.feed.messages import (
+from urlab_client.integrations._feed.messages import (
     ArticulationMessage,
     CameraCalibration,
     CompressedImage,

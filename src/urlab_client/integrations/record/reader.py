@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from zstandard import ZstdError
 
-from urlab_client.integrations.feed.messages import (
+from urlab_client.integrations._feed.messages import (
     ArticulationMessage,
     CompressedImage,
     EntityMessage,
@@ -27,7 +27,7 @@ from urlab_client.integrations.feed.messages import (
     RawImage,
     schema_name,
 )
-from urlab_client.integrations.feed.scene import Layout, from_metadata
+from urlab_client.integrations._feed.scene import Layout, from_metadata
 from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.rows import Pixels

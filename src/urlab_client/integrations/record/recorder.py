@@ -11,7 +11,7 @@ from typing import Literal, Self, overload
 import anyio.to_thread
 
 from urlab_client.aio.client import URLabClient as AsyncClient
-from urlab_client.integrations.feed.follower import Follower
+from urlab_client.integrations._feed.follower import Follower
 from urlab_client.integrations.record.writer import RecorderStats, WriterOptions, WriterThread
 from urlab_client.protocol.errors import ClientClosed, URLabError
 from urlab_client.sync._portal import Portal, aio_of

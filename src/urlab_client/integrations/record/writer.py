@@ -18,7 +18,7 @@ from typing import IO, cast
 from mcap.writer import CompressionType, Writer
 from msgspec import Struct
 
-from urlab_client.integrations.feed.messages import (
+from urlab_client.integrations._feed.messages import (
     ArticulationMessage,
     ContactsMessage,
     EntityMessage,
@@ -31,8 +31,8 @@ from urlab_client.integrations.feed.messages import (
     schema_of,
     values,
 )
-from urlab_client.integrations.feed.samples import Clock, Picture, Schedule, State, picture_message
-from urlab_client.integrations.feed.scene import Scene, Simulation, calibration, to_metadata
+from urlab_client.integrations._feed.samples import Clock, Picture, Schedule, State, picture_message
+from urlab_client.integrations._feed.scene import Scene, Simulation, calibration, to_metadata
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import CameraFrame, EntityState, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot

@@ -10,7 +10,7 @@ from msgspec import Struct
 
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.integrations._extras import need
-from urlab_client.integrations.feed.messages import (
+from urlab_client.integrations._feed.messages import (
     ArticulationMessage,
     ContactsMessage,
     FrameTransforms,
@@ -21,8 +21,8 @@ from urlab_client.integrations.feed.messages import (
     schema_of,
     values,
 )
-from urlab_client.integrations.feed.samples import Picture, State, picture_message
-from urlab_client.integrations.feed.scene import Scene, Simulation, calibration, to_metadata
+from urlab_client.integrations._feed.samples import Picture, State, picture_message
+from urlab_client.integrations._feed.scene import Scene, Simulation, calibration, to_metadata
 from urlab_client.integrations.view.geometry import Kind, Shape, shapes_of
 from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewOptions, make_view
 from urlab_client.protocol.errors import URLabError

@@ -11,9 +11,9 @@ import numpy as np
 
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.integrations._extras import need
-from urlab_client.integrations.feed.messages import FrameTransform, Time
-from urlab_client.integrations.feed.samples import Picture, State, compressed
-from urlab_client.integrations.feed.scene import Scene, Simulation, calibration
+from urlab_client.integrations._feed.messages import FrameTransform, Time
+from urlab_client.integrations._feed.samples import Picture, State, compressed
+from urlab_client.integrations._feed.scene import Scene, Simulation, calibration
 from urlab_client.integrations.view.geometry import Kind, Shape, shapes_of
 from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewOptions, make_view
 from urlab_client.protocol.enums import CameraMode

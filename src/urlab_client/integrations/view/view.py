@@ -16,9 +16,9 @@ import numpy as np
 from msgspec import Struct
 
 from urlab_client.aio.client import URLabClient as AsyncClient
-from urlab_client.integrations.feed.follower import Follower
-from urlab_client.integrations.feed.samples import Clock, Picture, State
-from urlab_client.integrations.feed.scene import Scene, Simulation
+from urlab_client.integrations._feed.follower import Follower
+from urlab_client.integrations._feed.samples import Clock, Picture, State
+from urlab_client.integrations._feed.scene import Scene, Simulation
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.errors import ClientClosed, URLabError
 from urlab_client.protocol.messages.session import EntityState, StepOk

@@ -8,8 +8,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, overload
 
 from urlab_client.aio.client import URLabClient as AsyncClient
-from urlab_client.integrations.feed.samples import Picture
-from urlab_client.integrations.feed.scene import Scene, Simulation
+from urlab_client.integrations._feed.samples import Picture
+from urlab_client.integrations._feed.scene import Scene, Simulation
 from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewOptions, make_view
 from urlab_client.protocol.errors import URLabError
 from urlab_client.sync.client import URLabClient

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from urlab_client.integrations.feed.messages import CompressedImage, RawImage, Time
-from urlab_client.integrations.feed.scene import CameraLayout, Scene
+from urlab_client.integrations._feed.messages import CompressedImage, RawImage, Time
+from urlab_client.integrations._feed.scene import CameraLayout, Scene
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraFrame, StateReply
 from urlab_client.protocol.messages.streams import StateSnapshot

@@ -10,8 +10,8 @@ from typing import Literal
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.state import SimState
-from urlab_client.integrations.feed.samples import Picture, Schedule, State
-from urlab_client.integrations.feed.scene import Scene
+from urlab_client.integrations._feed.samples import Picture, Schedule, State
+from urlab_client.integrations._feed.scene import Scene
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import ClientClosed, StreamOverflow, URLabError
 from urlab_client.protocol.messages.session import ResetOk, StateReply, StepOk

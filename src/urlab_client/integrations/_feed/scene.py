@@ -14,7 +14,7 @@ from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.layout import FREE, ArticulationLayout
 from urlab_client.aio.mirror import model_names
 from urlab_client.aio.state import SimState
-from urlab_client.integrations.feed.messages import (
+from urlab_client.integrations._feed.messages import (
     CameraCalibration,
     ContactMessage,
     FrameTransform,
