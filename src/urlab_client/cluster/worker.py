@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
-import sys
 import time
 from collections.abc import Mapping
 from importlib import import_module
@@ -30,9 +28,6 @@ class Worker:
     """
 
     def __init__(self, env_options: Mapping[str, Any], client_options: Mapping[str, Any], lease_timeout: float) -> None:
-        if sys.version_info < (3, 12):
-            # Ray makes uvloop's policy the default, and with that no other loop can start child processes.
-            asyncio.set_event_loop_policy(asyncio.DefaultEventLoopPolicy())  # pyright: ignore[reportDeprecated] - not there
         self._env_options = env_options
         self._client_options: dict[str, Any] = {"step_mode": "direct", **client_options}
         self._lease_timeout = lease_timeout
