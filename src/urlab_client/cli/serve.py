@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import ctypes
 import json
 import os
 import queue
@@ -32,8 +31,6 @@ _PORTS = {"step": 5559, "state": 5555, "ctrl": 5556, "info": 5557, "camera": 555
 
 # A lock wait on Windows does not see Ctrl-C, so there it is taken in slices.
 _WAIT_S = 0.1 if sys.platform == "win32" else None
-
-_M_ARENA_MAX = -8  # of glibc's mallopt
 
 _PATIENCE_S = 0.5  # of the second that ending may take, for a start under way
 
@@ -222,10 +219,12 @@ def run(arguments: ServeArguments) -> int:
     _stop_on_signals(events)
     if arguments.until_eof:
         threading.Thread(target=_watch_input, args=[events], name="urlab-stdin", daemon=True).start()
-    _share_heaps()
     import_mujoco()
     _check_paths(arguments)
+    from urlab_client.server.heap import share_heaps  # noqa: PLC0415
     from urlab_client.server.scratch import Scratch  # noqa: PLC0415
+
+    share_heaps()
 
     with Scratch() as scratch:
         server = _server(arguments, arguments.saved_dir or scratch.path)
@@ -295,17 +294,6 @@ def _stop_on_signals(events: _Events) -> None:
     hangup = getattr(signal, "SIGHUP", None)
     if hangup is not None and signal.getsignal(hangup) != signal.SIG_IGN:  # nohup wants it ignored
         signal.signal(hangup, stop)
-
-
-def _share_heaps() -> None:
-    """Have all threads allocate from two heaps.
-
-    Each play session draws and compiles in threads of its own. By default glibc gives each new thread a heap of its
-    own, up to eight per processor, and each keeps some ten MiB of what the renderer had in it.
-    """
-    if sys.platform == "linux":
-        with contextlib.suppress(AttributeError):  # another C library
-            ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 2)
 
 
 def _watch_input(events: _Events) -> None:

@@ -21,6 +21,7 @@ from urlab_client.protocol.messages.session import ErrorReply, Hello, Step
 from urlab_client.server.actors import Actor
 from urlab_client.server.controllers import ControllerConfig
 from urlab_client.server.engine import Engine
+from urlab_client.server.heap import give_back
 from urlab_client.server.limits import Limits
 from urlab_client.server.markers import Drawings
 from urlab_client.server.observe import Observer
@@ -204,6 +205,7 @@ class ServerCore:
         self.play.stop()
         self.world.pie_running = False
         self.drawings.clear(in_play=True)
+        give_back()
 
 
 @dataclass(frozen=True)
