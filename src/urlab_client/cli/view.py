@@ -76,7 +76,11 @@ def add_parser(commands: Commands) -> None:
         where.add_argument(f"--{name}", dest="where", action="store_const", const=name, help=text)
     parser.add_argument("--save", type=Path, metavar="FILE", help="with --rerun: write an .rrd file, show nothing")
     parser.add_argument("--connect", metavar="URL", help="with --rerun: send to a viewer, rerun+http://HOST:9876/proxy")
-    parser.add_argument("--page", action="store_true", help="with --rerun: serve Rerun's page for browsers")
+    parser.add_argument(
+        "--page",
+        action="store_true",
+        help="with --rerun: serve Rerun's page for browsers; Rerun does that on every interface, to anybody",
+    )
     parser.add_argument("--port", type=port, metavar="PORT", help="of what --web, --foxglove or --page serves")
     parser.add_argument("--step-port", type=port, default=5559, metavar="PORT", help="RPC port (default: %(default)s)")
     parser.add_argument(
@@ -214,7 +218,8 @@ def _make(client: URLabClient, arguments: ViewArguments) -> AsyncView:
 
 def _said(arguments: ViewArguments, view: AsyncView) -> str:
     where = arguments.save or arguments.connect or view.address or f"the {arguments.where} window"
-    return f"{arguments.address} is shown: {where}; Ctrl-C ends it."
+    who = " Rerun serves it on every interface of this machine, to anybody." if arguments.page else ""
+    return f"{arguments.address} is shown: {where}; Ctrl-C ends it.{who}"
 
 
 async def _until_done(client: URLabClient, view: AsyncView, arguments: ViewArguments, stop: asyncio.Event) -> None:

@@ -268,7 +268,8 @@ def rerun_view(
         client: A client after `discover()`, during play, with its local model.
         save: Write to this `.rrd` file instead of showing anything; one that exists is replaced.
         connect: Send to a viewer that runs elsewhere, `rerun+http://HOST:9876/proxy`, which may come later.
-        web: Serve Rerun's page for browsers instead of opening a window.
+        web: Serve Rerun's page for browsers instead of opening a window. Rerun serves page and data on every interface
+            of this machine, to anybody who reaches it; it has no option for that.
         web_port: Of the page.
         grpc_port: Of the data, for the page and for the window.
         cameras: Cameras whose pictures to show, `ARTICULATION/CAMERA` or a scene-level name; `all` for each of them.
