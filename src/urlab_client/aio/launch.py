@@ -16,6 +16,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Sequence
+from functools import partial
 from urllib.parse import parse_qsl
 
 import msgspec
@@ -231,7 +232,7 @@ class _Watched:
     async def connect(self) -> None:
         """Make the pipes readable."""
         for reader, pipe in ((self.stdout, self._process.stdout), (self.stderr, self._process.stderr)):
-            await self._loop.connect_read_pipe(lambda reader=reader: asyncio.StreamReaderProtocol(reader), pipe)
+            await self._loop.connect_read_pipe(partial(asyncio.StreamReaderProtocol, reader), pipe)
 
     @property
     def returncode(self) -> int | None:

@@ -17,6 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final, cast
 
+from urlab_client._processors import crowded
 from urlab_client.protocol import doorbell
 from urlab_client.protocol.errors import ProtocolError
 from urlab_client.protocol.shm import (
@@ -232,7 +233,7 @@ class SharedMemory:
                         continue
                     if not rung:
                         self._unrung_at = time.monotonic()
-                self._brisk = time.monotonic() - self._served_at < BRISK_S
+                self._brisk = time.monotonic() - self._served_at < BRISK_S and not crowded()
                 seen = self._serve(answer)
                 self._served_at = time.monotonic()
         except (OSError, ValueError):

@@ -487,7 +487,7 @@ class ShmTransport:
             self._ring()
             if deadline is not None:
                 timer = loop.call_at(deadline, self._expire, pending, deadline - started)
-            if self._spin.pays(op.name, started):
+            if self._spin.pays(op.name):
                 await self._spin.look(op.name, pending.future, lambda: self._look_at(channel))
             if self._memory.bell is None:
                 self._watch()

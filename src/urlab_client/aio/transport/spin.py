@@ -8,16 +8,14 @@ two looks.
 from __future__ import annotations
 
 import asyncio
-import os
 from collections.abc import Callable
 from typing import Any
+
+from urlab_client._processors import crowded
 
 __all__ = ["Spin"]
 
 _MISSES = 4
-# Where more than so many wait for each processor, the time spent looking is somebody else's.
-_CROWD = 1.5
-_CROWD_S = 1.0
 # One that looks keeps the loop awake for all; several would only keep each other busy.
 _looking = False
 
@@ -35,15 +33,10 @@ class Spin:
         self._longest = longest
         self._latency: dict[str, float] = {}
         self._missed: dict[str, int] = {}
-        self._crowded = False
-        self._crowd_known_until = 0.0
 
-    def pays(self, op: str, now: float) -> bool:
-        """Whether to look for the reply to this op, at this loop time."""
-        if now > self._crowd_known_until:
-            self._crowd_known_until = now + _CROWD_S
-            self._crowded = _crowded()
-        return not (_looking or self._crowded) and self._missed.get(op, 0) < _MISSES
+    def pays(self, op: str) -> bool:
+        """Whether to look for the reply to this op."""
+        return not _looking and self._missed.get(op, 0) < _MISSES and not crowded()
 
     async def look(self, op: str, reply: asyncio.Future[Any], look: Callable[[], object]) -> None:
         """Call `look` until it completes `reply` or that has taken too long."""
@@ -63,10 +56,3 @@ class Spin:
         """Learn how long a reply has taken."""
         self._latency[op] = 0.9 * self._latency.get(op, seconds) + 0.1 * seconds
         self._missed[op] = self._missed.get(op, 0) + 1 if seconds > self._longest else 0
-
-
-def _crowded() -> bool:
-    if not hasattr(os, "getloadavg"):
-        return False
-    processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return os.getloadavg()[0] > _CROWD * processors

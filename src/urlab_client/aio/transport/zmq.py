@@ -145,7 +145,7 @@ class ZmqTransport:
             self._expire_at(loop, deadline)
         try:
             # Sending may have consumed the descriptor's edge, so look at least once for what arrived meanwhile.
-            if self._spin.pays(op.name, started):
+            if self._spin.pays(op.name):
                 await self._spin.look(op.name, entry.reply, self._on_readable)
             elif cast("int", socket.get(_EVENTS)) & _POLLIN:
                 loop.call_soon(self._on_readable)
