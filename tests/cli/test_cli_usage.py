@@ -25,11 +25,17 @@ def test_help_needs_no_heavy_library(tmp_path: Path) -> None:
         [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=DEADLINE_S, check=True
     )
     *text, imported = done.stdout.splitlines()
-    assert {"serve", "ping", "demo"} <= set(" ".join(text).split())
+    assert set(COMMANDS) <= set(" ".join(text).split())
     assert imported == "[]"
 
 
-@pytest.mark.parametrize("command", ["serve", "ping", "demo"])
+COMMANDS = (
+    "serve", "console", "ping", "doctor", "demo", "keys", "snapshot", "record", "info", "convert", "plot", "run-policy",
+    "view",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("command", COMMANDS)
 def test_each_command_explains_itself(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as end:
         main([command, "--help"])
@@ -70,6 +76,8 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
         (["ping", "--timeout", "soon"], ["--timeout", "'soon'", "seconds"]),
         (["ping", "--timeout", "inf"], ["--timeout", "'inf'"]),
         (["demo", "--steps", "-5"], ["--steps", "'-5'"]),
+        (["view", "--max-hz", "0"], ["--max-hz", "'0'", "per second"]),
+        (["record", "sim://arm", "a.mcap", "--step-mode", "puppet"], ["--step-mode", "puppet", "live"]),
     ],
 )
 def test_wrong_usage_is_one_line_that_names_it(
@@ -81,6 +89,22 @@ def test_wrong_usage_is_one_line_that_names_it(
     assert (end.value.code, out) == (2, "")
     assert err.count("\n") == 1
     assert all(word in err for word in words), err
+
+
+@pytest.mark.parametrize(
+    "command",
+    [["ping"], ["doctor"], ["console"], ["snapshot"], ["view", "--foxglove"], ["record", "run.mcap"]],
+    ids=lambda command: command[0],
+)
+def test_an_address_that_is_none_is_one_line_that_says_so(
+    command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    name, *others = command
+    assert main([name, "gopher://lab", *others]) == 2
+    out, err = capsys.readouterr()
+    assert (out, err.count("\n")) == ("", 1)
+    assert err.startswith(f"urlab {name}: 'gopher://lab' is no address; write tcp://HOST")
 
 
 def test_the_package_runs_as_the_command(tmp_path: Path) -> None:

@@ -4,10 +4,33 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from typing import Any, NoReturn, Protocol
+from typing import Any, NoReturn, Protocol, TypeVar
 
-__all__ = ["Commands", "Parser", "add_keys", "count", "image_size", "port", "seconds"]
+from urlab_client.cli._failure import CommandError
+from urlab_client.protocol.enums import StepMode
 
+__all__ = [
+    "ADDRESSES",
+    "Commands",
+    "Parser",
+    "ServerArguments",
+    "add_address",
+    "add_keys",
+    "add_ports",
+    "add_step_mode",
+    "count",
+    "hertz",
+    "image_size",
+    "make_client",
+    "port",
+    "seconds",
+]
+
+ADDRESSES = "tcp://HOST[:PORT], ipc://PATH, or sim://MODEL to start a server for the occasion"
+
+C = TypeVar("C")
+
+_STEP_PORT, _STATE_PORT = 5559, 5555
 _LARGEST_IMAGE = 16384
 
 
@@ -27,6 +50,82 @@ class Commands(Protocol):
     """What a command adds its parser to."""
 
     def add_parser(self, name: str, *, help: str, description: str) -> Parser: ...  # noqa: A002 - argparse's word
+
+
+class ServerArguments(argparse.Namespace):
+    """How to reach a server, besides its address; see `add_ports` and `add_keys`."""
+
+    step_port: int
+    state_port: int
+    server_key: str | None
+    client_key: str | None
+
+
+def make_client(flavour: Callable[..., C], address: str, arguments: ServerArguments, **options: Any) -> C:
+    """Return a client of one of the two classes for the server that the arguments name.
+
+    Raises:
+        CommandError: The address or an option is malformed.
+    """
+    try:
+        return flavour(
+            address,
+            step_port=arguments.step_port,
+            state_port=arguments.state_port,
+            server_key=arguments.server_key,
+            client_key=arguments.client_key,
+            **options,
+        )
+    except ValueError as error:
+        raise CommandError(str(error)) from None
+
+
+def add_address(parser: argparse.ArgumentParser) -> None:
+    """Add the address of a server, which is one on this machine unless said otherwise."""
+    parser.add_argument(
+        "address",
+        nargs="?",
+        default="tcp://localhost",
+        metavar="ADDRESS",
+        help=f"{ADDRESSES} (default: %(default)s)",
+    )
+
+
+def add_ports(parser: argparse.ArgumentParser, *, state: bool = True) -> None:
+    """Add the ports of a server.
+
+    Args:
+        parser: The command's parser.
+        state: Whether the command uses the state stream.
+    """
+    parser.add_argument(
+        "--step-port",
+        type=port,
+        default=_STEP_PORT,
+        metavar="PORT",
+        help="RPC port of the server, if the address has none (default: %(default)s)",
+    )
+    if state:
+        parser.add_argument(
+            "--state-port",
+            type=port,
+            default=_STATE_PORT,
+            metavar="PORT",
+            help="port of the server's state stream (default: %(default)s)",
+        )
+    else:
+        parser.set_defaults(state_port=_STATE_PORT)
+
+
+def add_step_mode(parser: argparse.ArgumentParser) -> None:
+    """Add the choice between watching physics run and stepping it."""
+    parser.add_argument(
+        "--step-mode",
+        type=StepMode,
+        choices=[StepMode.LIVE, StepMode.DIRECT],
+        default=StepMode.LIVE,
+        help="live or direct (default: %(default)s)",
+    )
 
 
 def add_keys(parser: argparse.ArgumentParser) -> None:
@@ -52,6 +151,11 @@ def count(text: str) -> int:
 def seconds(text: str) -> float:
     """Parse a duration in seconds, above 0."""
     return _number(text, lambda value: 0 < value < 1e6, "give a number of seconds above 0")
+
+
+def hertz(text: str) -> float:
+    """Parse how often per second, above 0."""
+    return _number(text, lambda value: 0 < value < 1e6, "give a number per second, above 0")
 
 
 def image_size(text: str) -> tuple[int, int]:

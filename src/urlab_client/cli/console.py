@@ -2,33 +2,36 @@
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import socket
 import webbrowser
 from contextlib import suppress
 
-from urlab_client.cli._arguments import Commands, add_keys, port
+from urlab_client.cli._arguments import (
+    Commands,
+    ServerArguments,
+    add_address,
+    add_keys,
+    add_ports,
+    make_client,
+    port,
+)
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._mujoco import import_mujoco
 
-__all__ = ["add_parser", "run"]
+__all__ = ["PAGE_PORT", "ConsoleArguments", "add_parser", "run"]
 
-_PORT = 8355
+PAGE_PORT = 8355
 
 
-class ConsoleArguments(argparse.Namespace):
+class ConsoleArguments(ServerArguments):
     """What the command line says."""
 
     address: str
-    step_port: int
-    state_port: int
     host: str
     port: int
     allow_host: list[str]
     open: bool
-    server_key: str | None
-    client_key: str | None
 
 
 def add_parser(commands: Commands) -> None:
@@ -39,20 +42,12 @@ def add_parser(commands: Commands) -> None:
         description="Serve a page to see and touch a simulation, on this machine alone, and print a link that lets one "
         "browser in. The page makes links for more. It ends with exit code 0 on SIGINT (Ctrl-C) and SIGTERM.",
     )
-    parser.add_argument(
-        "address",
-        nargs="?",
-        default="tcp://localhost",
-        metavar="ADDRESS",
-        help="tcp://HOST, ipc://PATH, or sim://MODEL for a simulated server of its own, as in "
-        "'sim://arm?play&unpaused' (default: %(default)s)",
-    )
-    for name, default in (("step", 5559), ("state", 5555)):
-        parser.add_argument(
-            f"--{name}-port", type=port, default=default, metavar="PORT", help="of the server (default: %(default)s)"
-        )
+    add_address(parser)
+    add_ports(parser)
     add_keys(parser)
-    parser.add_argument("--port", type=port, default=_PORT, help="of the page; 0: any free one (default: %(default)s)")
+    parser.add_argument(
+        "--port", type=port, default=PAGE_PORT, help="of the page; 0: any free one (default: %(default)s)"
+    )
     parser.add_argument(
         "--host",
         default="127.0.0.1",
@@ -99,17 +94,8 @@ async def _serve(arguments: ConsoleArguments) -> None:
     from urlab_client.web.access import LOOPBACK  # noqa: PLC0415
 
     access = Access(hosts=[*LOOPBACK, *(name.lower() for name in arguments.allow_host)])
-    try:
-        client = URLabClient(
-            arguments.address,
-            step_port=arguments.step_port,
-            state_port=arguments.state_port,
-            server_key=arguments.server_key,
-            client_key=arguments.client_key,
-            live_pictures=False,  # each camera is streamed while somebody watches it
-        )
-    except ValueError as error:
-        raise CommandError(str(error)) from None
+    # Each camera is streamed while somebody watches it.
+    client = make_client(URLabClient, arguments.address, arguments, live_pictures=False)
     async with client:
         with _bound(arguments.host, arguments.port) as listener:
             name = arguments.allow_host[0] if arguments.allow_host else "127.0.0.1"

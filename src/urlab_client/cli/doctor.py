@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import contextlib
 import logging
@@ -11,7 +10,15 @@ import sys
 import msgspec
 
 from urlab_client._installation import conflict
-from urlab_client.cli._arguments import Commands, add_keys, port, seconds
+from urlab_client.cli._arguments import (
+    Commands,
+    ServerArguments,
+    add_address,
+    add_keys,
+    add_ports,
+    make_client,
+    seconds,
+)
 from urlab_client.cli._mujoco import import_mujoco
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import URLabError
@@ -24,17 +31,13 @@ _UNHEALTHY = 1
 logger = logging.getLogger("urlab_client.cli")
 
 
-class DoctorArguments(argparse.Namespace):
+class DoctorArguments(ServerArguments):
     """What the command line says."""
 
     address: str
-    step_port: int
-    state_port: int
     step_mode: StepMode
     timeout: float
     json: bool
-    server_key: str | None
-    client_key: str | None
 
 
 def add_parser(commands: Commands) -> None:
@@ -46,16 +49,8 @@ def add_parser(commands: Commands) -> None:
         "Opens a session, which takes the server over from the client that drives it; a program of your own can call "
         "client.explain() without doing so. Exit code 0 when nothing is in the way, 1 when something is.",
     )
-    parser.add_argument(
-        "address",
-        nargs="?",
-        default="tcp://localhost",
-        help="tcp://HOST, tcp://HOST:PORT or sim://MODEL (default: %(default)s)",
-    )
-    parser.add_argument("--step-port", type=port, default=5559, metavar="PORT", help="RPC port (default: %(default)s)")
-    parser.add_argument(
-        "--state-port", type=port, default=5555, metavar="PORT", help="state stream (default: %(default)s)"
-    )
+    add_address(parser)
+    add_ports(parser)
     parser.add_argument(
         "--step-mode",
         type=StepMode,
@@ -82,17 +77,15 @@ def run(arguments: DoctorArguments) -> int:
 async def _diagnose(arguments: DoctorArguments) -> Diagnosis:
     from urlab_client.aio import URLabClient  # noqa: PLC0415
 
-    client = URLabClient(
+    client = make_client(
+        URLabClient,
         arguments.address,
-        step_port=arguments.step_port,
-        state_port=arguments.state_port,
+        arguments,
         step_mode=arguments.step_mode,
         # Promoting the server would mend what is to be found.
         auto_promote_step_mode=False,
         mujoco_version_check=False,
         rcv_timeout_ms=round(arguments.timeout * 1000),
-        server_key=arguments.server_key,
-        client_key=arguments.client_key,
     )
     async with client:
         with contextlib.suppress(URLabError):  # the diagnosis says it

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import json
 import re
@@ -14,8 +13,16 @@ import msgspec
 from msgspec import Struct
 
 from urlab_client.aio.launch import SCHEME
-from urlab_client.cli._arguments import Commands, add_keys, count, port, seconds
-from urlab_client.cli._failure import CommandError
+from urlab_client.cli._arguments import (
+    Commands,
+    ServerArguments,
+    add_address,
+    add_keys,
+    add_ports,
+    count,
+    make_client,
+    seconds,
+)
 from urlab_client.cli._mujoco import import_mujoco
 from urlab_client.protocol.errors import ModeLocked, URLabRPCError, URLabVersionMismatch
 from urlab_client.protocol.messages.runtime import SetMode
@@ -28,16 +35,13 @@ __all__ = ["add_parser", "run"]
 _WATCH_S = 0.1  # several steps even at the slowest pace of live mode
 
 
-class PingArguments(argparse.Namespace):
+class PingArguments(ServerArguments):
     """What the command line says."""
 
     address: str
-    step_port: int
     timeout: float
     count: int
     no_session: bool
-    server_key: str | None
-    client_key: str | None
     json: bool
 
 
@@ -106,16 +110,8 @@ def add_parser(commands: Commands) -> None:
         "round-trip times of `meta`. Reading them opens a session, which takes the server over from the client that "
         "drives it; with --no-session only the op list and the round-trip times are read, and nobody is disturbed.",
     )
-    parser.add_argument(
-        "address",
-        nargs="?",
-        default="tcp://localhost",
-        metavar="ADDRESS",
-        help="tcp://HOST[:PORT], ipc://PATH, or sim://MODEL to start a server for the occasion (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--step-port", type=port, default=5559, metavar="PORT", help="RPC port, if ADDRESS has none (default: 5559)"
-    )
+    add_address(parser)
+    add_ports(parser, state=False)
     parser.add_argument(
         "--timeout", type=seconds, default=2.0, metavar="SECONDS", help="to wait for each reply (default: 2)"
     )
@@ -159,17 +155,8 @@ async def _ping(arguments: PingArguments) -> Report:
 def _client(arguments: PingArguments, *, local_model: bool) -> URLabClient:
     from urlab_client.aio import URLabClient  # noqa: PLC0415
 
-    try:
-        return URLabClient(
-            arguments.address,
-            step_port=arguments.step_port,
-            rcv_timeout_ms=max(1, round(arguments.timeout * 1000)),
-            local_model=local_model,
-            server_key=arguments.server_key,
-            client_key=arguments.client_key,
-        )
-    except ValueError as error:
-        raise CommandError(str(error)) from None
+    timeout_ms = max(1, round(arguments.timeout * 1000))
+    return make_client(URLabClient, arguments.address, arguments, rcv_timeout_ms=timeout_ms, local_model=local_model)
 
 
 async def _round_trips(client: URLabClient, arguments: PingArguments) -> RoundTrips:

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import signal
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from urlab_client.cli._arguments import Commands, add_keys, port, seconds
+from urlab_client.cli._arguments import (
+    ADDRESSES,
+    Commands,
+    ServerArguments,
+    add_keys,
+    add_ports,
+    add_step_mode,
+    hertz,
+    make_client,
+    seconds,
+)
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._mujoco import import_mujoco
 from urlab_client.cli._progress import progress_bar
@@ -24,13 +33,11 @@ _LOOK_S = 0.05
 _DROPPED = 1
 
 
-class RecordArguments(argparse.Namespace):
+class RecordArguments(ServerArguments):
     """What the command line says."""
 
     address: str
     output: Path
-    step_port: int
-    state_port: int
     step_mode: StepMode
     duration: float
     keyframe: str | None
@@ -38,8 +45,6 @@ class RecordArguments(argparse.Namespace):
     camera_hz: float
     contacts: bool
     overwrite: bool
-    server_key: str | None
-    client_key: str | None
 
 
 def add_parser(commands: Commands) -> None:
@@ -53,19 +58,10 @@ def add_parser(commands: Commands) -> None:
         "program of your own can call record(client, FILE). Ctrl-C ends the recording early. Exit code 1 when states "
         "were dropped. Needs the extra 'urlab-client[mcap]'.",
     )
-    parser.add_argument("address", help="tcp://HOST, tcp://HOST:PORT or sim://MODEL")
+    parser.add_argument("address", metavar="ADDRESS", help=ADDRESSES)
     parser.add_argument("output", type=Path, metavar="FILE", help="the file to write, a .mcap file")
-    parser.add_argument("--step-port", type=port, default=5559, metavar="PORT", help="RPC port (default: %(default)s)")
-    parser.add_argument(
-        "--state-port", type=port, default=5555, metavar="PORT", help="state stream (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--step-mode",
-        type=StepMode,
-        choices=[StepMode.LIVE, StepMode.DIRECT],
-        default=StepMode.LIVE,
-        help="live or direct (default: %(default)s)",
-    )
+    add_ports(parser)
+    add_step_mode(parser)
     parser.add_argument(
         "--duration", type=seconds, default=10.0, metavar="S", help="simulated seconds (default: %(default)s)"
     )
@@ -78,7 +74,7 @@ def add_parser(commands: Commands) -> None:
         help="a camera to keep, as ARTICULATION/CAMERA, or 'all'; may be repeated",
     )
     parser.add_argument(
-        "--camera-hz", type=seconds, default=30.0, metavar="HZ", help="pictures per second (default: %(default)s)"
+        "--camera-hz", type=hertz, default=30.0, metavar="HZ", help="pictures per second (default: %(default)s)"
     )
     parser.add_argument("--contacts", action="store_true", help="keep contacts, too")
     parser.add_argument("--overwrite", action="store_true", help="replace FILE if it exists")
@@ -121,14 +117,7 @@ async def _record(arguments: RecordArguments) -> AsyncRecorder:
     from urlab_client.aio import URLabClient  # noqa: PLC0415
     from urlab_client.integrations.record import record  # noqa: PLC0415
 
-    client = URLabClient(
-        arguments.address,
-        step_port=arguments.step_port,
-        state_port=arguments.state_port,
-        step_mode=arguments.step_mode,
-        server_key=arguments.server_key,
-        client_key=arguments.client_key,
-    )
+    client = make_client(URLabClient, arguments.address, arguments, step_mode=arguments.step_mode)
     async with client:
         await client.discover()
         recorder = record(

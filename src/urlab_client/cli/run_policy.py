@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import contextlib
 import sys
@@ -14,7 +13,15 @@ from urllib.parse import urlencode
 import msgspec
 import numpy as np
 
-from urlab_client.cli._arguments import Commands, add_keys, port, seconds
+from urlab_client.cli._arguments import (
+    ADDRESSES,
+    Commands,
+    ServerArguments,
+    add_keys,
+    add_ports,
+    make_client,
+    seconds,
+)
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._mujoco import import_mujoco
 from urlab_client.cli._progress import progress_bar
@@ -31,7 +38,7 @@ _FELL = 1
 _SEED = 0
 
 
-class RunPolicyArguments(argparse.Namespace):
+class RunPolicyArguments(ServerArguments):
     """What the command line says."""
 
     policy: Path
@@ -46,10 +53,6 @@ class RunPolicyArguments(argparse.Namespace):
     camera: list[str]
     overwrite: bool
     json: bool
-    step_port: int
-    state_port: int
-    server_key: str | None
-    client_key: str | None
 
 
 def add_parser(commands: Commands) -> None:
@@ -64,9 +67,7 @@ def add_parser(commands: Commands) -> None:
         "'urlab-client[onnx]'.",
     )
     parser.add_argument("policy", type=Path, metavar="POLICY", help="the network, a .onnx file")
-    parser.add_argument(
-        "address", nargs="?", help="tcp://HOST, tcp://HOST:PORT or sim://MODEL (default: a server for --robot)"
-    )
+    parser.add_argument("address", nargs="?", metavar="ADDRESS", help=f"{ADDRESSES} (default: a server for --robot)")
     parser.add_argument(
         "--declaration", type=Path, metavar="FILE", help="the .toml file (default: that beside POLICY, of its name)"
     )
@@ -106,10 +107,7 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument("--overwrite", action="store_true", help="with --record: replace FILE if it exists")
     parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument("--step-port", type=port, default=5559, metavar="PORT", help="RPC port (default: %(default)s)")
-    parser.add_argument(
-        "--state-port", type=port, default=5555, metavar="PORT", help="state stream (default: %(default)s)"
-    )
+    add_ports(parser)
     add_keys(parser)
     parser.set_defaults(run=run)
 
@@ -162,14 +160,8 @@ async def _run(arguments: RunPolicyArguments, policy: Policy) -> dict[str, Polic
     from urlab_client.integrations.policy import run as run_policy  # noqa: PLC0415
 
     address, articulation = _where(arguments, policy)
-    client = URLabClient(
-        address,
-        step_port=arguments.step_port,
-        state_port=arguments.state_port,
-        step_mode=arguments.step_mode or policy.spec.step_modes[0],
-        server_key=arguments.server_key,
-        client_key=arguments.client_key,
-    )
+    step_mode = arguments.step_mode or policy.spec.step_modes[0]
+    client = make_client(URLabClient, address, arguments, step_mode=step_mode)
     actors = {**(_others(policy) if arguments.compare else {}), "policy": policy}
     runs: dict[str, PolicyRun] = {}
     async with client:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,7 +9,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.cli._arguments import Commands, add_keys, image_size, port, seconds
+from urlab_client.cli._arguments import (
+    Commands,
+    ServerArguments,
+    add_keys,
+    add_ports,
+    image_size,
+    make_client,
+    seconds,
+)
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._files import replaced
 from urlab_client.cli._mujoco import import_mujoco
@@ -27,7 +34,7 @@ _CHUNK = 100  # physics steps of one request, which the server gives 5 s
 _BEYOND_M = 1e5  # farther than what a ray can meet
 
 
-class SnapshotArguments(argparse.Namespace):
+class SnapshotArguments(ServerArguments):
     """What the command line says."""
 
     sources: list[str]
@@ -37,10 +44,7 @@ class SnapshotArguments(argparse.Namespace):
     size: tuple[int, int]
     seconds: float | None
     keyframe: str | None
-    step_port: int
     timeout: float
-    server_key: str | None
-    client_key: str | None
 
 
 def add_parser(commands: Commands) -> None:
@@ -80,9 +84,7 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument("--keyframe", metavar="NAME", help="start play at this keyframe")
     parser.add_argument("--seconds", type=seconds, metavar="S", help="simulate for this long before")
-    parser.add_argument(
-        "--step-port", type=port, default=5559, metavar="PORT", help="RPC port, if an address has none (default: 5559)"
-    )
+    add_ports(parser, state=False)
     parser.add_argument(
         "--timeout", type=seconds, default=5.0, metavar="S", help="to wait for a running server (default: %(default)s)"
     )
@@ -167,13 +169,8 @@ def _of_running_server(arguments: SnapshotArguments) -> NDArray[np.uint8]:
     if arguments.keyframe or arguments.seconds:
         raise CommandError("--keyframe and --seconds are for models: what a running server does is not changed")
     (address,) = arguments.sources
-    with URLabClient(
-        address,
-        step_port=arguments.step_port,
-        rcv_timeout_ms=round(1e3 * arguments.timeout),
-        server_key=arguments.server_key,
-        client_key=arguments.client_key,
-    ) as client:
+    timeout_ms = round(1e3 * arguments.timeout)
+    with make_client(URLabClient, address, arguments, rcv_timeout_ms=timeout_ms) as client:
         client.discover()
         if arguments.camera is None:
             raise CommandError(

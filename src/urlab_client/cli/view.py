@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import signal
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from urlab_client.cli import console
-from urlab_client.cli._arguments import Commands, add_keys, port, seconds
+from urlab_client.cli._arguments import (
+    Commands,
+    ServerArguments,
+    add_address,
+    add_keys,
+    add_ports,
+    add_step_mode,
+    hertz,
+    make_client,
+    port,
+    seconds,
+)
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._mujoco import import_mujoco
 from urlab_client.protocol.enums import StepMode
@@ -21,12 +31,11 @@ if TYPE_CHECKING:
 __all__ = ["add_parser", "run"]
 
 _LOOK_S = 0.05
-_CONSOLE_PORT = 8355
 _FOXGLOVE_PORT = 8765
 _RERUN_PORT = 9090
 
 
-class ViewArguments(argparse.Namespace):
+class ViewArguments(ServerArguments):
     """What the command line says."""
 
     address: str
@@ -34,8 +43,6 @@ class ViewArguments(argparse.Namespace):
     save: Path | None
     connect: str | None
     page: bool
-    step_port: int
-    state_port: int
     port: int | None
     step_mode: StepMode
     seconds: float | None
@@ -43,8 +50,6 @@ class ViewArguments(argparse.Namespace):
     camera_hz: float
     sensors: bool
     max_hz: float
-    server_key: str | None
-    client_key: str | None
 
 
 def add_parser(commands: Commands) -> None:
@@ -58,13 +63,7 @@ def add_parser(commands: Commands) -> None:
         "siblings instead. Ctrl-C ends it. --rerun needs the extra 'urlab-client[rerun]', --foxglove "
         "'urlab-client[foxglove]', --web 'urlab-client[web]'.",
     )
-    parser.add_argument(
-        "address",
-        nargs="?",
-        default="tcp://localhost",
-        metavar="ADDRESS",
-        help="tcp://HOST, tcp://HOST:PORT or sim://MODEL (default: %(default)s)",
-    )
+    add_address(parser)
     where = parser.add_mutually_exclusive_group()
     parser.set_defaults(where="viewer")
     for name, text in (
@@ -82,17 +81,8 @@ def add_parser(commands: Commands) -> None:
         help="with --rerun: serve Rerun's page for browsers; Rerun does that on every interface, to anybody",
     )
     parser.add_argument("--port", type=port, metavar="PORT", help="of what --web, --foxglove or --page serves")
-    parser.add_argument("--step-port", type=port, default=5559, metavar="PORT", help="RPC port (default: %(default)s)")
-    parser.add_argument(
-        "--state-port", type=port, default=5555, metavar="PORT", help="state stream (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--step-mode",
-        type=StepMode,
-        choices=[StepMode.LIVE, StepMode.DIRECT],
-        default=StepMode.LIVE,
-        help="live or direct (default: %(default)s)",
-    )
+    add_ports(parser)
+    add_step_mode(parser)
     parser.add_argument("--seconds", type=seconds, metavar="S", help="simulated seconds (default: until Ctrl-C)")
     parser.add_argument(
         "--camera",
@@ -102,11 +92,11 @@ def add_parser(commands: Commands) -> None:
         help="a camera to show in Rerun or Foxglove, as ARTICULATION/CAMERA, or 'all'; may be repeated",
     )
     parser.add_argument(
-        "--camera-hz", type=seconds, default=10.0, metavar="HZ", help="pictures per second (default: %(default)s)"
+        "--camera-hz", type=hertz, default=10.0, metavar="HZ", help="pictures per second (default: %(default)s)"
     )
     parser.add_argument("--sensors", action="store_true", help="show sensors' readings in Rerun or Foxglove")
     parser.add_argument(
-        "--max-hz", type=seconds, default=30.0, metavar="HZ", help="states shown per second (default: %(default)s)"
+        "--max-hz", type=hertz, default=30.0, metavar="HZ", help="states shown per second (default: %(default)s)"
     )
     add_keys(parser)
     parser.set_defaults(run=run)
@@ -146,12 +136,12 @@ def _console_arguments(arguments: ViewArguments) -> console.ConsoleArguments:
         raise CommandError("--web shows everything until Ctrl-C: --camera, --sensors and --seconds do not go with it")
     return console.ConsoleArguments(
         address=arguments.address,
-        step_port=arguments.step_port,
-        state_port=arguments.state_port,
         host="127.0.0.1",
-        port=_CONSOLE_PORT if arguments.port is None else arguments.port,
+        port=console.PAGE_PORT if arguments.port is None else arguments.port,
         allow_host=[],
         open=False,
+        step_port=arguments.step_port,
+        state_port=arguments.state_port,
         server_key=arguments.server_key,
         client_key=arguments.client_key,
     )
@@ -160,14 +150,7 @@ def _console_arguments(arguments: ViewArguments) -> console.ConsoleArguments:
 async def _view(arguments: ViewArguments) -> None:
     from urlab_client.aio import URLabClient  # noqa: PLC0415
 
-    client = URLabClient(
-        arguments.address,
-        step_port=arguments.step_port,
-        state_port=arguments.state_port,
-        step_mode=arguments.step_mode,
-        server_key=arguments.server_key,
-        client_key=arguments.client_key,
-    )
+    client = make_client(URLabClient, arguments.address, arguments, step_mode=arguments.step_mode)
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     async with client:
