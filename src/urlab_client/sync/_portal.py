@@ -40,7 +40,7 @@ from typing import Any, Generic, Protocol, TypeVar, cast, overload
 from urlab_client.protocol.errors import ClientClosed, ForkedError, URLabError, URLabRPCError
 from urlab_client.protocol.names import NameMap
 
-__all__ = ["GRACE", "Facade", "FacadeRoot", "Portal", "aio_of"]
+__all__ = ["GRACE", "Facade", "FacadeRoot", "Portal", "aio_of", "portal_of"]
 
 T = TypeVar("T")
 A = TypeVar("A")
@@ -682,6 +682,11 @@ class _Twin(Protocol[A_co]):
 def aio_of(twin: _Twin[A_co]) -> A_co:
     """Return the async object that a façade object stands for."""
     return twin._aio  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
+
+
+def portal_of(twin: Facade) -> Portal:
+    """Return the way into the event loop of a façade object's client."""
+    return twin._portal  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
 
 
 class FacadeRoot(Facade):

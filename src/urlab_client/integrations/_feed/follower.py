@@ -34,6 +34,9 @@ class Follower:
         camera_hz: Pictures per second of simulation time, at most.
         needs_model: What to do where there is no local model, as advice in the error; None if none is needed.
         buffer: How many published states may wait, so that none is missed; 0 for the newest alone.
+
+    Raises:
+        ValueError: `cameras` is a name by itself.
     """
 
     def __init__(
@@ -46,10 +49,12 @@ class Follower:
         needs_model: str | None,
         buffer: int,
     ) -> None:
+        if isinstance(cameras, str) and cameras != "all":
+            raise ValueError(f"cameras is a sequence of names or 'all', not {cameras!r}")
         self._client = client
         self._state: SimState = client._state  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
         self._name = name
-        self._wanted_cameras = cameras
+        self._wanted_cameras = cameras if isinstance(cameras, str) else tuple(cameras)
         self._camera_ns = round(_NS / camera_hz)
         self._pictures = Schedule(self._camera_ns)
         self._needs_model = needs_model

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from urlab_client.integrations.gym.episode import Episode
 from urlab_client.integrations.gym.spaces import Observation, SpaceMapping, SpaceMode
 from urlab_client.protocol.enums import CameraMode
-from urlab_client.sync._portal import aio_of
+from urlab_client.sync._portal import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
 
 __all__ = ["RewardFn", "TerminationFn", "URLabEnv", "keyframe_option"]
@@ -183,7 +183,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         super().close()
 
     def _run(self, coro: Coroutine[Any, Any, T]) -> T:
-        return self.client._portal.call(coro)  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
+        return portal_of(self.client).call(coro)
 
     def _info(self) -> dict[str, Any]:
         client = self.client

@@ -18,7 +18,7 @@ from urlab_client.integrations.policy.policy import Policy
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.enums import ActuatorType, ControllerKind, ControlMode, StepMode
 from urlab_client.protocol.errors import URLabError
-from urlab_client.sync._portal import aio_of
+from urlab_client.sync._portal import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
 
 __all__ = ["PolicyRun", "require", "run", "run_blocking"]
@@ -199,7 +199,7 @@ def run_blocking(
 ) -> PolicyRun:
     """Do what `run` does with a blocking client."""
     coro = run(aio_of(client), policy, articulation=articulation, seconds=seconds, on_action=on_action)
-    return client._portal.call(coro)  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
+    return portal_of(client).call(coro)
 
 
 class _Run:

@@ -11,10 +11,11 @@ from typing import Literal, Self, overload
 import anyio.to_thread
 
 from urlab_client.aio.client import URLabClient as AsyncClient
+from urlab_client.integrations._feed.blocking import BlockingTwin
 from urlab_client.integrations._feed.follower import Follower
 from urlab_client.integrations.record.writer import RecorderStats, WriterOptions, WriterThread
-from urlab_client.protocol.errors import ClientClosed, URLabError
-from urlab_client.sync._portal import Portal, aio_of
+from urlab_client.protocol.errors import URLabError
+from urlab_client.sync._portal import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
 
 __all__ = ["AsyncRecorder", "Recorder", "record"]
@@ -95,12 +96,8 @@ class AsyncRecorder:
             self._writer.close()
 
 
-class Recorder:
+class Recorder(BlockingTwin[AsyncRecorder]):
     """A recording that is under way between `with` and its end. Made by `record`."""
-
-    def __init__(self, recorder: AsyncRecorder, portal: Portal) -> None:
-        self._aio = recorder
-        self._portal = portal
 
     @property
     def path(self) -> Path:
@@ -116,18 +113,6 @@ class Recorder:
     def failed(self) -> bool:
         """Whether writing has failed; leaving the block raises the reason."""
         return self._aio.failed
-
-    def __enter__(self) -> Self:
-        self._portal.call(self._aio.__aenter__())
-        return self
-
-    def __exit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        try:
-            self._portal.call(self._aio.__aexit__(exc_type, exc, traceback))
-        except ClientClosed:
-            self._aio.finish()
 
 
 @overload
@@ -203,8 +188,6 @@ def record(
         raise ValueError(f"image_format is 'jpeg' or 'png', not {image_format!r}")
     if contacts and pose_hz == 0:
         raise ValueError("contacts come with the poses: pose_hz must be above 0")
-    if isinstance(cameras, str) and cameras != "all":
-        raise ValueError(f"cameras is a sequence of names or 'all', not {cameras!r}")
     core = aio_of(client) if isinstance(client, URLabClient) else client
 
     def options() -> WriterOptions:
@@ -225,10 +208,9 @@ def record(
             },
         )
 
-    chosen = cameras if cameras == "all" else tuple(cameras)
-    recorder = AsyncRecorder(core, Path(path), cameras=chosen, camera_hz=camera_hz, pose_hz=pose_hz, options=options)
+    recorder = AsyncRecorder(core, Path(path), cameras=cameras, camera_hz=camera_hz, pose_hz=pose_hz, options=options)
     if isinstance(client, URLabClient):
-        return Recorder(recorder, client._portal)  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
+        return Recorder(recorder, portal_of(client))
     return recorder
 
 

@@ -367,11 +367,5 @@ def foxglove_view(
     and `KeyError` for an unknown camera.
     """
     need("foxglove", "PIL", extra="foxglove")
-    options = ViewOptions(
-        cameras=cameras if isinstance(cameras, str) else tuple(cameras),
-        camera_hz=camera_hz,
-        max_hz=max_hz,
-        contacts=contacts,
-        sensors=sensors,
-    )
+    options = ViewOptions(cameras=cameras, camera_hz=camera_hz, max_hz=max_hz, contacts=contacts)
     return make_view(client, _Foxglove(host=host, port=port, sensors=sensors), options, "foxglove_view")

@@ -289,13 +289,7 @@ def rerun_view(
     need("rerun", "PIL", extra="rerun")
     if (save is not None) + (connect is not None) + web > 1:
         raise ValueError("give one of save, connect and web")
-    options = ViewOptions(
-        cameras=cameras if cameras == "all" else tuple(cameras) if not isinstance(cameras, str) else cameras,
-        camera_hz=camera_hz,
-        max_hz=max_hz,
-        contacts=contacts,
-        sensors=sensors,
-    )
+    options = ViewOptions(cameras=cameras, camera_hz=camera_hz, max_hz=max_hz, contacts=contacts)
     path = None if save is None else Path(save)
     sink = _Rerun(save=path, connect=connect, web=web, web_port=web_port, grpc_port=grpc_port, sensors=sensors)
     return make_view(client, sink, options, "rerun_view")

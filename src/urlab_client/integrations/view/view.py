@@ -16,14 +16,15 @@ import numpy as np
 from msgspec import Struct
 
 from urlab_client.aio.client import URLabClient as AsyncClient
+from urlab_client.integrations._feed.blocking import BlockingTwin
 from urlab_client.integrations._feed.follower import Follower
 from urlab_client.integrations._feed.samples import Clock, Picture, State
 from urlab_client.integrations._feed.scene import Scene, Simulation
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.errors import ClientClosed, URLabError
+from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import EntityState, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.sync._portal import Portal, aio_of
+from urlab_client.sync._portal import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
 
 __all__ = ["AsyncView", "Moment", "Sink", "View", "ViewOptions", "ViewStats", "make_view"]
@@ -57,7 +58,6 @@ class ViewOptions:
     camera_hz: float
     max_hz: float
     contacts: bool
-    sensors: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,12 +283,8 @@ class AsyncView:
         self._counts["states"] += 1
 
 
-class View:
+class View(BlockingTwin[AsyncView]):
     """A view that is open between `with` and its end. Made by `rerun_view` and its siblings."""
-
-    def __init__(self, view: AsyncView, portal: Portal) -> None:
-        self._aio = view
-        self._portal = portal
 
     @property
     def stats(self) -> ViewStats:
@@ -310,18 +306,6 @@ class View:
         """What showing failed with; the simulation goes on without the view."""
         return self._aio.error
 
-    def __enter__(self) -> Self:
-        self._portal.call(self._aio.__aenter__())
-        return self
-
-    def __exit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        try:
-            self._portal.call(self._aio.__aexit__(exc_type, exc, traceback))
-        except ClientClosed:
-            self._aio.finish()
-
 
 @overload
 def make_view(client: AsyncClient, sink: Sink, options: ViewOptions, name: str) -> AsyncView: ...
@@ -338,10 +322,8 @@ def make_view(client: AsyncClient | URLabClient, sink: Sink, options: ViewOption
     for key, value in (("max_hz", options.max_hz), ("camera_hz", options.camera_hz)):
         if not 0 < value <= 1000:
             raise ValueError(f"{key} is above 0 and at most 1000, not {value}")
-    if isinstance(options.cameras, str) and options.cameras != "all":
-        raise ValueError(f"cameras is a sequence of names or 'all', not {options.cameras!r}")
     core = aio_of(client) if isinstance(client, URLabClient) else client
     view = AsyncView(core, sink, options, name)
     if isinstance(client, URLabClient):
-        return View(view, client._portal)  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
+        return View(view, portal_of(client))
     return view

@@ -102,5 +102,5 @@ def window_view(client: AsyncClient | URLabClient, *, max_hz: float = 60.0) -> A
 
     Entering the block raises `URLabError` where no window can be opened, and says what is missing.
     """
-    options = ViewOptions(cameras=(), camera_hz=1.0, max_hz=max_hz, contacts=True, sensors=False)
+    options = ViewOptions(cameras=(), camera_hz=1.0, max_hz=max_hz, contacts=True)
     return make_view(client, _Window(), options, "window_view")
