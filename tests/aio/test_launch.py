@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from waiting import until
 
 import urlab_client
 from urlab_client import OutcomeUnknown, ServerUnreachable
@@ -78,8 +79,7 @@ async def test_a_killed_server_is_noticed() -> None:
 async def test_cancelling_the_first_call_leaves_no_server_behind() -> None:
     async with URLabClient("sim://ball") as client:
         call = asyncio.create_task(client.discover())
-        while not children():  # noqa: ASYNC110  # the process table has no event to wait for
-            await asyncio.sleep(0)
+        await until(children)
         call.cancel()
         with pytest.raises(asyncio.CancelledError):
             await call

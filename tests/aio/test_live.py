@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import sys
 import threading
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 import pytest
 from publisher import Publisher
+from waiting import eventually, until
 
 import urlab_client
 from urlab_client.aio import URLabClient
@@ -119,13 +120,6 @@ def options(scripted: Any, publisher: Publisher) -> dict[str, Any]:
 async def client(plugin: Plugin, options: dict[str, Any]) -> AsyncIterator[URLabClient]:
     async with URLabClient("tcp://127.0.0.1", **options) as made:
         yield made
-
-
-async def until(condition: Callable[[], object]) -> None:
-    """Let the loop run until something is so that nobody announces."""
-    async with asyncio.timeout(5):
-        while not condition():  # noqa: ASYNC110
-            await asyncio.sleep(0)
 
 
 class TestInTheBackground:
@@ -246,8 +240,7 @@ class TestInTheBackground:
                         plugin.tick(float(time))
                         assert states.receive().time == time
                     assert client.sim_time == 0.0
-                while client.sim_time != 4.0:
-                    client.meta()
+                eventually(lambda: client.meta() and client.sim_time == 4.0)
 
 
 class TestOnRequest:

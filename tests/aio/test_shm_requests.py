@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from plugin_memory import PluginMemory
+from waiting import until
 
 from urlab_client.aio import URLabClient
 from urlab_client.protocol import shm
@@ -174,8 +175,7 @@ async def test_a_reply_to_something_else_is_dropped(connect: Any, plugin: Plugin
     task = asyncio.create_task(client.step())
     await asyncio.to_thread(plugin.held.get)
     plugin.reply({"op": "set_paused_ok", "paused": True})
-    while client.transport_stats.late == 0:  # noqa: ASYNC110 - counters have no event
-        await asyncio.sleep(0)
+    await until(lambda: client.transport_stats.late)
     plugin.reply(STEP | {"time": 0.25})
     assert (await task).time == 0.25
 

@@ -8,7 +8,7 @@ import logging
 import socket
 import sys
 import threading
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any, Self
 
@@ -18,6 +18,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from publisher import Publisher
+from waiting import until
 
 from urlab_client.aio.reception import LiveReception
 from urlab_client.aio.sources import CameraSource, EventBus, RowSource, StateSource
@@ -81,13 +82,6 @@ def latest(source: Any, **options: Any) -> Stream[Any]:
 
 def everything(source: Any, **options: Any) -> Stream[Any]:
     return Stream(source, policy="all", **{"default_timeout": 5.0, **options})
-
-
-async def until(condition: Callable[[], object]) -> None:
-    """Let the loop run until something is so that nobody announces."""
-    async with asyncio.timeout(5):
-        while not condition():  # noqa: ASYNC110
-            await asyncio.sleep(0)
 
 
 class Marker:

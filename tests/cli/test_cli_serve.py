@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from commands import DEADLINE_S, FREE_PORTS, GYMNASIUM_MODELS, child, refusal, served, signals_kept, urlab
+from waiting import eventually
 
 from urlab_client import ModeLocked, URLabClient, URLabPDController
 from urlab_client.cli import main
@@ -45,8 +46,7 @@ def test_ends_while_a_client_is_connected_and_physics_runs(tmp_path: Path) -> No
     with served("ball", "--play", "--unpaused", cwd=tmp_path) as server, URLabClient(**server.client_options) as client:
         client.discover()
         before = client.step().time
-        while client.step().time == before:
-            pass
+        eventually(lambda: client.step().time > before)
         assert server.end(signal.SIGTERM) == (0, "", "")
 
 

@@ -6,12 +6,12 @@ import itertools
 import json
 import re
 import shlex
-import time
 from pathlib import Path
 from urllib.request import Request, urlopen
 
 from pages import ROOT, Block, blocks
 from shell import Shell, same, steps
+from waiting import eventually
 
 PAGE = ROOT / "docs" / "console.md"
 
@@ -56,9 +56,7 @@ def test_the_requests_work_as_shown(tmp_path: Path) -> None:
         assert inner is not None, login[0]
         key = json.loads(fetch(inner[1].replace("…", token[1]), port))["key"]
         assert others
-        deadline = time.monotonic() + 30
-        while not knows_the_robots(port, key):
-            assert time.monotonic() < deadline, "the console does not get to know its robots"
+        eventually(lambda: knows_the_robots(port, key), "the console does not get to know its robots")
         for command, output in others:
             got = fetch(command, port, KEY=key)
             assert not output or not same(output, got), f"{command}: {got}"

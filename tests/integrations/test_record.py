@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import errno
 import json
 import math
@@ -21,6 +20,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from waiting import until
 
 import urlab_client
 from urlab_client.aio import URLabClient as AsyncClient
@@ -282,9 +282,8 @@ async def test_live_mode_records_every_snapshot_and_modes_may_change(tmp_path: P
         async with AsyncClient(**server.client_options(), step_mode="live") as client:
             await client.discover()
             await client.runtime.set_paused(False)
-            async with record(client, tmp_path / "run.mcap") as recorder, asyncio.timeout(30):
-                while recorder.stats.states < 50:  # noqa: ASYNC110
-                    await asyncio.sleep(0.01)
+            async with record(client, tmp_path / "run.mcap") as recorder:
+                await until(lambda: recorder.stats.states >= 50)
                 await client.runtime.set_mode("direct")
                 await client.step()
                 first = client.sim_time

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from waiting import until
 
 import urlab_client
 from urlab_client.aio import URLabClient as AsyncClient
@@ -133,12 +134,6 @@ def test_stepping_never_waits_and_the_newest_state_is_shown(
     body = next(iter(client.articulations["quadruped"].bodies))
     shown = rows(path, f"/world/quadruped_{body}", "Transform3D:translation")
     assert [times["sim_time"] for times, _ in shown] == [round(time * 1e9)]
-
-
-async def until(condition: Callable[[], bool]) -> None:
-    async with asyncio.timeout(30):
-        while not condition():  # noqa: ASYNC110
-            await asyncio.sleep(0.01)
 
 
 async def test_live_mode_is_followed_and_another_servers_robots_replace_the_first(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from typing import TypeVar
 
 import pytest
 from served import Served
+from waiting import until
 
 from urlab_client.aio import URLabClient
 from urlab_client.protocol.errors import NotReady, URLabConnectionError, URLabRPCError, URLabTimeoutError
@@ -36,8 +37,7 @@ async def in_time(deadline: float, call: Awaitable[T]) -> T:
 
 async def sent(client: URLabClient, number: int) -> None:
     """Wait until so many requests have left."""
-    while client.transport_stats.sent + client.transport_stats.over_shm < number:  # noqa: ASYNC110 - nobody tells
-        await asyncio.sleep(0)
+    await until(lambda: client.transport_stats.sent + client.transport_stats.over_shm >= number, look=0)
 
 
 async def lose(client: URLabClient, strike: Strike, call: Awaitable[object]) -> None:
@@ -117,9 +117,7 @@ def held() -> tuple[list[str], int]:
 
 async def released(before: tuple[list[str], int]) -> None:
     """Wait until nothing more is held than before."""
-    async with asyncio.timeout(SLACK_S):
-        while (now := held())[0] != before[0] or now[1] > before[1]:  # noqa: ASYNC110 - nobody tells
-            await asyncio.sleep(0)
+    await until(lambda: (now := held())[0] == before[0] and now[1] <= before[1])
 
 
 @pytest.mark.parametrize(("state", "death", "transport"), COMBINATIONS)

@@ -10,7 +10,6 @@ import stat
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
@@ -21,6 +20,7 @@ import msgspec
 import pytest
 import zmq
 from raw_shm import HEADER, RawRegion, RawShm
+from waiting import eventually
 
 from urlab_client.server import SimulatedServer
 
@@ -67,15 +67,6 @@ def session(rpc: Rpc) -> str:
     session = rpc(op="hello")["session_id"]
     assert rpc(op="set_mode", session_id=session, mode="direct")["op"] == "set_mode_ok"
     return session
-
-
-def eventually(condition: Callable[[], Any], seconds: float = 10.0) -> Any:
-    """Wait for something to be true, looking often."""
-    deadline = time.monotonic() + seconds
-    while not (found := condition()):
-        assert time.monotonic() < deadline, "it did not happen in time"
-        time.sleep(0.002)
-    return found
 
 
 def snapshot_of(state: RawRegion, step: int) -> dict[str, Any] | None:

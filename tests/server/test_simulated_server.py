@@ -18,6 +18,7 @@ from typing import Any
 import msgspec
 import pytest
 import zmq
+from waiting import eventually
 from wire import Wire, pack, write_level
 
 from urlab_client import URLabClient
@@ -218,8 +219,7 @@ def test_close_during_a_long_step(models: Path, connect: Connect) -> None:
         wire.ask("set_mode", mode="direct")
         reply = ask_later(wire, "step", n_steps=Limits().n_steps)
         running = server._opened._core.play.running()
-        while running.engine.time == 0.0:
-            pass
+        eventually(lambda: running.engine.time > 0.0)
     assert reply.result(10)["code"] == "shutting_down"
 
 
@@ -231,8 +231,7 @@ def test_close_while_a_step_waits(models: Path, connect: Connect) -> None:
         wire.ask("set_paused", paused=True)
         reply = ask_later(wire, "step")
         engine = server._opened._core.play.running().engine
-        while not engine._queue:
-            pass
+        eventually(lambda: engine._queue)
     assert reply.result(10)["code"] == "shutting_down"
 
 
