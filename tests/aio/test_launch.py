@@ -7,13 +7,14 @@ import os
 import signal
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 from waiting import until
 
 import urlab_client
-from urlab_client import OutcomeUnknown, ServerUnreachable
+from urlab_client import ClientClosed, OutcomeUnknown, ServerUnreachable
 from urlab_client.aio import URLabClient
 from urlab_client.aio.launch import serve_arguments
 
@@ -84,6 +85,34 @@ async def test_cancelling_the_first_call_leaves_no_server_behind() -> None:
         with pytest.raises(asyncio.CancelledError):
             await call
     assert children() == set()
+
+
+@pytest.mark.parametrize("moment", ["before there is a process", "before it is ready"])
+async def test_closing_while_the_server_starts_leaves_none_behind(moment: str) -> None:
+    client = URLabClient("sim://ball")
+    call = asyncio.create_task(client.discover())
+    await asyncio.sleep(0)
+    while moment == "before it is ready" and not children():  # noqa: ASYNC110  # the process table has no event
+        await asyncio.sleep(0)
+    await client.close()
+    assert children() == set()
+    with pytest.raises(ClientClosed):
+        await call
+    assert children() == set()
+    with pytest.raises(ClientClosed):
+        await client.discover()
+
+
+def test_closing_a_blocking_client_while_its_server_starts() -> None:
+    client = urlab_client.URLabClient("sim://ball")
+    with ThreadPoolExecutor(1) as pool:
+        call = pool.submit(client.discover)
+        while not children():
+            pass
+        client.close()
+        assert children() == set()
+        with pytest.raises(ClientClosed):
+            call.result()
 
 
 def test_the_server_dies_with_its_client() -> None:

@@ -79,6 +79,7 @@ class LaunchedTransport:
         self._process: asyncio.subprocess.Process | _Watched | None = None
         self._drain: asyncio.Task[None] | None = None
         self._inner: ZmqTransport | None = None
+        self._launching: asyncio.Task[ZmqTransport] | None = None
         self._state_port: int | None = None
         self._lost_at = 0.0
         self._closed = False
@@ -118,7 +119,7 @@ class LaunchedTransport:
         if self._inner is None:
             loop = asyncio.get_running_loop()
             before = loop.time()
-            self._inner = await self._launch(op)
+            self._inner = await self._started(op)
             took = loop.time() - before
             deadline = None if deadline is None else deadline + took
             connect_by = None if connect_by is None else connect_by + took
@@ -132,6 +133,9 @@ class LaunchedTransport:
         if self._closed:
             return
         self._closed = True
+        if self._launching is not None:
+            self._launching.cancel()
+            await asyncio.wait((self._launching,))
         await self._bury()
 
     async def _bury(self) -> None:
@@ -155,9 +159,27 @@ class LaunchedTransport:
         if drain is not None:
             await drain
 
-    async def _launch(self, op: Op) -> ZmqTransport:
+    async def _started(self, op: Op) -> ZmqTransport:
+        """Start a server in a task of its own, which `aclose` can break off as well as who waits for it."""
         if self._closed:
-            raise ClientClosed(f"The client of {self._address} is closed.", hint="Make a new client.")
+            raise self._was_closed()
+        await self._bury()  # what is left of a start that was broken off
+        task = self._launching = asyncio.create_task(self._launch(op), name="urlab-launch")
+        try:
+            # Cancelled, this cancels the task and waits for its end.
+            (transport,) = await asyncio.gather(task, return_exceptions=True)
+        finally:
+            self._launching = None
+        if self._closed:
+            raise self._was_closed()
+        if isinstance(transport, BaseException):
+            raise transport
+        return transport
+
+    def _was_closed(self) -> ClientClosed:
+        return ClientClosed(f"The client of {self._address} was closed.", hint="Make a new client.")
+
+    async def _launch(self, op: Op) -> ZmqTransport:
         command = [sys.executable, "-m", "urlab_client", "serve", *_DEFAULTS, *self._arguments]
         process = await _start(command)
         self._process = process
