@@ -97,7 +97,7 @@ class URLabClient:
         client_key: File with the client's own secret key, for servers that know their clients; likewise
             `URLAB_CLIENT_KEY`. None makes up a key.
         trust_server: Load the binary model of a server that is neither on this machine nor known by its key. Without,
-            the model is compiled here from XML.
+            the model is compiled here from XML, in a child process with limits.
         live_pictures: Receive the pictures of all cameras by themselves in live mode, for `latest_frame`. False spares
             server and network those that nobody looks at; `frames()` is received all the same.
 

@@ -80,6 +80,28 @@ def write_options(opt: mujoco.MjOption, options: SimOptions) -> None:
         opt.disableflags = _switched(opt.disableflags, bit, not options.enable_multiccd)
 
 
+def _from_binary(mjb: bytes) -> mujoco.MjModel:
+    import mujoco  # noqa: PLC0415
+
+    return mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": mjb})
+
+
+def _compiled(xml: str, assets: dict[str, bytes], *, trusted: bool) -> mujoco.MjModel:
+    import mujoco  # noqa: PLC0415
+
+    if trusted:
+        return mujoco.MjModel.from_xml_string(xml, assets)
+    from urlab_client.aio.compilation import compile_confined  # noqa: PLC0415 - it is run as a program, too
+
+    try:
+        return _from_binary(compile_confined(xml, assets))
+    except ValueError as error:
+        raise ValueError(
+            f"{error}. The server is neither on this machine nor known by its key, so what its model may ask for and "
+            "read is limited: trust_server=True lifts that, local_model=False loads no model"
+        ) from None
+
+
 def _switched(mask: int, bit: int, on: bool) -> int:
     return mask | bit if on else mask & ~bit
 
@@ -126,8 +148,12 @@ class Mirror:
         return None if same else URLabVersionMismatch(hello.mujoco_version, client)
 
     @classmethod
-    def load(cls, hello: HelloOk) -> Loaded | None:
+    def load(cls, hello: HelloOk, *, trusted: bool) -> Loaded | None:
         """Load the handshake's model, None if there is none. Blocking, and without effect here: run it in a thread.
+
+        Args:
+            hello: The handshake.
+            trusted: Whether the server may have its XML compiled in this process.
 
         Raises:
             ProtocolError: The bytes are not a model this MuJoCo can load.
@@ -138,9 +164,9 @@ class Mirror:
         try:
             binary = mismatch is None and hello.mjb is not None
             if binary and hello.mjb is not None:
-                model = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": hello.mjb})
+                model = _from_binary(hello.mjb)
             elif hello.mjcf_compiled is not None:
-                model = mujoco.MjModel.from_xml_string(hello.mjcf_compiled, hello.vfs_assets or {})
+                model = _compiled(hello.mjcf_compiled, hello.vfs_assets or {}, trusted=trusted)
             else:
                 return None
         except (ValueError, mujoco.FatalError) as error:

@@ -10,6 +10,7 @@ import re
 import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Protocol
 
 import anyio.to_thread
@@ -241,7 +242,8 @@ class SimState:
         if self._local_model:
             if hello.mjb is not None and not self._trusted:
                 hello = await self._without_binary(hello, timeout)
-            loaded = await anyio.to_thread.run_sync(self.mirror.load, hello, abandon_on_cancel=True)
+            load = partial(self.mirror.load, hello, trusted=self._trusted)
+            loaded = await anyio.to_thread.run_sync(load, abandon_on_cancel=True)
         # From here on nothing waits until all is taken over: cancelled or not, model and wrappers belong together.
         # The model's bytes, several times its size, are not needed any more.
         hello.mjb = hello.mjcf_compiled = hello.vfs_assets = None

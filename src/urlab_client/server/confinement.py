@@ -7,16 +7,14 @@ little.
 
 from __future__ import annotations
 
-import html
 import os
-import re
 from pathlib import Path
 
+from urlab_client._confined import named_files
 from urlab_client.server.limits import Limits
 
 __all__ = ["Outside", "check_references"]
 
-_REFERENCE = re.compile(r"""([\w.:-]*(?:file|dir)[\w.:-]*)\s*=\s*(?:"([^"]*)"|'([^']*)')""")
 _MAX_COMBINATIONS = 1_000_000
 
 
@@ -54,9 +52,12 @@ def check_references(file: Path, roots: tuple[Path, ...], limits: Limits) -> Non
         for path in waiting:
             text = _text(path, limits, must=path == file)
             bases.add(path.parent)
-            for attribute, double, single in _REFERENCE.findall(text):
-                value = html.unescape(double or single).replace("\\", "/")
-                (folders if attribute.endswith("dir") else names).add(value)
+            try:
+                found_names, found_folders = named_files(text)
+            except ValueError as error:
+                raise Outside(str(error)) from None
+            names |= found_names
+            folders |= found_folders
         waiting = list[Path]()
         variants = names | {name.rpartition("/")[2] for name in names}
         tried += len(bases) * len(folders) * len(variants)
@@ -107,7 +108,4 @@ def _text(path: Path, limits: Limits, *, must: bool) -> str:
         raise Outside(f"{path} is larger than the limit model_file_bytes, {limits.model_file_bytes}")
     if must and not _is_xml(path):
         raise Outside("it is empty, or no XML")
-    text = path.read_bytes().decode("utf-8", errors="replace")
-    if "<!ENTITY" in text or "<!DOCTYPE" in text:
-        raise Outside("it has a document type, which no MJCF needs")
-    return text
+    return path.read_bytes().decode("utf-8", errors="replace")

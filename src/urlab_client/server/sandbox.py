@@ -23,6 +23,7 @@ from typing import Final
 
 import msgspec
 
+from urlab_client._confined import limit_process
 from urlab_client.server.confinement import Outside, check_references
 from urlab_client.server.content import Compiled, build_snapshot, one_line
 from urlab_client.server.limits import Limits
@@ -158,7 +159,7 @@ def _fork(order: _Order) -> _Outcome:
     if pid == 0:
         os.close(reading)
         try:
-            _confine(order.limits)
+            limit_process(order.limits.model_memory_bytes, order.limits.model_cpu_s)
             with os.fdopen(writing, "wb") as stream:
                 stream.write(msgspec.json.encode(_work(order)))
         finally:
@@ -193,20 +194,6 @@ def _read(descriptor: int, deadline: float) -> tuple[bytes, bool]:
             return b"".join(parts), True
         parts.append(part)
     return b"", False
-
-
-def _confine(limits: Limits) -> None:
-    import resource  # noqa: PLC0415 - not on Windows
-
-    present = 0
-    with contextlib.suppress(OSError):
-        present = int(Path("/proc/self/statm").read_text("ascii").split()[0]) * resource.getpagesize()
-    # A hard limit above the soft one: the signal at the soft one tells why it ended.
-    resource.setrlimit(resource.RLIMIT_CPU, (limits.model_cpu_s, limits.model_cpu_s + 5))
-    memory = present + limits.model_memory_bytes
-    resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
-    resource.setrlimit(resource.RLIMIT_FSIZE, (memory, memory))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
 def _work(order: _Order) -> _Outcome:

@@ -1,0 +1,49 @@
+"""What a process that compiles a foreign model may use, and which files the model names. For client and server."""
+
+from __future__ import annotations
+
+import contextlib
+import html
+import re
+import sys
+from pathlib import Path
+
+__all__ = ["limit_process", "named_files"]
+
+_REFERENCE = re.compile(r"""([\w.:-]*(?:file|dir)[\w.:-]*)\s*=\s*(?:"([^"]*)"|'([^']*)')""")
+
+
+def named_files(text: str) -> tuple[set[str], set[str]]:
+    """Return the names of files and of folders in the text of an MJCF. They may be too many, never too few.
+
+    Raises:
+        ValueError: The text has a document type, which could hide names.
+    """
+    if "<!ENTITY" in text or "<!DOCTYPE" in text:
+        raise ValueError("it has a document type, which no MJCF needs")
+    names: set[str] = set()
+    folders: set[str] = set()
+    for attribute, double, single in _REFERENCE.findall(text):
+        value = html.unescape(double or single).replace("\\", "/")
+        (folders if attribute.endswith("dir") else names).add(value)
+    return names, folders
+
+
+def limit_process(memory_bytes: int, cpu_s: int) -> None:
+    """Limit this process for good, as far as the system can: memory besides what it has, and processor time.
+
+    Beyond the time it is ended by SIGXCPU; beyond the memory, allocations fail.
+    """
+    if sys.platform == "win32":
+        return
+    import resource  # noqa: PLC0415 - not on Windows
+
+    present = 0
+    with contextlib.suppress(OSError):
+        present = int(Path("/proc/self/statm").read_text("ascii").split()[0]) * resource.getpagesize()
+    # A hard limit above the soft one: the signal at the soft one tells why it ended.
+    resource.setrlimit(resource.RLIMIT_CPU, (cpu_s, cpu_s + 5))
+    memory = present + memory_bytes
+    resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (memory, memory))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

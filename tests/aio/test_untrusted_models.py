@@ -1,0 +1,126 @@
+"""Models of servers that are neither on this machine nor known by their key: compiled in a child, with limits."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import pytest
+
+from urlab_client import ProtocolError
+from urlab_client.aio import URLabClient, compilation
+from urlab_client.aio import client as client_module
+
+MESH = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+BODY = '<body><freejoint/><geom size=".1"/></body>'
+HUGE = f'<mujoco><worldbody><replicate count="1000000">{BODY}</replicate></worldbody></mujoco>'
+BALLS = "".join(
+    f'<body pos="{i * 0.15} 0 {0.05 + 0.1 * (i % 2)}"><freejoint/><geom size=".1"/></body>' for i in range(8)
+)
+# Contacts, and a solver that is never content.
+ENDLESS = (
+    '<mujoco><option solver="PGS" iterations="2000000000" tolerance="0"/>'
+    f'<worldbody><geom type="plane" size="1 1 1"/>{BALLS}</worldbody></mujoco>'
+)
+
+
+@pytest.fixture
+def told(scripted: Any, monkeypatch: pytest.MonkeyPatch) -> Callable[..., URLabClient]:
+    """Make a client of a server that sends this model and seems to be on another machine."""
+    monkeypatch.setattr(client_module, "is_local", lambda address: False)
+
+    def make(xml: str, assets: dict[str, bytes] | None = None, **options: Any) -> URLabClient:
+        reply = {
+            "op": "hello_ok",
+            "session_id": "11111111-2222-3333-4444-555555555555",
+            "urlab_version": "urlab/0.1",
+            "mujoco_version_int": float(mujoco.mj_version()),
+            "mujoco_version": mujoco.mj_versionString(),
+            "manager_present": True,
+            "articulations": [],
+            "mjcf_compiled": xml,
+            "vfs_assets": assets or {},
+        }
+        scripted.on("hello", reply)
+        return URLabClient("tcp://127.0.0.1", step_port=scripted.port, **options)
+
+    return make
+
+
+async def test_it_is_compiled_with_the_files_that_came_with_it(told: Callable[..., URLabClient]) -> None:
+    xml = (
+        '<mujoco><compiler meshdir="/nowhere/meshes"/><asset><mesh name="m" file="m.obj"/></asset>'
+        '<worldbody><geom type="mesh" mesh="m"/></worldbody></mujoco>'
+    )
+    async with told(xml, {"m.obj": MESH.encode()}) as client:
+        await client.discover()
+        assert client.model is not None
+        assert client.model.nmeshvert == 4
+        assert client.model_is_approximate
+
+
+@pytest.mark.parametrize(
+    "xml",
+    [
+        '<mujoco><asset><mesh file="{file}"/></asset></mujoco>',
+        '<mujoco><compiler meshdir="{folder}"/><asset><mesh file="secret.obj"/></asset></mujoco>',
+        '<mujoco><compiler strippath="true" meshdir="{folder}"/><asset><mesh file="x/secret.obj"/></asset></mujoco>',
+        '<mujoco><include file="{file}"/></mujoco>',
+        '<mujoco><asset><hfield name="h" size="1 1 1 1" file="{escaped}"/></asset></mujoco>',
+        '<mujoco><asset><texture name="t" type="2d" file="/dev/zero"/></asset></mujoco>',
+    ],
+)
+async def test_it_reads_no_file_of_this_machine(told: Callable[..., URLabClient], tmp_path: Path, xml: str) -> None:
+    secret = tmp_path / "secret.obj"
+    secret.write_text(MESH)
+    named = xml.format(file=secret, folder=tmp_path, escaped=str(secret).replace("/", "&#47;"))
+    async with told(named) as client:
+        with pytest.raises(ProtocolError, match=r"a file of this machine.*local_model=False"):
+            await client.discover()
+        assert client.model is None
+
+
+async def test_it_may_not_hide_names_in_entities(told: Callable[..., URLabClient]) -> None:
+    async with told('<!DOCTYPE mujoco [<!ENTITY f "/etc/passwd">]><mujoco/>') as client:
+        with pytest.raises(ProtocolError, match="document type"):
+            await client.discover()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there is no limit of processor time")
+@pytest.mark.parametrize("xml", [HUGE, ENDLESS], ids=["huge", "endless"])
+async def test_it_takes_no_more_time_than_it_may(
+    told: Callable[..., URLabClient], monkeypatch: pytest.MonkeyPatch, xml: str
+) -> None:
+    monkeypatch.setattr(compilation, "_CPU_S", 1)
+    async with told(xml) as client:
+        with pytest.raises(ProtocolError, match=r"more than 1 s of processor time.*trust_server=True"):
+            await client.discover()
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="there is no limit of memory")
+async def test_it_takes_no_more_memory_than_it_may(
+    told: Callable[..., URLabClient], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compilation, "_MEMORY_BYTES", 64 * 2**20)
+    texture = '<texture name="t" type="2d" builtin="flat" width="8000" height="8000"/>'
+    async with told(f"<mujoco><asset>{texture}</asset></mujoco>") as client:
+        with pytest.raises(ProtocolError, match=r"allocate memory.*trust_server=True"):
+            await client.discover()
+
+
+async def test_what_mujoco_says_of_it_is_passed_on(told: Callable[..., URLabClient]) -> None:
+    async with told("<mujoco><worldbody><geom/></worldbody></mujoco>") as client:
+        with pytest.raises(ProtocolError, match="size"):
+            await client.discover()
+
+
+async def test_a_trusted_server_has_no_limits(
+    told: Callable[..., URLabClient], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compilation, "_MAX_COMBINATIONS", -1)
+    async with told(f"<mujoco><worldbody>{BODY}</worldbody></mujoco>", trust_server=True) as client:
+        await client.discover()
+        assert client.model is not None
