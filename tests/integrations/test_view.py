@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import base64
 import contextlib
+import io
 import json
 import threading
 from collections.abc import Callable, Iterator
@@ -13,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from waiting import until
+from waiting import eventually, until
 
 import urlab_client
 from urlab_client.aio import URLabClient as AsyncClient
@@ -136,7 +137,9 @@ def test_stepping_never_waits_and_the_newest_state_is_shown(
     assert [times["sim_time"] for times, _ in shown] == [round(time * 1e9)]
 
 
-async def test_live_mode_is_followed_and_another_servers_robots_replace_the_first(tmp_path: Path) -> None:
+async def test_live_mode_is_followed_and_another_servers_robots_replace_the_first(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     path = tmp_path / "run.rrd"
     first = SimulatedServer("arm", play=True)
     with contextlib.ExitStack() as servers:
@@ -146,7 +149,7 @@ async def test_live_mode_is_followed_and_another_servers_robots_replace_the_firs
         async with AsyncClient(**options, step_mode="live") as client:
             await client.discover()
             await client.runtime.set_paused(False)
-            async with rerun_view(client, save=path) as view:
+            async with rerun_view(client, save=path, cameras=["wrist"]) as view:
                 await until(lambda: view.stats.states >= 5)
                 servers.close()
                 servers.enter_context(SimulatedServer("quadruped", play=True, **ports))
@@ -157,6 +160,40 @@ async def test_live_mode_is_followed_and_another_servers_robots_replace_the_firs
     assert view.error is None
     assert len(rows(path, "/joints/arm/elbow", "Scalars:scalars")) >= 5
     assert len(rows(path, "/joints/quadruped/FL_hip", "Scalars:scalars")) >= 5
+    assert "in the new scene there is no camera 'wrist'; there are: quadruped/head, quadruped/side" in caplog.text
+
+
+def test_rerun_is_shown_what_the_cameras_see(tmp_path: Path) -> None:
+    from PIL import Image
+
+    path = tmp_path / "run.rrd"
+    modes = {"arm/wrist": "depth", "arm/overview": "real"}
+    with (
+        SimulatedServer("arm", play=True, camera_modes=modes, camera_size=(80, 60)) as server,
+        urlab_client.URLabClient(**server.client_options(), step_mode="direct") as client,
+    ):
+        client.discover()
+        client.reset()
+        with rerun_view(client, save=path, cameras="all", camera_hz=1000, max_hz=1000) as view:
+            client.step()
+            eventually(lambda: view.stats.frames == 2)
+            cameras = client.articulations["arm"].cameras
+            depth, colour = cameras["wrist"].latest_frame, cameras["overview"].latest_frame
+            size, time = cameras["overview"].resolution, client.sim_time
+            fovy = client.model.camera("arm_overview").fovy[0]
+    assert depth is not None
+    assert colour is not None
+    ((times, (buffer,)),) = rows(path, "/world/cameras/arm/wrist/image", "DepthImage:buffer")
+    assert times["sim_time"] == round(time * 1e9)
+    assert np.array_equal(np.frombuffer(bytes(buffer), "<f4").reshape(depth.shape), depth)
+    ((_, (jpeg,)),) = rows(path, "/world/cameras/arm/overview/image", "EncodedImage:blob")
+    with Image.open(io.BytesIO(bytes(jpeg))) as image:
+        assert image.size == size
+        assert np.abs(np.asarray(image, float) - colour[..., :3]).mean() < 3  # what JPEG costs
+    ((_, (matrix,)),) = rows(path, "/world/cameras/arm/overview", "Pinhole:image_from_camera")
+    focal = size[1] / 2 / np.tan(np.radians(fovy / 2))
+    assert np.allclose(np.reshape(matrix, (3, 3)).T, [[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]])
+    assert rows(path, "/world/cameras/arm/overview", "Transform3D:translation")
 
 
 def test_a_window_without_a_display_says_what_is_missing(
@@ -223,6 +260,9 @@ class Foxglove:
             told = json.loads(message)
             if told["op"] == "advertise":
                 await self._subscribe(told["channels"])
+            elif told["op"] == "unadvertise":
+                for number in told["channelIds"]:
+                    del self.channels[self.topics.pop(number)]
 
     async def _subscribe(self, channels: list[dict[str, Any]]) -> None:
         for channel in channels:
@@ -277,3 +317,45 @@ async def test_foxglove_is_told_frames_geometry_joints_and_contacts(server: Simu
     assert len(markers.spheres) == len(contacts) > 3
     for sphere, contact in zip(markers.spheres, contacts, strict=True):
         assert [getattr(sphere.pose.position, axis) for axis in "xyz"] == list(contact["position"].values())
+
+
+async def test_another_servers_robots_and_cameras_replace_the_first_in_foxglove() -> None:
+    from PIL import Image
+    from websockets.asyncio.client import connect
+
+    def drawn(seen: Foxglove) -> set[str]:
+        update = scene_update(seen.channels["/scene"]["schema"], seen.newest["/scene"])
+        assert [deletion.type for deletion in update.deletions] == [1]  # all that there was before
+        return {entity.id.partition("_")[0] for entity in update.entities}
+
+    options: dict[str, Any] = {"play": True, "camera_size": (80, 60)}
+    with contextlib.ExitStack() as servers:
+        reach = servers.enter_context(SimulatedServer("arm", **options)).client_options()
+        ports = {name: number for name, number in reach.items() if name.endswith("_port")}
+        async with AsyncClient(**reach, step_mode="live") as client, asyncio.timeout(60):
+            await client.discover()
+            await client.runtime.set_paused(False)
+            async with (
+                foxglove_view(client, port=0, cameras="all") as view,
+                connect(view.address, subprotocols=["foxglove.sdk.v1"], max_size=None) as socket,
+            ):
+                seen = Foxglove(socket)
+                await seen.until("/tf", "/scene", "/state/arm", "/camera/arm/wrist")
+                assert "arm" in drawn(seen)
+                servers.close()
+                servers.enter_context(SimulatedServer("quadruped", **options, **ports))
+                await client.discover()
+                await client.runtime.set_paused(False)
+                await seen.until("/tf", "/scene", "/state/quadruped", "/camera/quadruped/side")
+                assert "quadruped" in drawn(seen)
+                assert "arm" not in drawn(seen)
+                frames = {frame["child_frame_id"] for frame in json.loads(seen.newest["/tf"])["transforms"]}
+                size = client.articulations["quadruped"].cameras["side"].resolution
+    assert view.error is None
+    assert "/state/quadruped" in seen.channels
+    assert "/state/arm" not in seen.channels
+    assert "quadruped/side" in frames
+    assert not any(frame.startswith("arm") for frame in frames)
+    picture = json.loads(seen.newest["/camera/quadruped/side"])
+    with Image.open(io.BytesIO(base64.b64decode(picture["data"]))) as image:
+        assert (image.format, image.size) == ("JPEG", size)

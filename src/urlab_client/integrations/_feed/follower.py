@@ -11,10 +11,10 @@ from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.state import SimState
 from urlab_client.integrations._feed.samples import Picture, Schedule, State
-from urlab_client.integrations._feed.scene import Scene
+from urlab_client.integrations._feed.scene import CameraLayout, Scene
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import ClientClosed, StreamOverflow, URLabError
-from urlab_client.protocol.messages.session import ResetOk, StateReply, StepOk
+from urlab_client.protocol.messages.session import HelloOk, ResetOk, StateReply, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
 
 __all__ = ["Follower"]
@@ -61,9 +61,10 @@ class Follower:
         self._buffer = buffer
         self._put: Callable[[State | Picture], None] | None = None
         self._scene: Scene | None = None
-        self._described: object = None
+        self._described: HelloOk | None = None
         self._expected = False
         self._tasks: list[asyncio.Task[None]] = []
+        self._camera_tasks: list[asyncio.Task[None]] = []
         self._live = False
 
     def check(self) -> Scene:
@@ -77,6 +78,14 @@ class Follower:
             raise URLabError(
                 f"{self._name}: what there is to see is not known yet.", hint="Call discover() first, during play."
             )
+        if self._needs_model is not None and self._state.mirror.model is None:
+            raise URLabError(
+                f"{self._name}: poses are computed with the local model, and there is none.",
+                hint=f"Call discover() during play, with local_model=True{self._needs_model}.",
+            )
+        unknown = self._unknown_cameras()
+        if unknown:
+            raise KeyError(unknown)
         return self._current()
 
     def start(self, put: Callable[[State | Picture], None]) -> None:
@@ -137,43 +146,35 @@ class Follower:
 
     def _current(self) -> Scene:
         """Return the scene, described anew when there was another handshake."""
-        model = self._state.mirror.model
-        if self._scene is None or model is not self._described:
-            self._described = model
-            try:
-                self._scene = self._describe()
-            except (KeyError, URLabError) as error:
-                if self._scene is None:
-                    raise
-                # The client goes on, and so does this, with what it knows.
-                log.warning("%s: the new scene lacks what is followed: %s", self._name, error)
+        hello = self._state.hello
+        if self._scene is None or hello is not self._described:
+            if self._scene is not None and (unknown := self._unknown_cameras()):
+                log.warning("%s: in the new scene there is %s", self._name, unknown)
+            self._described = hello
+            self._scene = Scene.of(self._state, self._views())
+            if self._live:
+                self._follow_cameras(self._scene)
         return self._scene
 
-    def _describe(self) -> Scene:
-        state = self._state
-        if self._needs_model is not None and state.mirror.model is None:
-            raise URLabError(
-                f"{self._name}: poses are computed with the local model, and there is none.",
-                hint=f"Call discover() during play, with local_model=True{self._needs_model}.",
-            )
-        return Scene.of(state, self._views())
+    def _every_camera(self) -> dict[str, URLabCameraView]:
+        arts = self._state.articulations
+        own = {f"{key}/{name}": view for key, art in arts.items() for name, view in art.cameras.items()}
+        return own | dict(self._state.global_cameras)
+
+    def _unknown_cameras(self) -> str:
+        """Say which cameras are not there; nothing if all are."""
+        missing = (
+            [] if self._wanted_cameras == "all" else [n for n in self._wanted_cameras if not self._state.camera(n)]
+        )
+        there = ", ".join(self._every_camera()) or "none"
+        return f"no camera {', '.join(map(repr, missing))}; there are: {there}" if missing else ""
 
     def _views(self) -> list[tuple[str, URLabCameraView]]:
-        state = self._state
-        every = {
-            f"{key}/{name}": view for key, art in state.articulations.items() for name, view in art.cameras.items()
-        }
-        every |= dict(state.global_cameras)
+        every = self._every_camera()
         if self._wanted_cameras == "all":
             return list(every.items())
-        names = {id(view): name for name, view in every.items()}
-        chosen: dict[int, tuple[str, URLabCameraView]] = {}
-        for wanted in self._wanted_cameras:
-            view = state.camera(wanted)
-            if view is None:
-                raise KeyError(f"no camera {wanted!r}; there are: {', '.join(every) or 'none'}")
-            chosen[id(view)] = names[id(view)], view
-        return list(chosen.values())
+        wanted = {id(self._state.camera(name)) for name in self._wanted_cameras}
+        return [(name, view) for name, view in every.items() if id(view) in wanted]
 
     def _hand_on(self, reply: StateReply | StateSnapshot) -> None:
         put = self._put
@@ -194,10 +195,18 @@ class Follower:
 
     def _listen(self) -> None:
         """Follow the streams, as live mode brings nothing by replies."""
-        self._live = True
         scene = self._current()
-        self._tasks = [asyncio.create_task(self._follow_states(), name="urlab-feed")]
-        self._tasks += [asyncio.create_task(self._follow_camera(view), name="urlab-feed") for view in scene.cameras]
+        self._live = True
+        self._tasks.append(asyncio.create_task(self._follow_states(), name="urlab-feed"))
+        self._follow_cameras(scene)
+
+    def _follow_cameras(self, scene: Scene) -> None:
+        """Follow this scene's cameras instead of those before."""
+        for task in self._camera_tasks:
+            task.cancel()
+        cameras = scene.cameras.values()
+        self._camera_tasks = [asyncio.create_task(self._follow_camera(camera), name="urlab-feed") for camera in cameras]
+        self._tasks += self._camera_tasks
 
     def _ignore(self) -> None:
         self._live = False
@@ -222,8 +231,7 @@ class Follower:
                     last = snapshot.time
                     self._hand_on(snapshot)
 
-    async def _follow_camera(self, identity: int) -> None:
-        camera = self._current().cameras[identity]
+    async def _follow_camera(self, camera: CameraLayout) -> None:
         schedule = Schedule(self._camera_ns)
         async with camera.view.frames("latest", timeout=None) as frames:
             while True:
