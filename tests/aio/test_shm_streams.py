@@ -20,6 +20,7 @@ from urlab_client.aio.streams import Stream
 from urlab_client.aio.transport.shm import SharedMemory
 from urlab_client.protocol import shm
 from urlab_client.protocol.enums import CameraMode
+from urlab_client.protocol.fence import processor_fence
 from urlab_client.protocol.messages.session import CameraInfo, HelloOk
 
 STATE = b"state/full"
@@ -273,3 +274,49 @@ async def test_closing_ends_streams_and_threads(publishers: Publishers, state_re
     publishers.close()
     with pytest.raises(ConnectionError, match="closed"):
         await waiting
+
+
+async def test_pictures_go_on_when_a_server_begins_to_count_anew(
+    publishers: Publishers, camera_region: WrittenRegion
+) -> None:
+    for _ in range(5):
+        camera_region.publish(picture(1))
+    async with frames(publishers) as stream:
+        await stream.receive()
+        # After a crash the plugin lays out its files in place.
+        again = shm.create(camera_region._map, camera_region.region.stride, fence=processor_fence())
+        again.publish(picture(2))
+        assert (await stream.receive()).pixels[0, 0, 2] == 2
+        again.publish(picture(3))
+        assert (await stream.receive()).pixels[0, 0, 2] == 3
+
+
+async def test_snapshots_go_on_when_a_server_lays_them_out_in_another_way(
+    publishers: Publishers, state_region: WrittenRegion
+) -> None:
+    state_region.publish(snapshot(1.0))
+    async with states(publishers) as stream:
+        await stream.receive()
+        again = WrittenRegion(state_region.path, 65_536)
+        for number in range(2, 6):  # the counter is beyond that of before already
+            again.publish(snapshot(float(number)))
+        assert (await stream.receive()).time == 5.0
+        again.publish(snapshot(6.0))
+        assert (await stream.receive()).time == 6.0
+        assert stream.stats.malformed == 0
+        again.close()
+
+
+async def test_streams_survive_a_server_that_calls_its_directory_something_else(
+    publishers: Publishers, publisher: Publisher, memory: SharedMemory, state_region: WrittenRegion
+) -> None:
+    state_region.publish(snapshot(1.0))
+    async with states(publishers) as stream:
+        await stream.receive()
+        memory._given, memory.directory = None, Path("not absolute")
+        await publisher.subscribed(STATE)
+        publisher.send(STATE, snapshot(2.0))
+        assert (await stream.receive()).time == 2.0
+        memory.directory = state_region.path.parent
+        state_region.publish(snapshot(3.0))
+        assert (await stream.receive()).time == 3.0

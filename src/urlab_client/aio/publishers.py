@@ -130,9 +130,14 @@ class Publishers:
             self.regions.refresh()
 
     def release_regions(self) -> None:
-        """Let go of the shared memory of a play session that ends."""
+        """Let go of the shared memory of a play session that ends, or of a server that is gone."""
         if self.regions is not None:
             self.regions.release()
+
+    def resume_regions(self) -> None:
+        """Look for shared memory again: the server is back."""
+        if self.regions is not None:
+            self.regions.refresh()
 
     def close(self) -> None:
         """End every stream with `ClientClosed`, from the event loop. Idempotent."""

@@ -57,10 +57,13 @@ class Watch:
 
     def on_line(self, event: ClientEvent) -> None:
         """Take note of what happened to the connection of the requests, and pass it on."""
+        publishers = self._state.publishers
         if isinstance(event, ServerLost):
             self._session.confirmed = False
-        self._state.publishers.events.publish(event)
+            publishers.release_regions()  # the next server may lay them out anew where they are
+        publishers.events.publish(event)
         if isinstance(event, ServerReconnected):
+            publishers.resume_regions()
             self._look()
 
     async def aclose(self) -> None:

@@ -33,6 +33,7 @@ from urlab_client.protocol.errors import ProtocolError
 
 __all__ = [
     "HEADER_SIZE",
+    "LAYOUT_SIZE",
     "LIVE_DIRECTORY",
     "MAGIC",
     "MAX_BUFFERS",
@@ -62,6 +63,8 @@ __all__ = [
 MAGIC = 0x424C5255
 VERSION = 1
 HEADER_SIZE = 64
+LAYOUT_SIZE = 16
+"""How much of the header, from its start, stays as it is for as long as the region does."""
 SIZE_PREFIX = 4
 RPC_STRIDE = 1_048_576
 MAX_BUFFERS = 64

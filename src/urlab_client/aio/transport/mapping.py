@@ -16,7 +16,7 @@ from pathlib import Path
 from urlab_client.aio.transport.windows import NamedLock
 from urlab_client.protocol.errors import ProtocolError
 from urlab_client.protocol.fence import processor_fence
-from urlab_client.protocol.shm import HEADER_SIZE, RegionNotReady, attach
+from urlab_client.protocol.shm import HEADER_SIZE, LAYOUT_SIZE, RegionNotReady, attach
 
 if sys.platform != "win32":
     import fcntl
@@ -50,6 +50,7 @@ class Mapping:
     def __init__(self, path: Path, *, writable: bool = False, exclusive: bool = False) -> None:
         self.path = path
         self._lock: NamedLock | None = None
+        self._locked_by = 0
         # Not blocking: opening a pipe that somebody put there would wait for its other end.
         mode = os.O_RDWR if writable else os.O_RDONLY
         self._fd = os.open(path, mode | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_NONBLOCK", 0))
@@ -75,6 +76,7 @@ class Mapping:
             self.region = attach(memoryview(self._mmap), fence=processor_fence())
         except ProtocolError as error:
             raise type(error)(f"{self.path}: {error.args[0]}") from None
+        self._layout = self._mmap[:LAYOUT_SIZE]
 
     def _take_lock(self) -> bool:
         if sys.platform == "win32":
@@ -84,6 +86,7 @@ class Mapping:
             fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             return False
+        self._locked_by = os.getpid()
         return True
 
     def intact(self) -> bool:
@@ -98,11 +101,20 @@ class Mapping:
             return True
         return (about.st_dev, about.st_ino) != self._identity
 
+    def laid_out_anew(self) -> bool:
+        """Whether somebody laid the region out in another way than was found. Not to be asked unless `intact`."""
+        return self._mmap[:LAYOUT_SIZE] != self._layout
+
     def close(self) -> None:
         """Unmap and close. What still views the mapping keeps it alive."""
         self.region.release()
         self._unmap()
         self._release()
+
+    def __del__(self) -> None:
+        # A client that nobody closed must not keep the regions from the next one.
+        if getattr(self, "_fd", -1) >= 0:
+            self._release()
 
     def _unmap(self) -> None:
         # A view handed out to the user keeps the mapping; it goes with the view.
@@ -110,6 +122,10 @@ class Mapping:
             self._mmap.close()
 
     def _release(self) -> None:
+        if sys.platform != "win32" and self._locked_by == os.getpid():
+            # Closing alone would leave the lock to a forked child, which has the file open, too. No child may let go.
+            fcntl.flock(self._fd, fcntl.LOCK_UN)
         os.close(self._fd)
+        self._fd = -1
         if self._lock is not None:
             self._lock.close()

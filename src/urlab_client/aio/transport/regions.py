@@ -21,7 +21,7 @@ from urlab_client.aio.transport.shm import SharedMemory
 from urlab_client.aio.transport.subscriber import MessageGone, Sink, Subscription, Subscriptions, client_closed
 from urlab_client.aio.transport.waiter import Stream
 from urlab_client.protocol import doorbell
-from urlab_client.protocol.errors import ProtocolError
+from urlab_client.protocol.errors import ProtocolError, URLabError
 from urlab_client.protocol.rows import BytesLike
 from urlab_client.protocol.shm import Publication
 
@@ -112,6 +112,10 @@ class _Reader:
     def news(self) -> bool:
         """Whether there is something to do. From the thread that looks."""
         return not self.mapping.intact() or self.mapping.region.sequence != self.seen
+
+    def begun_anew(self) -> bool:
+        """Whether the region was laid out anew where it is, as a server does that comes after one that crashed."""
+        return self.region_sequence < self.seen or self.mapping.laid_out_anew()
 
     def message(self) -> BytesLike | None:
         """Return what is there now, None if that is nothing. Raises `ProtocolError`."""
@@ -213,7 +217,7 @@ class Regions:
         self._settle_all()
 
     def release(self) -> None:
-        """Let go of every region, until the next handshake: play ends, and the server removes the files."""
+        """Let go of every region until `refresh`: play ends, or the server is gone, and with it the files."""
         self._away = True
         for reader in tuple(self._readers.values()):
             self._lose(reader)
@@ -299,6 +303,10 @@ class Regions:
         if not reader.mapping.intact():
             self._lose(reader)
             return
+        if reader.begun_anew():
+            self._lose(reader)
+            self._settle_all()
+            return
         if reader.region_sequence != reader.seen:
             reader.changed_at = self._now()
             if reader.silent:
@@ -342,7 +350,7 @@ class Regions:
     def _subscribe(self, sink: Sink) -> None:
         source = self._sources.get(sink)
         if source is not None:
-            with contextlib.suppress(ProtocolError, ValueError):  # an address that is none: as silent as a closed port
+            with contextlib.suppress(URLabError, ValueError):  # an address that is none: as silent as a closed port
                 self._subscriptions.attach(sink, source.subscription)
 
     def _resume(self, reader: _Reader) -> None:
@@ -389,7 +397,10 @@ class Regions:
                     self._feed(reader, sink)
 
     def _moved(self, reader: _Reader) -> bool:
-        return self._memory.find(reader.place.file) != reader.mapping.path
+        try:
+            return self._memory.find(reader.place.file) != reader.mapping.path
+        except (OSError, ProtocolError):  # what a server calls its directory may be anything
+            return True
 
     def _now(self) -> float:
         return 0.0 if self._loop is None else self._loop.time()

@@ -54,6 +54,8 @@ _NOT_READY_S = 0.5
 _RETRY_S = 1.0
 _SETTLE_S = 0.5
 _IDLE_S = 0.5
+# Whatever is to tell of a reply, look for it so often, too: a ring that is lost must not cost more.
+_GLANCE_S = 0.05
 
 # Looking from the loop before the thread is asked to; longer than the last waits took is of no use.
 _SPIN_S = 400e-6
@@ -130,17 +132,18 @@ class SharedMemory:
     def connect_bell(self) -> Doorbell | None:
         """Return the doorbell, connecting it if the server has one."""
         if self._bell is None:
-            requests = self.find(REQUEST_FILE)
-            path = None if requests is None else requests.with_name(doorbell.FILE)
-            if path is not None and path.exists():
-                on_ring = {kind: self._act(kind) for kind in self.rung}
-                try:
-                    self._bell = Doorbell(asyncio.get_running_loop(), path, on_ring, self._lose_bell)
-                except OSError as error:
-                    log.debug("no doorbell at %s: %s", path, error)
+            on_ring = {kind: self._act(kind) for kind in self.rung}
+            try:
+                requests = self.find(REQUEST_FILE)
+                path = None if requests is None else requests.with_name(doorbell.FILE)
+                if path is None or not path.exists():
                     return None
-                for message in self._wanted:
-                    self._bell.ring(message)
+                bell = self._bell = Doorbell(asyncio.get_running_loop(), path, on_ring, self._lose_bell)
+            except (OSError, ProtocolError) as error:
+                log.debug("no doorbell: %s", error)
+                return None
+            for message in self._wanted:
+                bell.ring(message)  # which may find that it is lost already
         return self._bell
 
     def want(self, message: bytes) -> None:
@@ -272,6 +275,7 @@ class _Pending:
         self.op = op
         self.future = future
         self.watch: Reply | None = None
+        self.glance: asyncio.TimerHandle | None = None
 
 
 class ShmTransport:
@@ -332,7 +336,7 @@ class ShmTransport:
             return
         loop = asyncio.get_running_loop()
         give_up = loop.time() + _NOT_READY_S
-        while self._channel is None:
+        while self._channel is None and not self._closed:
             try:
                 self._open()
             except RegionInUse as error:
@@ -347,9 +351,12 @@ class ShmTransport:
                     f"discover: transport='shm', but the server's shared memory cannot be used: {_reason(error)}",
                     hint="Is the server on this machine, and this its directory? Else use transport='zmq'.",
                 ) from error
+        channel = self._channel
+        if channel is None:
+            return
         self._memory.connect_bell()
         give_up = loop.time() + _SETTLE_S
-        while not self._is_clean(self._channel) and loop.time() < give_up:  # noqa: ASYNC110 - a region has no event
+        while self._settling(channel) and loop.time() < give_up:  # noqa: ASYNC110 - a region has no event
             await asyncio.sleep(0.001)
 
     async def request(self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None) -> bytes:
@@ -404,7 +411,8 @@ class ShmTransport:
             self._obstacle = "busy"
             return None
         channel = self._channel
-        if channel is not None and (not channel.intact() or (now - self._used_at > _IDLE_S and channel.replaced())):
+        doubtful = channel is not None and (channel.dirty or now - self._used_at > _IDLE_S)
+        if channel is not None and (not channel.intact() or (doubtful and channel.replaced())):
             self._drop("the regions were replaced")
             channel = None
         if channel is None:
@@ -421,6 +429,10 @@ class ShmTransport:
                 self._obstacle = "waiting for an old reply"
             return None
         return channel
+
+    def _settling(self, channel: _Channel) -> bool:
+        """Whether `channel` has yet to become clean, unless it is gone or another task's request is in it by now."""
+        return self._channel is channel and self._pending is None and not self._is_clean(channel)
 
     def _is_clean(self, channel: _Channel) -> bool:
         try:
@@ -489,11 +501,15 @@ class ShmTransport:
                 timer = loop.call_at(deadline, self._expire, pending, deadline - started)
             if self._spin.pays(op.name):
                 await self._spin.look(op.name, pending.future, lambda: self._look_at(channel))
-            if self._memory.bell is None:
-                self._watch()
+            if not pending.future.done():
+                if self._memory.bell is None:
+                    self._watch()
+                pending.glance = loop.call_later(_GLANCE_S, self._glance, pending)
             answer = await pending.future
         finally:
             self._unwatch()
+            if pending.glance is not None:
+                pending.glance.cancel()
             self._pending = None
             if timer is not None:
                 timer.cancel()
@@ -509,8 +525,16 @@ class ShmTransport:
             bell.ring(doorbell.REQUEST)
 
     def _look_at(self, channel: _Channel) -> None:
-        if channel.replies.region.sequence != channel.seen:
+        # Between two looks another task may have had the loop for as long as a server takes to start again.
+        if not channel.replies.intact() or channel.replies.region.sequence != channel.seen:
             self._look()
+
+    def _glance(self, pending: _Pending) -> None:
+        self._look()
+        if not pending.future.done() and self._channel is not None and self._channel.replaced():
+            self._drop("the regions were replaced")
+        if not pending.future.done():
+            pending.glance = asyncio.get_running_loop().call_later(_GLANCE_S, self._glance, pending)
 
     def _watch(self) -> None:
         """Let the thread look for the reply from now on."""
@@ -541,7 +565,6 @@ class ShmTransport:
         if pending is None or pending.future.done() or channel is None:
             return
         if not channel.replies.intact():
-            self._fail(self._lost)
             self._drop("the reply region was cut off")
             return
         try:
@@ -553,7 +576,10 @@ class ShmTransport:
             self._drop("the reply region is damaged")
             return
         if found is None:
-            if channel.replies.region.sequence != channel.seen:  # it changed while it was read, again and again
+            sequence = channel.replies.region.sequence
+            if sequence == 0:  # begun anew: it counts from one again
+                channel.seen = 0
+            if sequence != channel.seen:  # it changed while it was read, again and again
                 asyncio.get_running_loop().call_soon(self._look)
             elif pending.watch is not None:
                 pending.watch.resume()
@@ -594,13 +620,13 @@ class ShmTransport:
     def _on_event(self, event: ClientEvent) -> None:
         if isinstance(event, ServerLost):
             self._look()
-            self._fail(self._lost)
             self._drop("the server was lost")
         if self.on_event is not None:
             self.on_event(event)
 
     def _drop(self, obstacle: str) -> None:
         self._obstacle = obstacle
+        self._fail(self._lost)
         self._unwatch()
         if self._channel is not None:
             self._channel.close()

@@ -44,6 +44,10 @@ _OBSTACLES = {
     **line.OBSTACLES,
     **dict.fromkeys(line.FAILED_HANDSHAKES, f"the ZeroMQ handshake failed. {SERVER_KEY_HINT}"),
 }
+# A context that is collected as garbage before its sockets waits for them without end. So contexts are not garbage
+# before they are closed, whoever forgets to close a client.
+_contexts: set[zmq.Context[zmq.Socket[bytes]]] = set()
+
 # Topics differ for ever only where a server is out of its mind; then forget them.
 _REMEMBERED_TOPICS = 4096
 
@@ -357,6 +361,7 @@ class Subscriptions:
         self._subscribers.clear()
         if self._context is not None:
             self._context.term()
+            _contexts.discard(self._context)
         for sink in sinks:
             sink.on_end(client_closed)
 
@@ -367,6 +372,7 @@ class Subscriptions:
         if subscriber is None:
             if self._context is None:
                 self._context = zmq.Context()
+                _contexts.add(self._context)
             subscriber = _Subscriber(
                 self._context, self._loop, subscription.endpoint, pictures=subscription.pictures, keys=self._keys
             )
