@@ -91,6 +91,7 @@ class ZmqTransport:
         self._socket: zmq.Socket[bytes] | None = None
         self._monitor: zmq.Socket[bytes] | None = None
         self._timer: asyncio.TimerHandle | None = None
+        self._due = 0.0
         self._spin = Spin(_SPIN_S, _LONGEST_SPIN_S)
         self._sent: dict[bytes, _Sent] = {}
         self._waiting: set[asyncio.Future[None]] = set()
@@ -125,6 +126,9 @@ class ZmqTransport:
         while True:
             if not self._connected:
                 await self._wait_connected(loop, op, connect_by)
+            started = loop.time()
+            if deadline is not None and started >= deadline:
+                raise self._too_late(op)
             self._last_id += 1
             key = self._last_id.to_bytes(8, "big")
             try:
@@ -138,7 +142,6 @@ class ZmqTransport:
                     raise self._clogged(op) from None
                 continue
             break
-        started = loop.time()
         entry = self._sent[key] = _Sent(op, loop.create_future(), started, deadline)
         self.stats.sent += 1
         if deadline is not None:
@@ -228,6 +231,7 @@ class ZmqTransport:
             line.reconnect(self._socket, self._endpoint)
 
         def give_up() -> None:
+            self._on_event()  # as in `_expire`
             if not waiter.done():
                 waiter.set_exception(
                     ServerUnreachable(
@@ -249,13 +253,15 @@ class ZmqTransport:
     def _expire_at(self, loop: asyncio.AbstractEventLoop, deadline: float) -> None:
         """See to it that what is due then expires. One timer for all: most requests are answered long before."""
         if self._timer is not None:
-            if self._timer.when() <= deadline:
+            if self._due <= deadline:
                 return
             self._timer.cancel()
+        self._due = deadline
         self._timer = loop.call_at(deadline, self._expire, loop)
 
     def _expire(self, loop: asyncio.AbstractEventLoop) -> None:
-        due = self._timer.when() if self._timer is not None else loop.time()  # the loop may be early by its resolution
+        self._on_readable()  # what came while the loop was busy counts; uvloop looks at its timers first
+        due = self._due  # and not the time: the loop may be early by its resolution
         self._timer = None
         for entry in self._sent.values():
             if entry.deadline is not None and not entry.reply.done():
@@ -397,6 +403,13 @@ class ZmqTransport:
             f"{op.name}: {self._endpoint} has not taken the requests before this one. Nothing was sent.",
             op=op.name,
             hint="The connection stands, but the server does not read from it: restart it.",
+        )
+
+    def _too_late(self, op: Op) -> URLabTimeoutError:
+        return URLabTimeoutError(
+            f"{op.name}: the deadline passed before the request could go to {self._endpoint}. Nothing was sent.",
+            op=op.name,
+            hint="Something kept the event loop busy, or the timeout is too short.",
         )
 
     def _fail_sent(self, error: Callable[[_Sent], URLabError]) -> None:
