@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import importlib.util
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,7 +16,7 @@ from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.protocol.messages.session import Hello, HelloOk, Meta, Step
 from urlab_client.server import SimulatedServer
 
-__all__ = ["recorded", "robot_mjcf"]
+__all__ = ["humanoid", "recorded", "recorded_of", "robot_mjcf"]
 
 _SENSORS = """
     <gyro name="imu_gyro" site="imu"/>
@@ -65,14 +66,27 @@ def recorded(joints: int, count: int = 1, *, mode: str = "direct", terrain: int 
         mode: Step mode that the server is left in.
         terrain: See `robot_mjcf`.
     """
-    answers: dict[str, bytes] = {}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "robot.xml"
         path.write_text(robot_mjcf(joints, terrain=terrain))
-        with SimulatedServer(*[path] * count, play=True) as server, Requester(server.step_port) as floor:
-            answers["hello"] = floor.ask(encode_request(Hello(), ""))
-            hello = decode_reply(op_of(Hello), HelloOk, answers["hello"])
-            others: list[Request[Any]] = [Meta(), SetMode(mode=mode), Step()]
-            for request in others:
-                answers[op_of(request).name] = floor.ask(encode_request(request, hello.session_id))
+        return recorded_of(path, count, mode=mode)
+
+
+def recorded_of(path: Path, count: int = 1, *, mode: str = "direct") -> dict[str, bytes]:
+    """Return what `recorded` does of the robots in an MJCF file."""
+    answers: dict[str, bytes] = {}
+    with SimulatedServer(*[path] * count, play=True) as server, Requester(server.step_port) as floor:
+        answers["hello"] = floor.ask(encode_request(Hello(), ""))
+        hello = decode_reply(op_of(Hello), HelloOk, answers["hello"])
+        others: list[Request[Any]] = [Meta(), SetMode(mode=mode), Step()]
+        for request in others:
+            answers[op_of(request).name] = floor.ask(encode_request(request, hello.session_id))
     return answers
+
+
+def humanoid() -> Path:
+    """Return Gymnasium's humanoid: 17 motors, 12 contacts when it lies, integrated by Runge-Kutta's fourth order."""
+    spec = importlib.util.find_spec("gymnasium")
+    if spec is None or spec.origin is None:
+        raise SystemExit("The humanoid is Gymnasium's: pip install -e '.[gym]'.")
+    return Path(spec.origin).parent / "envs" / "mujoco" / "assets" / "humanoid.xml"

@@ -8,6 +8,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import msgspec
@@ -15,7 +16,7 @@ import mujoco
 
 from benchmarks.canned import Requester, server
 from benchmarks.harness import Burst, Pair, Row
-from benchmarks.robots import recorded, robot_mjcf
+from benchmarks.robots import humanoid, recorded_of, robot_mjcf
 from urlab_client.protocol.codec import decode_reply, encode_request, op_of
 from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.protocol.messages.session import Hello, HelloOk, Reset, Step
@@ -49,20 +50,36 @@ class _Simulated:
 
 
 @contextlib.contextmanager
-def _simulated(*, standing: bool = True) -> Iterator[_Simulated]:
+def _robot(*, standing: bool) -> Iterator[Path]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "robot.xml"
         path.write_text(robot_mjcf(_JOINTS, standing=standing))
-        ports = [f"--{name}-port=0" for name in ("step", "state", "ctrl", "info", "camera")]
-        command = [sys.executable, "-m", "urlab_client", "serve", str(path), "--play", "--json", "--until-eof", *ports]
-        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
-            assert process.stdin is not None and process.stdout is not None  # noqa: S101, PT018
-            try:
-                port = msgspec.json.decode(process.stdout.readline())["step_port"]
-                with Requester(port) as requester:
-                    yield _Simulated(requester)
-            finally:
-                process.stdin.close()
+        yield path
+
+
+@contextlib.contextmanager
+def _simulated(path: Path) -> Iterator[_Simulated]:
+    ports = [f"--{name}-port=0" for name in ("step", "state", "ctrl", "info", "camera")]
+    command = [
+        sys.executable,
+        "-m",
+        "urlab_client",
+        "serve",
+        str(path),
+        "--mjcf-options",
+        "--play",
+        "--json",
+        "--until-eof",
+        *ports,
+    ]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdin is not None and process.stdout is not None  # noqa: S101, PT018
+        try:
+            port = msgspec.json.decode(process.stdout.readline())["step_port"]
+            with Requester(port) as requester:
+                yield _Simulated(requester)
+        finally:
+            process.stdin.close()
 
 
 def _from_start(reset: Callable[[], object], step: Callable[[], object]) -> Burst:
@@ -80,8 +97,13 @@ def _from_start(reset: Callable[[], object], step: Callable[[], object]) -> Burs
 
 
 @contextlib.contextmanager
-def _single(*, standing: bool = True) -> Iterator[Pair]:
-    with _simulated(standing=standing) as ours, server(recorded(_JOINTS)) as port, Requester(port) as floor:
+def _single(robot: AbstractContextManager[Path]) -> Iterator[Pair]:
+    with (
+        robot as path,
+        _simulated(path) as ours,
+        server(recorded_of(path)) as port,
+        Requester(port) as floor,
+    ):
         data = mujoco.MjData(ours.model)
         ask = floor.asking(encode_request(Step(), ours.session_id))
 
@@ -96,8 +118,8 @@ def _single(*, standing: bool = True) -> Iterator[Pair]:
 
 
 @contextlib.contextmanager
-def _hundred() -> Iterator[Pair]:
-    with _simulated() as ours:
+def _hundred(robot: AbstractContextManager[Path]) -> Iterator[Pair]:
+    with robot as path, _simulated(path) as ours:
         data = mujoco.MjData(ours.model)
 
         def physics() -> None:
@@ -110,32 +132,34 @@ def _hundred() -> Iterator[Pair]:
         )
 
 
-_ROBOT = "robot of 29 joints and a free base"
+_LIGHT = "a robot of 29 joints and a free base"
 
+
+def _rows(suffix: str, robot: str, make: Callable[[], AbstractContextManager[Path]]) -> tuple[Row, Row]:
+    return (
+        Row(
+            name=f"server-step-1{suffix}",
+            what=f"simulated server, direct, n_steps=1, {robot}",
+            floor="mj_step + blocking REQ round trip of the same bytes",
+            reach=1.35,
+            prepare=lambda: _single(make()),
+            count=100,
+        ),
+        Row(
+            name=f"server-step-100{suffix}",
+            what=f"the same, n_steps=100, {robot}",
+            floor="100 x mj_step in a loop",
+            reach=0.95,
+            kind="rate",
+            prepare=lambda: _hundred(make()),
+            count=5,
+        ),
+    )
+
+
+# What the server adds is the same for all of them: the less there is to compute, the more it weighs.
 ROWS = (
-    Row(
-        name="server-step-1",
-        what=f"simulated server, direct, n_steps=1, {_ROBOT} standing on the ground",
-        floor="mj_step + blocking REQ round trip of the same bytes",
-        reach=1.35,
-        prepare=_single,
-        count=100,
-    ),
-    Row(
-        name="server-step-1-falling",
-        what="the same robot in free fall, where physics has least to do",
-        floor="mj_step + blocking REQ round trip of the same bytes",
-        reach=1.35,
-        prepare=lambda: _single(standing=False),
-        count=100,
-    ),
-    Row(
-        name="server-step-100",
-        what="simulated server, direct, n_steps=100, the robot standing",
-        floor="100 x mj_step in a loop",
-        reach=0.95,
-        kind="rate",
-        prepare=_hundred,
-        count=5,
-    ),
+    *_rows("", "Gymnasium's humanoid", lambda: contextlib.nullcontext(humanoid())),
+    *_rows("-light", f"{_LIGHT} standing on the ground", lambda: _robot(standing=True)),
+    *_rows("-falling", f"{_LIGHT} in free fall", lambda: _robot(standing=False)),
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
+import statistics
 import time
 from collections.abc import Iterator, Sequence
 
@@ -27,6 +28,7 @@ __all__ = ["ROWS"]
 _SNAPSHOTS = 500
 _HZ = 1000.0
 _PACED = 2000
+_PACED_RUNS = 3
 
 
 def _snapshots(count: int) -> list[bytes]:
@@ -60,7 +62,7 @@ def _state() -> Iterator[Pair]:
             client._state.step_count = 0  # noqa: SLF001  # so that the next burst's end is seen
             return took / _SNAPSHOTS
 
-        async def paced() -> list[Figure]:
+        async def paced() -> tuple[float, int]:
             async with client.state_stream("all", buffer=_PACED) as stream:
                 await asyncio.sleep(0.1)
                 source.send(0, _PACED, _HZ)
@@ -73,9 +75,13 @@ def _state() -> Iterator[Pair]:
                     if taken + dropped >= _PACED:
                         break
                 share = (time.process_time() - busy) / (time.perf_counter() - wall)
+            return share, dropped
+
+        def figures() -> list[Figure]:
+            shares, dropped = zip(*[runner.run(paced()) for _ in range(_PACED_RUNS)], strict=True)
             return [
-                Figure(name="messages dropped at 1 kHz", value=dropped, at_most=0),
-                Figure(name="share of a core at 1 kHz", value=share, at_most=0.25),
+                Figure(name="messages dropped at 1 kHz", value=sum(dropped), at_most=0),
+                Figure(name="share of a core at 1 kHz", value=statistics.median(shares), at_most=0.25),
             ]
 
         def decode(count: int) -> list[float]:
@@ -88,7 +94,7 @@ def _state() -> Iterator[Pair]:
         yield Pair(
             ours=lambda count: [runner.run(burst()) for _ in range(count)],
             floor=decode,
-            figures=lambda: runner.run(paced()),
+            figures=figures,
         )
         runner.run(client.close())
 
@@ -96,7 +102,7 @@ def _state() -> Iterator[Pair]:
 @contextlib.contextmanager
 def _pictures(mode: str, width: int, height: int) -> Iterator[Pair]:
     """The same burst of pictures to a camera stream, and to a bare socket."""
-    per_burst = max(8, 30_000_000 // (width * height * 4))
+    per_burst = 24  # or waiting for the first one would weigh more than it does in a stream
     generator = np.random.default_rng(0)
     data = [
         generator.uniform(50, 500, (height, width)).astype("<f4").tobytes()
