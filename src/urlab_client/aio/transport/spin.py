@@ -45,10 +45,13 @@ class Spin:
         give_up = now() + min(max(2 * self._latency.get(op, 0.0), self._shortest), self._longest)
         _looking = True
         try:
-            while not reply.done() and now() < give_up:
+            while True:  # once at least: whoever is late to look first would find nobody left to wake it
                 await asyncio.sleep(0)
-                if not reply.done():  # by whoever else had a turn, and took away where to look
-                    look()
+                if reply.done():  # by whoever else had a turn, and took away where to look
+                    break
+                look()
+                if reply.done() or now() >= give_up:
+                    break
         finally:
             _looking = False
 

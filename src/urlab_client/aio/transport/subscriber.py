@@ -194,11 +194,10 @@ class _Subscriber:
         drained = self._closed
         try:
             while not self._closed and messages < _BATCH_MESSAGES and size < _BATCH_BYTES:
-                try:
-                    topic = socket.recv(zmq.NOBLOCK)
-                except zmq.Again:
+                if not cast("int", socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN:  # an exception would cost more
                     drained = True
                     break
+                topic = socket.recv(zmq.NOBLOCK)
                 if messages == 0 or not self.connected:
                     # What tells of a new connection comes before its messages, but on another socket.
                     self._on_event()
