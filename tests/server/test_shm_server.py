@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import random
 import signal
@@ -11,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -23,6 +25,8 @@ from raw_shm import HEADER, RawRegion, RawShm
 from waiting import eventually
 
 from urlab_client.server import SimulatedServer
+from urlab_client.server.region_files import InstanceDirectory, RegionFile
+from urlab_client.server.shared_memory import SharedMemory
 
 Rpc = Callable[..., dict[str, Any]]
 
@@ -287,7 +291,7 @@ def test_two_servers_share_a_base_and_leave_nothing(base: Path) -> None:
         for server in (one, two):
             with RawShm(directory_of(server), bell=True) as shm:
                 assert shm.call({"op": "meta"}) is not None
-    assert [path.name for path in base.iterdir()] == [f".urlab-lock-{os.getuid()}"]
+    assert list(base.iterdir()) == []
 
 
 def serve(base: Path) -> tuple[subprocess.Popen[bytes], Path]:
@@ -317,4 +321,48 @@ def test_a_terminated_server_cleans_up_and_a_killed_one_is_cleaned_up_after(base
     with RawShm(directory, bell=True) as shm:
         assert shm.call({"op": "meta"}) is not None
     end(terminated, signal.SIGTERM)
-    assert {path.name for path in base.iterdir()} == {f".urlab-lock-{os.getuid()}", "urlab-not-ours"}
+    assert {path.name for path in base.iterdir()} == {"urlab-not-ours"}
+
+
+def test_servers_that_start_at_once_leave_each_other_alone(base: Path) -> None:
+    killed, left = serve(base)
+    end(killed, signal.SIGKILL)
+    with ThreadPoolExecutor(8) as threads:
+        directories = list(threads.map(lambda _: InstanceDirectory(base), range(64)))
+    assert not left.exists()
+    assert all(directory.path.is_dir() for directory in directories)
+    for directory in directories:
+        directory.remove()
+    assert list(base.iterdir()) == []
+
+
+def test_a_server_for_which_there_is_no_room_keeps_nothing(base: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[int] = []
+
+    def allocate(descriptor: int, offset: int, size: int) -> None:
+        made.append(descriptor)
+        if len(made) % 2 == 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", allocate, raising=False)
+    before = os.listdir("/dev/fd")
+    with pytest.raises(OSError, match="No space left"):
+        SharedMemory(base)
+    assert os.listdir("/dev/fd") == before
+    assert list(base.iterdir()) == []
+
+
+def test_where_replies_cannot_be_written_zmq_goes_on_alone(
+    server: SimulatedServer, rpc: Rpc, session: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    directory = directory_of(server)
+    with RawShm(directory, bell=True) as shm:
+        assert shm.call({"op": "step", "session_id": session}) is not None
+
+        def publish(region: RegionFile, payload: bytes) -> None:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+        monkeypatch.setattr(RegionFile, "publish", publish)
+        assert shm.call({"op": "step", "session_id": session}, 0.2) is None
+        eventually(lambda: not directory.exists())
+    assert rpc(op="step", session_id=session)["step"] == 3

@@ -13,8 +13,6 @@ import logging
 import os
 import sys
 import tempfile
-import time
-from collections.abc import Generator
 from pathlib import Path
 from struct import Struct as Layout
 from typing import Final
@@ -34,9 +32,6 @@ PREFIX: Final = "urlab-"
 LOCK_FILE: Final = "lock"
 
 LOCK_TEXT: Final = b"directory of a URLab server's shared memory\n"
-
-LOCK_S: Final = 5.0
-"""Longest wait for another server that is just starting."""
 
 _SLOTS: Final = 2
 _FIXED: Final = Layout("<IIII")
@@ -66,38 +61,25 @@ class InstanceDirectory:
             OSError: The base cannot be made or written to.
         """
         base.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with _base_lock(base):  # or one server could take the other's new directory for a dead one's
-            _remove_left_behind(base)
-            self._instance = Path(tempfile.mkdtemp(prefix=PREFIX, dir=base.resolve()))
-            self._lock = _open_lock(self._instance / LOCK_FILE)
-            os.write(self._lock, LOCK_TEXT)
-            _lock(self._lock)
+        _remove_left_behind(base)
+        self._instance = Path(tempfile.mkdtemp(prefix=PREFIX, dir=base.resolve()))
         self.path = self._instance / LIVE_DIRECTORY
-        self.path.mkdir(mode=0o700)
+        with contextlib.ExitStack() as made:
+            made.callback(_remove, self._instance)
+            self._lock = os.open(
+                self._instance / LOCK_FILE, os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0), 0o600
+            )
+            made.callback(os.close, self._lock)
+            # Before the text: a server that starts at this moment takes a directory without it for somebody else's.
+            _lock(self._lock)
+            os.write(self._lock, LOCK_TEXT)
+            self.path.mkdir(mode=0o700)
+            made.pop_all()
 
     def remove(self) -> None:
         """Remove the directory with everything in it."""
         _remove(self._instance)
         os.close(self._lock)
-
-
-@contextlib.contextmanager
-def _base_lock(base: Path) -> Generator[None]:
-    user = os.getuid() if sys.platform != "win32" else 0  # others' files cannot be opened
-    descriptor = _open_lock(base / f".{PREFIX}{LOCK_FILE}-{user}")
-    deadline = time.monotonic() + LOCK_S
-    try:
-        while not _lock(descriptor):
-            if time.monotonic() > deadline:
-                raise TimeoutError(f"another server has been holding {base} for {LOCK_S:g} s")
-            time.sleep(0.01)
-        yield
-    finally:
-        os.close(descriptor)
-
-
-def _open_lock(path: Path) -> int:
-    return os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0), 0o600)
 
 
 def _lock(descriptor: int) -> bool:

@@ -90,15 +90,16 @@ class SharedMemory:
         Raises:
             OSError: There is no room, or the base cannot be used.
         """
-        self._instance = InstanceDirectory(base)
-        self.directory = self._instance.path
-        try:
+        with contextlib.ExitStack() as made:
+            self._instance = InstanceDirectory(base)
+            made.callback(self._instance.remove)
+            self.directory = self._instance.path
             self._requests = RequestFile(self.directory / REQUEST_FILE, RPC_STRIDE)
+            made.callback(self._requests.close)
             self._replies = RegionFile(self.directory / REPLY_FILE, RPC_STRIDE)
+            made.callback(self._replies.close)
             self._bell = _Bell(self.directory)
-        except BaseException:
-            self._instance.remove()
-            raise
+            made.pop_all()
         self._unrung_at = -AT_WORK_S
         self._served_at = -BRISK_S
         self._brisk = False
@@ -151,6 +152,8 @@ class SharedMemory:
 
     def wants_state(self) -> bool:
         """Whether the snapshot of this tick is to be published. Cheap; called by physics."""
+        if self._released:
+            return False
         if self._bell.wanted(doorbell.STATE) or not self._bell.listeners:
             return True
         now = time.monotonic()
@@ -238,6 +241,8 @@ class SharedMemory:
                 self._served_at = time.monotonic()
         except (OSError, ValueError):
             logger.exception("shared memory failed; the server answers over ZMQ alone")
+            self._stopping = True
+            self._release()  # so that clients see it, too
         finally:
             with self._lock:
                 given_up = self._given_up
