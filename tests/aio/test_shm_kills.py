@@ -68,7 +68,7 @@ async def test_servers_killed_while_a_client_steps(tmp_path: Path) -> None:
     try:
         async with client_of(port) as client:
             for _ in range(KILLS):
-                await client.discover()
+                await client.discover(timeout=60)
                 number = await over_shared_memory(client, number)
                 loop.call_later(chance.uniform(0.0, 0.05), server.kill)
                 begun = loop.time()
@@ -81,7 +81,7 @@ async def test_servers_killed_while_a_client_steps(tmp_path: Path) -> None:
                 await server.wait()
                 # The plugin's files are still there, and cut short in place while the client may have them mapped.
                 server, _ = await start(tmp_path, port)
-            await client.discover()
+            await client.discover(timeout=60)
             await over_shared_memory(client, number)
     finally:
         server.kill()
@@ -105,7 +105,7 @@ async def test_clients_killed_while_they_step(tmp_path: Path) -> None:
             victim.kill()
             await victim.wait()
             async with client_of(port) as client:
-                await client.discover()
+                await client.discover(timeout=60)
                 await over_shared_memory(client, 1_000_000)
     finally:
         server.kill()

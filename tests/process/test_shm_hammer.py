@@ -1,4 +1,4 @@
-"""A writer and two readers in processes of their own: no torn payload is accepted, from our regions or the server's.
+"""Writers and readers in processes of their own: nothing torn is accepted, whichever side writes and whichever reads.
 
 `URLAB_HAMMER_S=10` runs the long form.
 """
@@ -12,33 +12,43 @@ import sys
 from pathlib import Path
 
 import pytest
+from hammer import STRIDE
 
 from urlab_client.protocol.fence import processor_fence
 from urlab_client.protocol.shm import create, region_size
 
 SECONDS = os.environ.get("URLAB_HAMMER_S", "1")
 HAMMER = Path(__file__).parents[1] / "support" / "hammer.py"
-STRIDE = 1024
 
 
-def side(kind: str, path: Path) -> subprocess.Popen[str]:
-    command = [sys.executable, str(HAMMER), kind, str(path), SECONDS]
+def side(role: str, path: Path) -> subprocess.Popen[str]:
+    command = [sys.executable, str(HAMMER), role, str(path), SECONDS]
     return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
 
 
-@pytest.mark.timeout(60 + 3 * float(SECONDS))
-def test_nothing_torn_is_accepted(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "roles",
+    [("write", "read", "read"), ("serve", "read", "read"), ("write", "answer")],
+    ids=["client's writer and readers", "server's writer, client's readers", "client's writer, server's reader"],
+)
+@pytest.mark.timeout(200 + 3 * float(SECONDS))
+def test_nothing_torn_is_accepted(tmp_path: Path, roles: tuple[str, ...]) -> None:
     path = tmp_path / "region"
-    path.write_bytes(bytes(region_size(STRIDE)))
-    with path.open("r+b") as file, mmap.mmap(file.fileno(), 0) as mapping:
-        create(memoryview(mapping), STRIDE, fence=processor_fence()).release()
-    sides = [side("write", path), side("read", path), side("read", path)]
-    outputs = [process.communicate(timeout=30 + 2 * float(SECONDS))[0] for process in sides]
-    assert [process.returncode for process in sides] == [0, 0, 0]
+    if set(roles) == {"write", "read"}:
+        path.write_bytes(bytes(region_size(STRIDE)))
+        with path.open("r+b") as file, mmap.mmap(file.fileno(), 0) as mapping:
+            create(memoryview(mapping), STRIDE, fence=processor_fence()).release()
+    sides = [side(role, path) for role in roles]
+    try:
+        outputs = [process.communicate(timeout=100 + 2 * float(SECONDS))[0] for process in sides]
+    finally:
+        for process in sides:
+            process.kill()
+    assert [process.returncode for process in sides] == [0] * len(sides)
     written, *read = outputs
-    sys.stdout.write(f"{written.strip()} written; accepted and torn: {[line.strip() for line in read]}\n")
+    counts = [tuple(map(int, line.split())) for line in read]
+    sys.stdout.write(f"{roles}: {written} written; reads, accepted, torn: {counts}\n")
     assert int(written) > 0
-    for line in read:
-        accepted, torn = map(int, line.split())
+    for _, accepted, torn in counts:
         assert accepted > 0
         assert torn == 0

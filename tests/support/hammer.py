@@ -1,54 +1,92 @@
-"""One side of a region that is hammered: `python hammer.py write|read FILE SECONDS`. Prints a count.
+"""One side of a region that is hammered: `python hammer.py ROLE FILE SECONDS`. Prints counts.
 
-Every payload is one 64-bit number over and over, so that a mixture of two shows.
+`write` and `read` are the client's ways, through a mapping; `serve` and `answer` are the server's, which publishes with
+and takes requests by system calls. Every payload is one 64-bit number over and over, so that a mixture of two shows.
 """
 
 from __future__ import annotations
 
 import mmap
+import random
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from urlab_client.protocol.fence import processor_fence
 from urlab_client.protocol.shm import Region, attach
+from urlab_client.server.region_files import RegionFile, RequestFile
 
 WORDS = (8, 40, 100)
+STRIDE = 1024
+BURST = 3000
+# Between two publications, so that both sides meet at every point: none, or as long as a read takes, more or less.
+LONGEST_PAUSE_S = 20e-6
 
 
-def opened(path: str) -> tuple[Region, mmap.mmap]:
-    with Path(path).open("r+b") as file:
+def opened(path: Path) -> tuple[Region, mmap.mmap]:
+    give_up = time.monotonic() + 20
+    while not path.exists():  # the server's side makes it
+        assert time.monotonic() < give_up, f"there is no {path}"
+    with path.open("r+b") as file:
         mapping = mmap.mmap(file.fileno(), 0)
     return attach(memoryview(mapping), fence=processor_fence()), mapping
 
 
-def write(region: Region, seconds: float) -> str:
+def publish(put: Callable[[bytes], None], seconds: float) -> str:
+    """Print how many were published: in bursts without a pause, and in bursts with pauses of all lengths."""
     end = time.monotonic() + seconds
-    payloads = [number.to_bytes(8, "little") * WORDS[number % len(WORDS)] for number in range(1, 3000)]
+    chance = random.Random(3)
+    payloads = [number.to_bytes(8, "little") * WORDS[number % len(WORDS)] for number in range(1, BURST)]
     count = 0
     while time.monotonic() < end:
+        hurried = chance.random() < 0.5
         for payload in payloads:
-            region.publish(payload)
+            put(payload)
+            resume = 0.0 if hurried else time.perf_counter() + chance.uniform(0, LONGEST_PAUSE_S)
+            while time.perf_counter() < resume:
+                pass
         count += len(payloads)
     return str(count)
 
 
-def read(region: Region, seconds: float) -> str:
+def take(news: Callable[[int], tuple[int, bytes | None]], seconds: float) -> str:
+    """Print how many reads were made, how many payloads accepted, and how many of those were torn."""
     end = time.monotonic() + seconds
-    seen = accepted = torn = 0
+    seen = tries = accepted = torn = 0
     while time.monotonic() < end:
         for _ in range(1000):
-            found = region.read_latest(seen)
-            if found is None:
+            sequence, payload = news(seen)
+            tries += sequence != seen
+            if payload is None:
                 continue
-            seen = found.sequence
+            seen = sequence
             accepted += 1
-            payload = found.payload
             number = int.from_bytes(payload[:8], "little")
             torn += payload != payload[:8] * WORDS[number % len(WORDS)]
-    return f"{accepted} {torn}"
+    return f"{tries} {accepted} {torn}"
+
+
+def run(role: str, path: Path, seconds: float) -> str:
+    if role == "serve":
+        return publish(RegionFile(path, STRIDE).publish, seconds)
+    if role == "answer":
+        requests = RequestFile(path, STRIDE)
+
+        def request(seen: int) -> tuple[int, bytes | None]:
+            return (seen, None) if requests.sequence() == seen else requests.read()
+
+        return take(request, seconds)
+    region, _mapping = opened(path)
+    if role == "write":
+        return publish(region.publish, seconds)
+
+    def newest(seen: int) -> tuple[int, bytes | None]:
+        found = region.read_latest(seen)
+        return (region.sequence, None) if found is None else (found.sequence, found.payload)
+
+    return take(newest, seconds)
 
 
 if __name__ == "__main__":
-    region, mapping = opened(sys.argv[2])
-    sys.stdout.write(write(region, float(sys.argv[3])) if sys.argv[1] == "write" else read(region, float(sys.argv[3])))
+    sys.stdout.write(run(sys.argv[1], Path(sys.argv[2]), float(sys.argv[3])))
