@@ -18,7 +18,7 @@ from urlab_client.aio.sources import (
 from urlab_client.aio.transport.curve import ClientKeys
 from urlab_client.aio.transport.regions import Regions
 from urlab_client.aio.transport.shm import SharedMemory
-from urlab_client.aio.transport.subscriber import Subscriptions
+from urlab_client.aio.transport.subscriber import Subscriptions, client_closed
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.streams import StreamPolicy
@@ -138,6 +138,11 @@ class Publishers:
         """Look for shared memory again: the server is back."""
         if self.regions is not None:
             self.regions.refresh()
+
+    def check_open(self) -> None:
+        """Raise `ClientClosed` once the client was closed."""
+        if self.subscriptions.closed:
+            raise client_closed()
 
     def close(self) -> None:
         """End every stream with `ClientClosed`, from the event loop. Idempotent."""

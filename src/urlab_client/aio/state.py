@@ -244,6 +244,7 @@ class SimState:
                 hello = await self._without_binary(hello, timeout)
             load = partial(self.mirror.load, hello, trusted=self._trusted)
             loaded = await anyio.to_thread.run_sync(load, abandon_on_cancel=True)
+        self.publishers.check_open()
         # From here on nothing waits until all is taken over: cancelled or not, model and wrappers belong together.
         # The model's bytes, several times its size, are not needed any more.
         hello.mjb = hello.mjcf_compiled = hello.vfs_assets = None
@@ -263,6 +264,8 @@ class SimState:
         self.publishers.refresh()
         if hello.manager_present and not played:
             self.publishers.events.publish(PlayStarted(articulations=list(self.articulations)))
+        if self.on_adopted is not None:
+            self.on_adopted()
         if not hello.manager_present:
             self.mode = StepMode.LIVE
         elif self._promote and self.wanted_mode in (StepMode.DIRECT, StepMode.PUPPET):
@@ -271,8 +274,6 @@ class SimState:
                 self.promoted_from = previous
         else:
             self.mode = StepMode.LIVE if self.wanted_mode is StepMode.AUTO else self.wanted_mode
-        if self.on_adopted is not None:
-            self.on_adopted()
         log.info(
             "session with %s, MuJoCo %s: %d articulations, mode %s",
             hello.urlab_version, hello.mujoco_version, len(self.articulations), self.mode,

@@ -289,7 +289,11 @@ class _Subscriber:
 
 
 class Subscriptions:
-    """All that one client receives. Sockets are made when first needed and closed when nobody listens any more."""
+    """All that one client receives. Sockets are made when first needed and closed when nobody listens any more.
+
+    Attributes:
+        closed: Whether it was closed.
+    """
 
     def __init__(self, keys: ClientKeys | None = None) -> None:
         self._keys = keys
@@ -297,7 +301,7 @@ class Subscriptions:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._subscribers: dict[tuple[str, bool], _Subscriber] = {}
         self._attached: dict[Sink, tuple[Subscription, Callable[[], Subscription]]] = {}
-        self._closed = False
+        self.closed = False
 
     def attach(self, sink: Sink, wanted: Callable[[], Subscription]) -> None:
         """Let `sink` have what `wanted` describes, which `refresh` asks again.
@@ -306,7 +310,7 @@ class Subscriptions:
             ClientClosed: The client was closed.
             ValueError: The endpoint is not one.
         """
-        if self._closed:
+        if self.closed:
             raise client_closed()
         loop = asyncio.get_running_loop()
         if self._loop not in (None, loop):
@@ -350,9 +354,9 @@ class Subscriptions:
 
     def close(self) -> None:
         """End every subscription with `ClientClosed` and release the sockets. Idempotent."""
-        if self._closed:
+        if self.closed:
             return
-        self._closed = True
+        self.closed = True
         sinks = tuple(self._attached)
         self._attached.clear()
         for subscriber in self._subscribers.values():
