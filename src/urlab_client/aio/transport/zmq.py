@@ -23,6 +23,7 @@ from urlab_client.aio.transport.base import TransportStats
 from urlab_client.aio.transport.curve import ClientKeys
 from urlab_client.aio.transport.spin import Spin
 from urlab_client.protocol.base import Op, Timing
+from urlab_client.protocol.codec import MAX_REPLY_BYTES
 from urlab_client.protocol.errors import (
     AuthenticationFailed,
     ClientClosed,
@@ -199,6 +200,7 @@ class ZmqTransport:
         line.configure(socket)
         # A request must not wait in a queue for a server that is gone: it would reach the next one.
         socket.immediate = True
+        socket.maxmsgsize = MAX_REPLY_BYTES  # refused when it is announced, before it fills the memory
         if self._keys is not None:
             self._keys.protect(socket)
         monitor = socket.get_monitor_socket(line.WATCHED)
