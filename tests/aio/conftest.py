@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 import pytest
 import zmq
+from waiting import DEADLINE_S
 
 from urlab_client.aio import URLabClient
 from urlab_client.protocol.registry import OPS
@@ -67,10 +68,10 @@ class ScriptedServer:
 
     def release(self, reply: dict[str, Any]) -> None:
         """Answer the oldest request that got silence."""
-        envelope = self.held.get(timeout=5)
+        envelope = self.held.get(timeout=DEADLINE_S)
         self._control.send_multipart([*envelope, msgspec.msgpack.encode(reply)])
 
-    def request(self, timeout: float = 5.0) -> dict[str, Any]:
+    def request(self, timeout: float = DEADLINE_S) -> dict[str, Any]:
         """Return the next request that arrived."""
         return self.seen.get(timeout=timeout)
 

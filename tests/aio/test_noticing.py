@@ -12,6 +12,8 @@ import msgspec
 import pytest
 import zmq
 from relay import Relay
+from waiting import DEADLINE_S
+from waiting import until as wait_until
 
 from urlab_client.aio import Stream, URLabClient
 from urlab_client.aio.transport import line
@@ -35,7 +37,7 @@ LEVEL = {"op": "current_level_ok", "level_path": "/Game/Levels/lab"}
 
 async def until(events: Stream[ClientEvent], kind: type[E]) -> E:
     """Read events up to the first of a kind."""
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(DEADLINE_S):
         async for event in events:
             if isinstance(event, kind):
                 return event
@@ -46,13 +48,6 @@ async def until(events: Stream[ClientEvent], kind: type[E]) -> E:
 async def server() -> AsyncIterator[SimulatedServer]:
     async with SimulatedServer("arm", play=True) as made:
         yield made
-
-
-@pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Heartbeats ten times as fast, for tests that wait for them to fail."""
-    monkeypatch.setattr(line, "HEARTBEAT_MS", 100)
-    monkeypatch.setattr(line, "SILENCE_MS", 300)
 
 
 async def behind_its_back(server: SimulatedServer, client: URLabClient, op: str) -> None:
@@ -118,18 +113,16 @@ async def test_live_state_waits_until_the_session_is_known_to_live(server: Simul
             relay.cut()
             await until(events, ServerLost)
             frozen = client.sim_time
-            for _ in range(20):
-                assert (await states.receive()).time > frozen
+            times = [(await states.receive()).time for _ in range(20)]
+            assert times[0] >= frozen  # the first may be the one that was taken over last
+            assert times[-1] > times[0]
             assert client.sim_time == frozen
             relay.refusing = False
             await until(events, ServerReconnected)
-            async with asyncio.timeout(5):
-                while client.sim_time == frozen:
-                    await states.receive()
+            await wait_until(lambda: client.sim_time > frozen)
             await client.runtime.set_paused(True)
 
 
-@pytest.mark.usefixtures("quick")
 async def test_a_pulled_cable_is_noticed_by_heartbeats(server: SimulatedServer) -> None:
     async with Relay(server.client_options()["step_port"]) as relay:
         options = server.client_options() | {"step_port": relay.port, "step_mode": "direct"}
@@ -139,7 +132,7 @@ async def test_a_pulled_cable_is_noticed_by_heartbeats(server: SimulatedServer) 
             events = client.events()
             relay.freeze()
             with pytest.raises(OutcomeUnknown):
-                await client.step(3, timeout=5)
+                await client.step(3, timeout=None)
             await until(events, ServerLost)
             relay.cut()
             relay.thaw()
@@ -152,12 +145,17 @@ async def test_a_stuck_worker_behind_a_live_connection_is_told_from_a_dead_serve
     await client.discover()
     events = client.events()
     scripted.on("current_level", None)
+    loop = asyncio.get_running_loop()
+    asked = loop.time()
     with pytest.raises(URLabTimeoutError, match="busy or blocked"):
         await client.scene.current_level(timeout=0.05)
+    gave_up = loop.time()
     silent = await until(events, ServerSilent)
     assert (silent.op, client.connected) == ("current_level", True)
+    released = loop.time()
     scripted.release(LEVEL)
-    assert (await until(events, ServerAnswers)).silent_s >= 0.05
+    answers = await until(events, ServerAnswers)
+    assert released - gave_up < answers.silent_s < loop.time() - asked
 
 
 async def test_a_read_is_asked_again_on_the_next_connection(client: Any, scripted: Any) -> None:
@@ -178,7 +176,7 @@ async def test_a_read_is_asked_again_on_the_next_connection(client: Any, scripte
 
 async def test_a_read_whose_server_stays_away_says_that_it_was_lost(client: Any, scripted: Any) -> None:
     await client.discover()
-    pending = asyncio.create_task(client.scene.current_level(timeout=0.3))
+    pending = asyncio.create_task(client.scene.current_level(timeout=1.5))
     while (await asyncio.to_thread(scripted.request))["op"] != "current_level":
         pass
     await asyncio.to_thread(scripted.close)
@@ -235,7 +233,7 @@ async def test_a_probe_gives_way_to_a_call(client: Any, scripted: Any) -> None:
     try:
         while (await asyncio.to_thread(reborn.request))["op"] != "list_keyframes":
             pass
-        assert await client.scene.current_level(timeout=0.5) == "/Game/Levels/lab"
+        assert await client.scene.current_level(timeout=1.5) == "/Game/Levels/lab"
     finally:
         await asyncio.to_thread(reborn.close)
 

@@ -35,7 +35,7 @@ log = logging.getLogger("urlab_client.launch")
 
 SCHEME = "sim://"
 _START_S = 60.0
-_STOP_S = 2.0
+_STOP_S = 10.0  # an idle machine takes 0.2; what is killed leaves its folders behind
 
 
 class _Ready(Struct):

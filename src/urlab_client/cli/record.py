@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import signal
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,15 +20,14 @@ from urlab_client.cli._arguments import (
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._mujoco import import_mujoco
 from urlab_client.cli._progress import progress_bar
+from urlab_client.cli._watching import go_on, interruptible
 from urlab_client.protocol.enums import StepMode
 
 if TYPE_CHECKING:
-    from urlab_client.aio import URLabClient
     from urlab_client.integrations.record import AsyncRecorder
 
 __all__ = ["add_parser", "run"]
 
-_LOOK_S = 0.05
 _DROPPED = 1
 
 
@@ -128,30 +126,12 @@ async def _record(arguments: RecordArguments) -> AsyncRecorder:
             contacts=arguments.contacts,
             overwrite=arguments.overwrite,
         )
-        stop = asyncio.Event()
-        loop = asyncio.get_running_loop()
-        loop.add_signal_handler(signal.SIGINT, stop.set)
-        try:
+        with interruptible() as stop:
             if arguments.step_mode is StepMode.DIRECT:
                 await client.reset(arguments.keyframe)
             async with recorder:
-                await _until_done(client, recorder, arguments, stop)
-        finally:
-            loop.remove_signal_handler(signal.SIGINT)
+                with progress_bar(f"recording {arguments.output.name}", arguments.duration) as progress:
+                    await go_on(
+                        client, arguments.duration, over=lambda: stop.is_set() or recorder.failed, progress=progress
+                    )
     return recorder
-
-
-async def _until_done(
-    client: URLabClient, recorder: AsyncRecorder, arguments: RecordArguments, stop: asyncio.Event
-) -> None:
-    direct = arguments.step_mode is StepMode.DIRECT
-    if not direct:
-        await client.runtime.set_paused(False)
-    start = client.sim_time
-    with progress_bar(f"recording {arguments.output.name}", arguments.duration) as progress:
-        while (done := client.sim_time - start) < arguments.duration - 1e-9 and not (stop.is_set() or recorder.failed):
-            progress(done)
-            if direct:
-                await client.step()
-            else:
-                await asyncio.sleep(_LOOK_S)

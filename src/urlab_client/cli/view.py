@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import signal
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,6 +21,7 @@ from urlab_client.cli._arguments import (
 )
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._mujoco import import_mujoco
+from urlab_client.cli._watching import go_on, interruptible
 from urlab_client.protocol.enums import StepMode
 
 if TYPE_CHECKING:
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
 __all__ = ["add_parser", "run"]
 
-_LOOK_S = 0.05
 _FOXGLOVE_PORT = 8765
 _RERUN_PORT = 9090
 
@@ -151,20 +150,15 @@ async def _view(arguments: ViewArguments) -> None:
     from urlab_client.aio import URLabClient  # noqa: PLC0415
 
     client = make_client(URLabClient, arguments.address, arguments, step_mode=arguments.step_mode)
-    stop = asyncio.Event()
-    loop = asyncio.get_running_loop()
     async with client:
         await client.discover()
         if arguments.step_mode is StepMode.DIRECT:
             await client.reset()
         view = _make(client, arguments)
-        loop.add_signal_handler(signal.SIGINT, stop.set)
-        try:
+        with interruptible() as stop:
             async with view:
                 print(_said(arguments, view), flush=True)
-                await _until_done(client, view, arguments, stop)
-        finally:
-            loop.remove_signal_handler(signal.SIGINT)
+                await go_on(client, arguments.seconds, over=lambda: stop.is_set() or view.closed)
     if view.error is not None:
         raise CommandError(f"the view has ended: {view.error}")
     stats = view.stats
@@ -203,17 +197,3 @@ def _said(arguments: ViewArguments, view: AsyncView) -> str:
     where = arguments.save or arguments.connect or view.address or f"the {arguments.where} window"
     who = " Rerun serves it on every interface of this machine, to anybody." if arguments.page else ""
     return f"{arguments.address} is shown: {where}; Ctrl-C ends it.{who}"
-
-
-async def _until_done(client: URLabClient, view: AsyncView, arguments: ViewArguments, stop: asyncio.Event) -> None:
-    direct = arguments.step_mode is StepMode.DIRECT
-    if not direct:
-        await client.runtime.set_paused(False)
-    start = client.sim_time
-    while not (stop.is_set() or view.closed):
-        if arguments.seconds is not None and client.sim_time - start >= arguments.seconds - 1e-9:
-            return
-        if direct:
-            await client.step()
-        else:
-            await asyncio.sleep(_LOOK_S)

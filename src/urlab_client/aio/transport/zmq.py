@@ -282,7 +282,7 @@ class ZmqTransport:
             )
         )
         if self._loop is not None and self._silent_since is None:
-            self._silent_since = self._loop.time() - seconds
+            self._silent_since = entry.at
             self._tell(ServerSilent(endpoint=self._endpoint, op=entry.op.name, waited_s=seconds))
 
     def _on_readable(self) -> None:

@@ -1,0 +1,107 @@
+"""A play session that goes on while a command watches, live or stepped by the command: for `record` and `view`."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import signal
+from collections.abc import Callable, Generator
+from typing import TYPE_CHECKING
+
+from urlab_client.cli._failure import CommandError
+from urlab_client.protocol.enums import StepMode
+from urlab_client.protocol.errors import OutcomeUnknown, URLabTimeoutError
+from urlab_client.protocol.messages.streams import ClientEvent, PlayEnded, ServerLost, ServerReconnected, SessionLost
+
+if TYPE_CHECKING:
+    from urlab_client.aio import Stream, URLabClient
+
+__all__ = ["go_on", "interruptible"]
+
+_LOOK_S = 0.05
+_AWAY_S = 5.0
+"""How long a server may be away."""
+
+
+@contextlib.contextmanager
+def interruptible() -> Generator[asyncio.Event]:
+    """Give an event that Ctrl-C sets while the block runs, instead of interrupting it."""
+    loop, stop = asyncio.get_running_loop(), asyncio.Event()
+    # Not the loop's own way, which there is none of on Windows.
+    before = signal.signal(signal.SIGINT, lambda _number, _frame: loop.call_soon_threadsafe(stop.set))
+    try:
+        yield stop
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+async def go_on(
+    client: URLabClient,
+    seconds: float | None,
+    *,
+    over: Callable[[], bool],
+    progress: Callable[[float], None] = lambda _: None,
+) -> None:
+    """Let simulation time pass: unpause in live mode, else step.
+
+    Args:
+        client: The client.
+        seconds: Simulated seconds; None for no limit.
+        over: Whether to end before.
+        progress: Told how many seconds have passed.
+
+    Raises:
+        CommandError: Play has ended, or the server is gone or another one.
+        URLabError: The server refused, or does not answer.
+    """
+    direct = client.step_mode is StepMode.DIRECT
+    start = client.sim_time
+    async with client.events() as events:
+        watch = _Watch(events)
+        if not direct:
+            await client.runtime.set_paused(False)
+        while not over():
+            done = client.sim_time - start
+            progress(done)
+            if seconds is not None and done >= seconds - 1e-9:
+                return
+            if direct:
+                await _step(client)
+            else:
+                await asyncio.sleep(_LOOK_S)
+                watch.check()
+
+
+async def _step(client: URLabClient) -> None:
+    try:
+        await client.step()
+    except (OutcomeUnknown, URLabTimeoutError):  # a connection that broke, a machine that was suspended
+        found = await client.resync()
+        if not (found.session_held and found.playing):
+            raise CommandError("the server has begun anew, or another client drives it") from None
+
+
+class _Watch:
+    """Looks out for what ends live mode for a client that only watches, and would otherwise wait for ever."""
+
+    def __init__(self, events: Stream[ClientEvent]) -> None:
+        self._events = events
+        self._lost_at: float | None = None
+
+    def check(self) -> None:
+        """Raise why nothing more will come."""
+        now = asyncio.get_running_loop().time()
+        while (event := self._events.receive_nowait()) is not None:
+            match event:
+                case ServerLost():
+                    self._lost_at = now
+                case ServerReconnected():
+                    self._lost_at = None
+                case PlayEnded():
+                    raise CommandError(f"play has ended: {event.reason}")
+                case SessionLost():
+                    raise CommandError(f"the session is lost: {event.reason}")
+                case _:
+                    pass
+        if self._lost_at is not None and now - self._lost_at > _AWAY_S:
+            raise CommandError(f"the server has been away for {_AWAY_S:g} s")

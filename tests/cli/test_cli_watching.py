@@ -1,0 +1,98 @@
+"""What `urlab record` and `urlab view` do while simulation time passes: what interrupts them, and what does not."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+from commands import DEADLINE_S, child
+from relay import Relay
+from waiting import eventually, until
+
+from urlab_client.aio import URLabClient
+from urlab_client.cli import _watching
+from urlab_client.cli._failure import CommandError
+from urlab_client.cli._watching import go_on
+from urlab_client.integrations.record import read_run
+from urlab_client.server import SimulatedServer
+
+
+@pytest.fixture
+async def server() -> AsyncIterator[SimulatedServer]:
+    async with SimulatedServer("ball", play=True) as made:
+        yield made
+
+
+async def test_a_connection_that_breaks_between_step_and_reply_is_no_end(server: SimulatedServer) -> None:
+    options = server.client_options()
+    async with (
+        Relay(options["step_port"]) as relay,
+        URLabClient(**(options | {"step_port": relay.port}), step_mode="direct") as client,
+    ):
+        await client.discover()
+        going = asyncio.create_task(go_on(client, 0.5, over=lambda: False))
+        relay.hold_replies()
+        await relay.until_held(1)
+        relay.cut()
+        relay.thaw()
+        await going
+        assert client.transport_stats.connects == 2
+        assert client.sim_time == pytest.approx(0.5)
+        assert client.step_count == 250
+
+
+async def test_another_client_that_takes_over_meanwhile_is_an_end(server: SimulatedServer) -> None:
+    options = server.client_options()
+    async with (
+        Relay(options["step_port"]) as relay,
+        URLabClient(**(options | {"step_port": relay.port}), step_mode="direct") as client,
+        URLabClient(**options) as thief,
+    ):
+        await client.discover()
+        going = asyncio.create_task(go_on(client, None, over=lambda: False))
+        relay.hold_replies()
+        await relay.until_held(1)
+        await thief.discover()
+        relay.cut()
+        relay.thaw()
+        with pytest.raises(CommandError, match="another client drives it"):
+            await going
+
+
+async def test_live_mode_ends_when_play_does(server: SimulatedServer) -> None:
+    async with URLabClient(**server.client_options(), step_mode="live") as client:
+        await client.discover()
+        going = asyncio.create_task(go_on(client, None, over=lambda: False))
+        await until(lambda: client.sim_time > 0)
+        await client.sim.stop()
+        with pytest.raises(CommandError, match="play has ended"):
+            await going
+
+
+async def test_live_mode_ends_when_the_server_stays_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_watching, "_AWAY_S", 0.2)
+    server = SimulatedServer("ball", play=True)
+    await asyncio.to_thread(server.start)
+    async with URLabClient(**server.client_options(), step_mode="live") as client:
+        await client.discover()
+        going = asyncio.create_task(go_on(client, None, over=lambda: False))
+        await until(lambda: client.sim_time > 0)
+        await asyncio.to_thread(server.close)
+        with pytest.raises(CommandError, match=r"away for 0\.2 s|play has ended"):
+            await going
+
+
+@pytest.mark.parametrize("mode", ["direct", "live"])
+def test_ctrl_c_ends_a_recording_early_and_whole(mode: str, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    command = ["record", "sim://ball", path, "--step-mode", mode, "--duration", "1000"]
+    with child("-m", "urlab_client", *command, cwd=tmp_path) as recording:
+        eventually(lambda: path.exists() and path.stat().st_size > 2_000)
+        recording.send_signal(signal.SIGINT)
+        out, err = recording.communicate(timeout=DEADLINE_S)
+    assert (recording.returncode, err) == (0, "")
+    assert out.startswith(f"{path}  ")
+    assert read_run(path).summary().complete
