@@ -218,6 +218,22 @@ async def test_a_reply_region_begun_anew_during_a_step_brings_the_reply(connect:
     assert (await task).time == 0.75
 
 
+@pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="the system cannot be asked for a file's memory")
+async def test_memory_for_requests_is_there_before_they_are_written(
+    connect: Any, silent: tuple[WrittenRegion, WrittenRegion], directory: Path
+) -> None:
+    # Writing into a hole of a file on a full tmpfs would kill the process.
+    path = directory / shm.REQUEST_FILE
+    header = path.read_bytes()[: shm.HEADER_SIZE]
+    path.unlink()
+    with path.open("wb") as file:
+        file.write(header)
+        file.truncate(shm.region_size(shm.RPC_STRIDE))
+    assert path.stat().st_blocks * 512 < path.stat().st_size
+    await connect().discover()
+    assert path.stat().st_blocks * 512 >= path.stat().st_size
+
+
 FORKING = """
 import asyncio, os, sys
 from urlab_client.aio import URLabClient

@@ -194,7 +194,10 @@ class RegionFile:
         self._sequence = self._latest = 0
         # With the memory, not only the length: a full disk is to show here.
         if hasattr(os, "posix_fallocate"):
-            os.posix_fallocate(self._fd, 0, self._size)
+            try:
+                os.posix_fallocate(self._fd, 0, self._size)
+            except OSError as error:
+                raise OSError(error.errno, os.strerror(error.errno or 0), os.fspath(self.path)) from None
         else:
             os.ftruncate(self._fd, self._size)
         _pwrite(self._fd, self._fixed().ljust(HEADER_SIZE, b"\0"), 0)

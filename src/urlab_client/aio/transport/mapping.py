@@ -23,6 +23,8 @@ if sys.platform != "win32":
 
 __all__ = ["Mapping", "RegionInUse"]
 
+_BLOCK = 512  # bytes, in which the system counts what a file occupies
+
 
 class RegionInUse(ProtocolError):
     """Another client on this machine has the region."""
@@ -70,6 +72,9 @@ class Mapping:
             raise RegionInUse(f"{self.path}: another client on this machine has it.")
         self._identity = about.st_dev, about.st_ino
         self._size = about.st_size
+        if writable and hasattr(os, "posix_fallocate") and about.st_blocks * _BLOCK < self._size:
+            # To write into a hole of a file for which there is no room any more kills the process, too.
+            os.posix_fallocate(self._fd, 0, self._size)
         access = mmap.ACCESS_WRITE if writable else mmap.ACCESS_READ
         self._mmap = mmap.mmap(self._fd, self._size, access=access)
         try:
