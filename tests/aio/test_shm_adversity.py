@@ -156,6 +156,41 @@ async def test_opening_a_session_does_not_disturb_a_step_of_another_task(
         await opening
 
 
+async def test_no_memory_of_a_lost_server_is_touched(
+    connect: Any, plugin: PluginMemory, answers: dict[str, Any], scripted: Any, directory: Path
+) -> None:
+    camera = {
+        "mode": "real",
+        "resolution": [2, 2],
+        "fovy": 45.0,
+        "zmq_endpoint": "tcp://127.0.0.1:9",
+        "zmq_topic": "arm/camera/eye",
+    }
+    arm = {
+        "prefix": "arm",
+        "actor_id": "",
+        "default_control_mode": "raw",
+        "actuator_types": {},
+        "original_names": {},
+        "camera_topics": {"eye": camera},
+    }
+    scripted.on("hello", answers["hello"]({}) | {"articulations": [arm]})
+    region = WrittenRegion(directory / "cam_arm_eye.shm", shm.camera_stride(2, 2))
+    region.publish(bytes(16))
+    client = await shared(connect())
+    eye = client.articulations["arm"].cameras["eye"]
+    async with eye.frames() as frames:
+        await frames.receive(timeout=10)
+        frame = eye.shared_frame()
+        assert frame is not None
+        assert frame.valid()
+        await asyncio.to_thread(scripted.close)
+        await until(lambda: not client.connected)
+        assert not frame.valid()
+        assert eye.shared_frame() is None, "its files are there, as a killed server leaves them"
+    region.close()
+
+
 async def test_regions_removed_during_a_step_are_noticed_before_the_deadline(
     connect: Any, plugin: PluginMemory, directory: Path
 ) -> None:
