@@ -32,6 +32,21 @@ def test_every_picture_has_a_script() -> None:
     assert set(made()) <= shown
 
 
+def test_the_drawings_name_what_there_is() -> None:
+    package = ROOT / "src" / "urlab_client"
+    named = {
+        name: set(re.findall(r"[\w/]+\.py\b|[\w/]+/(?!\w)", " ".join(re.findall(r">([^<]+)</", drawing))))
+        for name in BY_HAND
+        for drawing in [(ROOT / "docs" / "images" / name).read_text(encoding="utf-8")]
+    }
+    for name, files in named.items():
+        missing = [file for file in files if not (ROOT / file).exists() and not any(package.glob(f"**/{file}"))]
+        assert files
+        assert not missing, f"{name} shows what is not there"
+    layers = {f"{path.parent.name}/" for path in package.glob("*/__init__.py")}
+    assert layers <= named["layers.svg"]
+
+
 def test_the_scripts_make_what_they_are_said_to() -> None:
     for name, (script, left) in made().items():
         source = (ROOT / script).read_text(encoding="utf-8")
