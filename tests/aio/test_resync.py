@@ -206,6 +206,21 @@ async def test_a_wrench_acts_once(client: URLabClient, relay: Relay) -> None:
     assert await velocities(lost=True) == await velocities(lost=False)
 
 
+async def test_a_wrench_whose_step_never_arrived_is_kept_for_the_next(client: URLabClient, relay: Relay) -> None:
+    arm = client.articulations["arm"]
+
+    async def velocities(*, lost: bool) -> list[float]:
+        await client.reset()
+        arm.apply_xfrc(list(arm.bodies)[-1], force=(0, 0, 5))
+        if lost:
+            await lose_the_request(relay, asyncio.create_task(client.step()))
+            assert (await client.resync()).steps_applied == 0
+        await client.step(2)
+        return arm.qvel_array.tolist()
+
+    assert await velocities(lost=True) == await velocities(lost=False)
+
+
 async def test_another_client_took_over(client: URLabClient, server: SimulatedServer) -> None:
     async with URLabClient(**server.client_options()) as other:
         await other.discover()

@@ -19,7 +19,9 @@ __all__ = [
     "RETRYING",
     "RETRY_S",
     "REVIVE_S",
+    "UNANSWERED",
     "WATCHED",
+    "Attempts",
     "configure",
     "reconnect",
 ]
@@ -28,6 +30,7 @@ HEARTBEAT_MS = 1000
 SILENCE_MS = 3000
 # The system's own limits are minutes: with them a cable plugged in again would be noticed as late.
 _CONNECT_MS = 3000
+_SILENT = 0.9  # of that time, and nothing refused the attempt
 _RECONNECT_MS = 50
 RECONNECT_MAX_MS = 1000
 
@@ -51,6 +54,8 @@ WATCHED: Final = (
 )
 """Events that a monitor of a connection must bring."""
 
+UNANSWERED: Final = "the host does not answer"
+
 OBSTACLES: Final = {
     zmq.Event.CONNECT_RETRIED: "connection refused",
     zmq.Event.CONNECTED: "something accepts the connection but does not speak ZeroMQ, or is suspended",
@@ -68,6 +73,32 @@ came."""
 
 RETRY_S: Final = 2 * RECONNECT_MAX_MS / 1000
 """The same after a handshake that failed, where ZeroMQ itself may be waiting before it tries again."""
+
+
+class Attempts:
+    """Follows a connection's attempts, to tell a host that refuses from one that says nothing: ZeroMQ does not.
+
+    Args:
+        now: When the first attempt begins, seconds.
+    """
+
+    def __init__(self, now: float) -> None:
+        self._began = now
+
+    def obstacle(self, event: zmq.Event, value: int, now: float) -> str | None:
+        """Return what stands in the way after a monitor's event, None if the event does not say.
+
+        Args:
+            event: The event.
+            value: Its value; of `CONNECT_RETRIED` the milliseconds until the next attempt.
+            now: The time, seconds.
+        """
+        took, self._began = now - self._began, now
+        if event is zmq.Event.CONNECT_RETRIED:
+            self._began += value / 1000
+            if took >= _SILENT * _CONNECT_MS / 1000:
+                return UNANSWERED
+        return OBSTACLES.get(event)
 
 
 def reconnect(socket: zmq.Socket[bytes], endpoint: str) -> None:

@@ -40,10 +40,6 @@ _MAX_MESSAGE_BYTES = 256 * 1024 * 1024
 _BATCH_MESSAGES = 64
 _BATCH_BYTES = 8 * 1024 * 1024
 
-_OBSTACLES = {
-    **line.OBSTACLES,
-    **dict.fromkeys(line.FAILED_HANDSHAKES, f"the ZeroMQ handshake failed. {SERVER_KEY_HINT}"),
-}
 # A context that is collected as garbage before its sockets waits for them without end. So contexts are not garbage
 # before they are closed, whoever forgets to close a client.
 _contexts: set[zmq.Context[zmq.Socket[bytes]]] = set()
@@ -128,7 +124,7 @@ class _Subscriber:
         self.endpoint = endpoint
         self.connected = False
         self.connects = 0
-        self.obstacle = "the host does not answer"
+        self.obstacle = line.UNANSWERED
         self._loop = loop
         self._copy = not pictures
         self._sinks: dict[Sink, Subscription] = {}
@@ -136,6 +132,7 @@ class _Subscriber:
         self._down_since: float | None = None
         self._retrying = False
         self._closed = False
+        self._attempts = line.Attempts(loop.time())
         socket = self._socket = context.socket(zmq.SUB)
         line.configure(socket)
         socket.rcvhwm = _QUEUED_PICTURES if pictures else _QUEUED_MESSAGES
@@ -245,9 +242,10 @@ class _Subscriber:
     def _on_event(self) -> None:
         while not self._closed and cast("int", self._monitor.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
             message = cast("dict[str, Any]", recv_monitor_message(self._monitor, zmq.NOBLOCK))
-            self._note(zmq.Event(message["event"]))
+            self._note(zmq.Event(message["event"]), message["value"])
 
-    def _note(self, event: zmq.Event) -> None:
+    def _note(self, event: zmq.Event, value: int) -> None:
+        obstacle = self._attempts.obstacle(event, value, self._loop.time())
         self._retrying = self._retrying or event in line.RETRYING
         if event is zmq.Event.HANDSHAKE_SUCCEEDED:
             self.connected = True
@@ -268,8 +266,8 @@ class _Subscriber:
                 self._retrying = False
                 self._loop.call_later(line.REVIVE_S, self._revive)
                 self._tell_line()
-        elif event in _OBSTACLES and self.connects == 0:
-            self.obstacle = _OBSTACLES[event]
+        elif obstacle is not None and self.connects == 0:
+            self.obstacle = f"{obstacle}. {SERVER_KEY_HINT}" if event in line.FAILED_HANDSHAKES else obstacle
         if event in (zmq.Event.HANDSHAKE_FAILED_AUTH, zmq.Event.HANDSHAKE_FAILED_PROTOCOL):
             # ZeroMQ does not try again by itself, but the server may learn the key.
             self._loop.call_later(line.RECONNECT_MAX_MS / 1000, self._reconnect)

@@ -99,7 +99,8 @@ class ZmqTransport:
         self._last_id = 0
         self._connected = False
         self._closed = False
-        self._obstacle = "the host does not answer"
+        self._obstacle = line.UNANSWERED
+        self._attempts = line.Attempts(0.0)
         self.lost_at = 0.0
         self._silent_since: float | None = None
         self._retrying = False
@@ -207,6 +208,7 @@ class ZmqTransport:
         try:
             loop.add_reader(monitor, self._on_event)
             loop.add_reader(socket, self._on_readable)
+            self._attempts = line.Attempts(loop.time())
             socket.connect(self._endpoint)
         except (NotImplementedError, zmq.ZMQError) as error:
             socket.disable_monitor()
@@ -321,6 +323,7 @@ class ZmqTransport:
             self._note(zmq.Event(message["event"]), message["value"])
 
     def _note(self, event: zmq.Event, value: int) -> None:
+        obstacle = self._attempts.obstacle(event, value, 0.0 if self._loop is None else self._loop.time())
         self._retrying = self._retrying or event in line.RETRYING
         if event is zmq.Event.HANDSHAKE_SUCCEEDED:
             self._connected = True
@@ -333,8 +336,8 @@ class ZmqTransport:
                     waiter.set_result(None)
         elif event is zmq.Event.DISCONNECTED:
             self._lose()
-        elif event in line.OBSTACLES:
-            self._obstacle = line.OBSTACLES[event]
+        elif obstacle is not None:
+            self._obstacle = obstacle
             if event in line.FAILED_HANDSHAKES and value != errno.EAGAIN:  # which says that time was up
                 self._rejections += 1
                 self._note_rejection(event, value)
