@@ -191,6 +191,19 @@ async def test_no_memory_of_a_lost_server_is_touched(
     region.close()
 
 
+async def test_a_server_lost_during_a_step_is_noticed_before_the_deadline(
+    connect: Any, plugin: PluginMemory, scripted: Any
+) -> None:
+    client = await shared(connect())
+    task = await step_in_flight(client, plugin, timeout=None)
+    await asyncio.to_thread(scripted.close)
+    async with asyncio.timeout(10):
+        with pytest.raises(OutcomeUnknown):
+            await task
+    with pytest.raises(URLabConnectionError):
+        await client.step()
+
+
 async def test_regions_removed_during_a_step_are_noticed_before_the_deadline(
     connect: Any, plugin: PluginMemory, directory: Path
 ) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import threading
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,14 @@ from waiting import until
 
 from urlab_client.aio import URLabClient
 from urlab_client.protocol import shm
-from urlab_client.protocol.errors import ProtocolError, SessionTakenOver, URLabConnectionError, URLabTimeoutError
-from urlab_client.protocol.messages.runtime import SetQpos
+from urlab_client.protocol.errors import (
+    ProtocolError,
+    SessionTakenOver,
+    URLabConnectionError,
+    URLabRPCError,
+    URLabTimeoutError,
+)
+from urlab_client.protocol.messages.runtime import ReadMocapPose, SetQpos
 
 SESSION = "11111111-2222-3333-4444-555555555555"
 STEP = {"op": "step_ok", "time": 0.5, "step": 1.0, "per_articulation": {}}
@@ -140,6 +147,23 @@ async def test_wrong_transport_is_repeated_once_and_remembered(
     assert client.transport_stats.over_zmq["refused by the server"] == 2
 
 
+async def test_a_reply_that_turned_out_too_large_is_asked_for_again_only_if_that_changes_nothing(
+    connect: Any, plugin: PluginMemory, scripted: Any
+) -> None:
+    pose = {"op": "read_mocap_pose_ok", "body": "b", "pos": [0.0] * 3, "quat": [1.0, 0.0, 0.0, 0.0]}
+    scripted.on("read_mocap_pose", pose)
+    too_large = {"op": "error", "code": "reply_too_large", "message": "the reply does not fit"}
+    plugin.answers = plugin.answers | {"read_mocap_pose": lambda _: too_large, "set_paused": lambda _: too_large}
+    client = await shared(connect())
+    assert (await client.call(ReadMocapPose(body="b"))).body == "b"
+    with pytest.raises(URLabRPCError, match="reply_too_large"):
+        await client.runtime.set_paused(True)
+    asked = [scripted.seen.get_nowait()["op"] for _ in range(scripted.seen.qsize())]
+    assert "read_mocap_pose" in asked
+    assert "set_paused" not in asked, "it was executed already"
+    assert plugin.seen == ["read_mocap_pose", "set_paused"]
+
+
 async def test_a_late_reply_is_not_taken_for_the_next_one(connect: Any, plugin: PluginMemory, scripted: Any) -> None:
     client = await shared(connect())
     scripted.on("step", None)
@@ -190,14 +214,23 @@ async def test_a_real_refusal_is_raised(connect: Any, plugin: PluginMemory) -> N
 async def test_what_a_dead_client_left_behind_is_waited_out(
     connect: Any, plugin: PluginMemory, scripted: Any, directory: Path
 ) -> None:
-    # The worker is still busy with the dead client's step while the next client says hello.
-    scripted.on("step", None)
+    busy, done = threading.Event(), threading.Event()
+
+    def be_slow(request: dict[str, Any]) -> dict[str, Any]:
+        busy.set()
+        done.wait(10)
+        return STEP | {"time": 99.0}
+
+    # The worker is still busy with the dead client's step while the next client says hello, and begins to step.
+    plugin.answers = scripted.answers | {"step": be_slow}
+    plugin._period = 0.02  # so that one reply is there for a while before the next one
     plugin.requests.region.publish(b"\x82\xa2op\xa4step\xaasession_id\xd9\x24" + SESSION.encode())
-    await asyncio.to_thread(plugin.held.get)
-    scripted.on("step", STEP)
+    await asyncio.to_thread(busy.wait)
+    plugin.answers = scripted.answers
     client = await shared(connect())
-    plugin.reply(STEP | {"time": 99.0})
-    for _ in range(5):
+    asyncio.get_running_loop().call_later(0.05, done.set)
+    over_shm = client.transport_stats.over_shm
+    while not done.is_set() or client.transport_stats.over_shm == over_shm:
         assert (await client.step()).time == 0.5
 
 

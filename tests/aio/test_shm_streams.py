@@ -226,16 +226,23 @@ async def test_a_picture_read_in_place_of_the_one_before_does_not_come_twice(
             await stream.receive(timeout=0.05)
 
 
-async def test_no_torn_picture_is_handed_out(publishers: Publishers, camera_region: WrittenRegion) -> None:
+async def test_no_torn_picture_is_handed_out(
+    publishers: Publishers, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # So large that the interpreter lets the writer on in the midst of a conversion.
+    size = (800, 600)
+    monkeypatch.setattr(Camera, "info", msgspec.structs.replace(Camera.info, resolution=size))
+    region = WrittenRegion(tmp_path / "cam_arm_eye.shm", shm.camera_stride(*size))
+    pictures = [bytes([value, value + 1, value + 2, 0]) * (size[0] * size[1]) for value in range(16)]
     stop = threading.Event()
 
     def hammer() -> None:
-        value = 0
         while not stop.is_set():
-            value = (value + 1) % 250
-            camera_region.publish(picture(value))
+            for number, payload in enumerate(pictures):
+                region.publish(payload)
+                stop.wait(1e-3 * (number % 4))
 
-    camera_region.publish(picture(1))
+    region.publish(pictures[0])
     writer = threading.Thread(target=hammer)
     writer.start()
     try:
@@ -246,6 +253,7 @@ async def test_no_torn_picture_is_handed_out(publishers: Publishers, camera_regi
     finally:
         stop.set()
         writer.join()
+        region.close()
 
 
 async def test_a_shared_frame_says_when_it_was_overwritten(

@@ -23,7 +23,7 @@ HAMMER = Path(__file__).parents[1] / "support" / "hammer.py"
 
 def side(role: str, path: Path) -> subprocess.Popen[str]:
     command = [sys.executable, str(HAMMER), role, str(path), SECONDS]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 
 @pytest.mark.parametrize(
@@ -40,6 +40,13 @@ def test_nothing_torn_is_accepted(tmp_path: Path, roles: tuple[str, ...]) -> Non
             create(memoryview(mapping), STRIDE, fence=processor_fence()).release()
     sides = [side(role, path) for role in roles]
     try:
+        for process in sides:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "ready\n"
+        for process in sides:
+            assert process.stdin is not None
+            process.stdin.write("go\n")
+            process.stdin.flush()
         outputs = [process.communicate(timeout=100 + 2 * float(SECONDS))[0] for process in sides]
     finally:
         for process in sides:
@@ -47,8 +54,8 @@ def test_nothing_torn_is_accepted(tmp_path: Path, roles: tuple[str, ...]) -> Non
     assert [process.returncode for process in sides] == [0] * len(sides)
     written, *read = outputs
     counts = [tuple(map(int, line.split())) for line in read]
-    sys.stdout.write(f"{roles}: {written} written; reads, accepted, torn: {counts}\n")
+    sys.stdout.write(f"{roles}: {written} written; reads, accepted, wrong: {counts}\n")
     assert int(written) > 0
-    for _, accepted, torn in counts:
+    for _, accepted, wrong in counts:
         assert accepted > 0
-        assert torn == 0
+        assert wrong == 0

@@ -1,7 +1,10 @@
-"""One side of a region that is hammered: `python hammer.py ROLE FILE SECONDS`. Prints counts.
+"""One side of a region that is hammered: `python hammer.py ROLE FILE SECONDS`.
 
-`write` and `read` are the client's ways, through a mapping; `serve` and `answer` are the server's, which publishes with
-and takes requests by system calls. Every payload is one 64-bit number over and over, so that a mixture of two shows.
+Says that it is ready, waits for a line, and in the end prints counts.
+
+`write` and `read` are the client's ways, through a mapping; `serve` and `answer` are the server's, which publishes and
+takes requests by system calls. Every payload is one 64-bit number over and over, so that a mixture of two shows. The
+number tells which publication it is, so that one taken under the wrong count shows, too.
 """
 
 from __future__ import annotations
@@ -19,13 +22,14 @@ from urlab_client.server.region_files import RegionFile, RequestFile
 
 WORDS = (8, 40, 100)
 STRIDE = 1024
-BURST = 3000
+START_S = 60.0
+BURST = 2999
 # Between two publications, so that both sides meet at every point: none, or as long as a read takes, more or less.
 LONGEST_PAUSE_S = 20e-6
 
 
 def opened(path: Path) -> tuple[Region, mmap.mmap]:
-    give_up = time.monotonic() + 20
+    give_up = time.monotonic() + START_S
     while not path.exists():  # the server's side makes it
         assert time.monotonic() < give_up, f"there is no {path}"
     with path.open("r+b") as file:
@@ -37,7 +41,7 @@ def publish(put: Callable[[bytes], None], seconds: float) -> str:
     """Print how many were published: in bursts without a pause, and in bursts with pauses of all lengths."""
     end = time.monotonic() + seconds
     chance = random.Random(3)
-    payloads = [number.to_bytes(8, "little") * WORDS[number % len(WORDS)] for number in range(1, BURST)]
+    payloads = [number.to_bytes(8, "little") * WORDS[number % len(WORDS)] for number in range(BURST)]
     count = 0
     while time.monotonic() < end:
         hurried = chance.random() < 0.5
@@ -51,9 +55,9 @@ def publish(put: Callable[[bytes], None], seconds: float) -> str:
 
 
 def take(news: Callable[[int], tuple[int, bytes | None]], seconds: float) -> str:
-    """Print how many reads were made, how many payloads accepted, and how many of those were torn."""
+    """Print how many reads were made, how many payloads accepted, and how many of those were torn or others'."""
     end = time.monotonic() + seconds
-    seen = tries = accepted = torn = 0
+    seen = tries = accepted = wrong = 0
     while time.monotonic() < end:
         for _ in range(1000):
             sequence, payload = news(seen)
@@ -63,21 +67,33 @@ def take(news: Callable[[int], tuple[int, bytes | None]], seconds: float) -> str
             seen = sequence
             accepted += 1
             number = int.from_bytes(payload[:8], "little")
-            torn += payload != payload[:8] * WORDS[number % len(WORDS)]
-    return f"{tries} {accepted} {torn}"
+            torn = payload != payload[:8] * WORDS[number % len(WORDS)]
+            # A writer stores the slot and then counts: between the two, the next publication is already the newest.
+            wrong += torn or number not in ((sequence - 1) % BURST, sequence % BURST)
+    return f"{tries} {accepted} {wrong}"
+
+
+def wait_for_start() -> None:
+    sys.stdout.write("ready\n")
+    sys.stdout.flush()
+    sys.stdin.readline()
 
 
 def run(role: str, path: Path, seconds: float) -> str:
     if role == "serve":
-        return publish(RegionFile(path, STRIDE).publish, seconds)
+        region_file = RegionFile(path, STRIDE)
+        wait_for_start()
+        return publish(region_file.publish, seconds)
     if role == "answer":
         requests = RequestFile(path, STRIDE)
 
         def request(seen: int) -> tuple[int, bytes | None]:
             return (seen, None) if requests.sequence() == seen else requests.read()
 
+        wait_for_start()
         return take(request, seconds)
     region, _mapping = opened(path)
+    wait_for_start()
     if role == "write":
         return publish(region.publish, seconds)
 
