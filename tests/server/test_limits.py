@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import socket as sockets
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -14,7 +16,7 @@ from waiting import eventually
 from wire import Wire, pack
 
 from urlab_client.protocol.registry import OPS
-from urlab_client.server import Limits, SimulatedServer
+from urlab_client.server import Limits, SimulatedServer, endpoint
 
 Serve = Callable[..., Wire]
 SMALL = Limits(
@@ -174,8 +176,6 @@ def test_a_subscriber_that_never_reads_slows_nobody(connect: Callable[..., Wire]
 
 
 def test_connections_that_say_nothing_do_not_keep_others_out() -> None:
-    import socket as sockets
-
     with SimulatedServer() as server:
         silent = [sockets.create_connection(("127.0.0.1", server.step_port)) for _ in range(200)]
         try:
@@ -184,6 +184,49 @@ def test_connections_that_say_nothing_do_not_keep_others_out() -> None:
         finally:
             for connection in silent:
                 connection.close()
+
+
+def test_connections_that_never_become_peers_are_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(endpoint, "HANDSHAKE_MS", 100)
+    with SimulatedServer() as server:
+        for port in (server.step_port, server.state_port, server.ctrl_port, server.info_port):
+            with sockets.create_connection(("127.0.0.1", port), timeout=10) as connection:
+                while connection.recv(1024):
+                    pass
+
+
+@contextmanager
+def _watched(kind: int, address: str) -> Generator[tuple[zmq.Socket[bytes], zmq.Socket[bytes]]]:
+    """Open a socket whose monitor tells of a connection that is closed."""
+    with zmq.Context() as context, context.socket(kind) as socket:
+        socket.linger = 0
+        socket.rcvtimeo = 10_000
+        monitor = socket.get_monitor_socket(zmq.EVENT_DISCONNECTED)
+        monitor.linger = 0
+        socket.connect(address)
+        try:
+            yield socket, monitor
+        finally:
+            socket.disable_monitor()
+            monitor.close()
+
+
+def test_a_subscription_that_is_too_long_costs_the_connection() -> None:
+    with SimulatedServer() as server:
+        for port in (server.state_port, server.info_port):
+            with _watched(zmq.SUB, f"{server.address}:{port}") as (socket, monitor):
+                socket.subscribe(b"x" * 4200)
+                assert monitor.poll(10_000)
+
+
+def test_a_control_message_that_is_too_long_costs_the_connection(models: Path) -> None:
+    with (
+        SimulatedServer(models / "bot.xml", play=True) as server,
+        _watched(zmq.XPUB, f"{server.address}:{server.ctrl_port}") as (socket, monitor),
+    ):
+        topic = socket.recv()[1:]
+        socket.send_multipart([topic, b"x" * (2**20 + 1)])
+        assert monitor.poll(10_000)
 
 
 def test_a_client_with_several_requests_waiting_gets_every_answer() -> None:

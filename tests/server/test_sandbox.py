@@ -110,6 +110,7 @@ def test_what_a_model_names_may_lie_below_the_roots(wire: Wire, folder: Path) ->
         FIGURE.format(file="linked/secret.obj"),
         FIGURE.format(file="secret.obj").replace("<asset>", '<compiler meshdir=".."/><asset>'),
         FIGURE.format(file="secret.obj").replace("<asset>", "<compiler\nassetdir = '{folder}'/><asset>"),
+        FIGURE.format(file="x/secret.obj").replace("<asset>", '<compiler strippath="true" meshdir=".."/><asset>'),
         '<mujoco><include file="../secret.xml"/></mujoco>',
         '<mujoco><include file="middle.xml"/></mujoco>',
         '<mujoco><asset><model name="m" file="../secret.xml"/></asset></mujoco>',
