@@ -171,7 +171,7 @@ def test_a_missing_extra_is_one_line(
 ) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "rich" else object())
     assert main(["demo", "--output", str(tmp_path)]) == 2
-    assert capsys.readouterr() == ("", "urlab demo: rich not installed; run: pip install 'urlab-client[demo]'\n")
+    assert capsys.readouterr() == ("", "urlab demo: rich is not installed; run: pip install 'urlab-client[demo]'\n")
 
 
 def test_a_model_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -30,6 +30,7 @@ from urlab_client.cli import (
 )
 from urlab_client.cli._arguments import Parser
 from urlab_client.cli._failure import CommandError, one_line
+from urlab_client.integrations._extras import MissingExtra
 from urlab_client.protocol.errors import URLabError
 
 __all__ = ["main"]
@@ -58,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         # Whoever read the output has gone; what the interpreter would still flush at its end goes nowhere, too.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _FAILED
-    except (CommandError, URLabError, OSError) as error:
+    except (CommandError, MissingExtra, URLabError, OSError) as error:
         sys.stderr.write(f"{name}: {one_line(error)}\n")
         return _FAILED
     finally:

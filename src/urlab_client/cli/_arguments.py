@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from typing import Any, NoReturn, Protocol, TypeVar
+from typing import Any, Literal, NoReturn, Protocol, TypeVar
 
 from urlab_client.cli._failure import CommandError
 from urlab_client.protocol.enums import StepMode
@@ -15,9 +15,11 @@ __all__ = [
     "Parser",
     "ServerArguments",
     "add_address",
+    "add_cameras",
     "add_keys",
     "add_ports",
     "add_step_mode",
+    "cameras",
     "count",
     "hertz",
     "image_size",
@@ -126,6 +128,27 @@ def add_step_mode(parser: argparse.ArgumentParser) -> None:
         default=StepMode.LIVE,
         help="live or direct (default: %(default)s)",
     )
+
+
+def add_cameras(parser: argparse.ArgumentParser, what: str) -> None:
+    """Add `--camera`, which may be repeated; `cameras` reads what was given.
+
+    Args:
+        parser: The command's parser.
+        what: What becomes of the camera.
+    """
+    parser.add_argument(
+        "--camera",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help=f"{what}, as ARTICULATION/CAMERA, or 'all'; may be repeated",
+    )
+
+
+def cameras(given: list[str]) -> list[str] | Literal["all"]:
+    """Return the cameras that were given with `--camera`."""
+    return "all" if "all" in given else given
 
 
 def add_keys(parser: argparse.ArgumentParser) -> None:

@@ -67,7 +67,8 @@ def run(arguments: ConvertArguments) -> int:
     """Convert.
 
     Raises:
-        CommandError: The recording, the output or an option cannot be used, or a library is missing.
+        CommandError: The recording, the output or an option cannot be used.
+        MissingExtra: A library is missing.
     """
     kind = arguments.format or arguments.output.suffix[1:].lower()
     if kind not in _FORMATS:
@@ -86,8 +87,6 @@ def run(arguments: ConvertArguments) -> int:
             else:
                 with replaced(arguments.output) as temporary:
                     written = write(temporary, progress=progress)
-    except ImportError as error:
-        raise CommandError(str(error)) from None
     except KeyError as error:
         raise CommandError(str(error.args[0])) from None
     print(f"{arguments.output}  {written} {what}")

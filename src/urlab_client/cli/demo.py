@@ -9,7 +9,6 @@ import argparse
 import asyncio
 import contextlib
 import hashlib
-import importlib.util
 import logging
 import platform
 from collections.abc import Callable, Generator
@@ -24,6 +23,7 @@ from urlab_client.cli._arguments import Commands, count
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._files import replaced
 from urlab_client.cli._mujoco import import_mujoco
+from urlab_client.integrations._extras import need
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -83,12 +83,11 @@ def run(arguments: DemoArguments) -> int:
     """Run the demonstration.
 
     Raises:
-        CommandError: A library, the model or the output folder cannot be used.
+        CommandError: The model or the output folder cannot be used.
+        MissingExtra: A library is missing.
         URLabError: The server refused something.
     """
-    missing = [name for name in ("matplotlib", "rich") if importlib.util.find_spec(name) is None]
-    if missing:
-        raise CommandError(f"{' and '.join(missing)} not installed; run: pip install 'urlab-client[demo]'")
+    need("matplotlib", "rich", extra="demo")
     import_mujoco()
 
     from urlab_client.cli.demo_runs import drive_one, drive_two  # noqa: PLC0415

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from urlab_client.cli._arguments import Commands
-from urlab_client.cli._failure import CommandError
 from urlab_client.cli._progress import progress_bar
 
 if TYPE_CHECKING:
@@ -45,12 +44,10 @@ def run(arguments: InfoArguments) -> int:
     """Print the summary; return 0 for a whole recording, else 1.
 
     Raises:
-        CommandError: A library is missing.
+        MissingExtra: A library is missing.
     """
-    try:
-        from urlab_client.integrations.record import read_run  # noqa: PLC0415
-    except ImportError as error:
-        raise CommandError(str(error)) from None
+    from urlab_client.integrations.record import read_run  # noqa: PLC0415
+
     recording = read_run(arguments.recording)
     with progress_bar(arguments.recording.name, recording.path.stat().st_size) as progress:
         summary = recording.summary(progress)

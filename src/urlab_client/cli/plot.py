@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib.util
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +12,7 @@ import numpy as np
 from urlab_client.cli._arguments import Commands
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._progress import progress_bar
+from urlab_client.integrations._extras import need
 
 if TYPE_CHECKING:
     from urlab_client.integrations.record import Table
@@ -64,15 +64,12 @@ def run(arguments: PlotArguments) -> int:
     """Draw.
 
     Raises:
-        CommandError: A library is missing, or nothing has such a name.
+        CommandError: Nothing has such a name.
+        MissingExtra: A library is missing.
     """
-    if importlib.util.find_spec("matplotlib") is None:
-        raise CommandError("matplotlib not installed; run: pip install 'urlab-client[demo]'")
-    try:
-        from urlab_client.integrations.record import read_run  # noqa: PLC0415
-    except ImportError as error:
-        raise CommandError(str(error)) from None
+    need("matplotlib", extra="demo")
     from urlab_client.cli.figures import Quantity, Trace, plot_trace  # noqa: PLC0415
+    from urlab_client.integrations.record import read_run  # noqa: PLC0415
 
     recording = read_run(arguments.recording)
     with progress_bar(arguments.recording.name, recording.path.stat().st_size) as progress:

@@ -10,9 +10,11 @@ from urlab_client.cli._arguments import (
     ADDRESSES,
     Commands,
     ServerArguments,
+    add_cameras,
     add_keys,
     add_ports,
     add_step_mode,
+    cameras,
     hertz,
     make_client,
     seconds,
@@ -64,13 +66,7 @@ def add_parser(commands: Commands) -> None:
         "--duration", type=seconds, default=10.0, metavar="S", help="simulated seconds (default: %(default)s)"
     )
     parser.add_argument("--keyframe", metavar="NAME", help="keyframe to start from, in direct mode")
-    parser.add_argument(
-        "--camera",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="a camera to keep, as ARTICULATION/CAMERA, or 'all'; may be repeated",
-    )
+    add_cameras(parser, "a camera to keep")
     parser.add_argument(
         "--camera-hz", type=hertz, default=30.0, metavar="HZ", help="pictures per second (default: %(default)s)"
     )
@@ -84,17 +80,16 @@ def run(arguments: RecordArguments) -> int:
     """Record; return 1 if states were dropped, else 0.
 
     Raises:
-        CommandError: The file or an option cannot be used, or a library is missing.
+        CommandError: The file or an option cannot be used.
+        MissingExtra: A library is missing.
     """
     import_mujoco()
     if arguments.output.exists() and not arguments.overwrite:
         raise CommandError(f"{arguments.output} exists; --overwrite replaces it")
     if arguments.keyframe is not None and arguments.step_mode is not StepMode.DIRECT:
         raise CommandError("--keyframe resets the simulation, which needs --step-mode direct")
-    try:
-        import urlab_client.integrations.record  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]
-    except ImportError as error:
-        raise CommandError(str(error)) from None
+    import urlab_client.integrations.record  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]  # is it there?
+
     try:
         recorder = asyncio.run(_record(arguments))
     except KeyError as error:
@@ -121,7 +116,7 @@ async def _record(arguments: RecordArguments) -> AsyncRecorder:
         recorder = record(
             client,
             arguments.output,
-            cameras="all" if "all" in arguments.camera else arguments.camera,
+            cameras=cameras(arguments.camera),
             camera_hz=arguments.camera_hz,
             contacts=arguments.contacts,
             overwrite=arguments.overwrite,

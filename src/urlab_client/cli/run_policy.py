@@ -17,8 +17,10 @@ from urlab_client.cli._arguments import (
     ADDRESSES,
     Commands,
     ServerArguments,
+    add_cameras,
     add_keys,
     add_ports,
+    cameras,
     make_client,
     seconds,
 )
@@ -98,13 +100,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--record", type=Path, metavar="FILE", help="record the policy's run into a .mcap file (extra 'mcap')"
     )
-    parser.add_argument(
-        "--camera",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="with --record: a camera to keep, as ARTICULATION/CAMERA, or 'all'; repeatable",
-    )
+    add_cameras(parser, "with --record: a camera to keep")
     parser.add_argument("--overwrite", action="store_true", help="with --record: replace FILE if it exists")
     parser.add_argument("--json", action="store_true", help="print JSON")
     add_ports(parser)
@@ -116,17 +112,15 @@ def run(arguments: RunPolicyArguments) -> int:
     """Run the policy; return 1 if the robot fell, else 0.
 
     Raises:
-        CommandError: An option cannot be used, or a library is missing.
+        CommandError: An option cannot be used.
+        MissingExtra: A library is missing.
         URLabError: A file is wrong, the policy does not fit, or the server cannot be reached.
     """
     import_mujoco()
     _check_record(arguments)
     from urlab_client.integrations.policy import load  # noqa: PLC0415
 
-    try:
-        policy = load(arguments.policy, arguments.declaration)
-    except ImportError as error:
-        raise CommandError(str(error)) from None
+    policy = load(arguments.policy, arguments.declaration)
     if arguments.twist is not None:
         try:
             policy.command = arguments.twist
@@ -147,10 +141,7 @@ def _check_record(arguments: RunPolicyArguments) -> None:
         return
     if arguments.record.exists() and not arguments.overwrite:
         raise CommandError(f"{arguments.record} exists; --overwrite replaces it")
-    try:
-        import urlab_client.integrations.record  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]
-    except ImportError as error:
-        raise CommandError(str(error)) from None
+    import urlab_client.integrations.record  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]  # is it there?
 
 
 async def _run(arguments: RunPolicyArguments, policy: Policy) -> dict[str, PolicyRun]:
@@ -219,9 +210,8 @@ async def _recorded(client: URLabClient, arguments: RunPolicyArguments | None) -
         return
     from urlab_client.integrations.record import record  # noqa: PLC0415
 
-    cameras = "all" if "all" in arguments.camera else arguments.camera
     try:
-        async with record(client, arguments.record, cameras=cameras, overwrite=arguments.overwrite):
+        async with record(client, arguments.record, cameras=cameras(arguments.camera), overwrite=arguments.overwrite):
             yield
     except KeyError as error:
         raise CommandError(f"--camera: {error.args[0]}") from None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +20,7 @@ from urlab_client.cli._arguments import (
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._files import replaced
 from urlab_client.cli._mujoco import import_mujoco
+from urlab_client.integrations._extras import need
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.errors import URLabTimeoutError
 
@@ -96,12 +96,12 @@ def run(arguments: SnapshotArguments) -> int:
     """Write the picture.
 
     Raises:
-        CommandError: An option cannot be honoured, or a library is missing.
+        CommandError: An option cannot be honoured.
+        MissingExtra: A library is missing.
         URLabError: A model is broken, nothing can be drawn here, or the server does not answer.
         OSError: The file cannot be written.
     """
-    if importlib.util.find_spec("matplotlib") is None:
-        raise CommandError("matplotlib not installed; run: pip install 'urlab-client[demo]'")
+    need("matplotlib", extra="demo")
     if not arguments.output.parent.is_dir():
         raise CommandError(f"{arguments.output}: no such folder")
     _check_mode(arguments)

@@ -11,9 +11,11 @@ from urlab_client.cli._arguments import (
     Commands,
     ServerArguments,
     add_address,
+    add_cameras,
     add_keys,
     add_ports,
     add_step_mode,
+    cameras,
     hertz,
     make_client,
     port,
@@ -83,13 +85,7 @@ def add_parser(commands: Commands) -> None:
     add_ports(parser)
     add_step_mode(parser)
     parser.add_argument("--seconds", type=seconds, metavar="S", help="simulated seconds (default: until Ctrl-C)")
-    parser.add_argument(
-        "--camera",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="a camera to show in Rerun or Foxglove, as ARTICULATION/CAMERA, or 'all'; may be repeated",
-    )
+    add_cameras(parser, "a camera to show in Rerun or Foxglove")
     parser.add_argument(
         "--camera-hz", type=hertz, default=10.0, metavar="HZ", help="pictures per second (default: %(default)s)"
     )
@@ -105,7 +101,8 @@ def run(arguments: ViewArguments) -> int:
     """Show it until told to stop.
 
     Raises:
-        CommandError: An option cannot be honoured, or a library is missing.
+        CommandError: An option cannot be honoured.
+        MissingExtra: A library is missing.
     """
     if arguments.where != "rerun" and (arguments.save or arguments.connect or arguments.page):
         raise CommandError("--save, --connect and --page go with --rerun")
@@ -123,7 +120,7 @@ def run(arguments: ViewArguments) -> int:
         import_mujoco()
     try:
         asyncio.run(_view(arguments))
-    except (ImportError, ValueError) as error:
+    except ValueError as error:
         raise CommandError(str(error)) from None
     except KeyError as error:
         raise CommandError(str(error.args[0])) from None
@@ -168,14 +165,14 @@ async def _view(arguments: ViewArguments) -> None:
 def _make(client: URLabClient, arguments: ViewArguments) -> AsyncView:
     from urlab_client.integrations.view import foxglove_view, rerun_view, window_view  # noqa: PLC0415
 
-    cameras = "all" if "all" in arguments.camera else arguments.camera
+    chosen = cameras(arguments.camera)
     if arguments.where == "viewer":
         return window_view(client, max_hz=arguments.max_hz)
     if arguments.where == "foxglove":
         return foxglove_view(
             client,
             port=_FOXGLOVE_PORT if arguments.port is None else arguments.port,
-            cameras=cameras,
+            cameras=chosen,
             camera_hz=arguments.camera_hz,
             sensors=arguments.sensors,
             max_hz=arguments.max_hz,
@@ -186,7 +183,7 @@ def _make(client: URLabClient, arguments: ViewArguments) -> AsyncView:
         connect=arguments.connect,
         web=arguments.page,
         web_port=_RERUN_PORT if arguments.port is None else arguments.port,
-        cameras=cameras,
+        cameras=chosen,
         camera_hz=arguments.camera_hz,
         sensors=arguments.sensors,
         max_hz=arguments.max_hz,

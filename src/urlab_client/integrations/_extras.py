@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import importlib.util
 
-__all__ = ["need"]
+__all__ = ["MissingExtra", "need"]
+
+
+class MissingExtra(ImportError):
+    """An optional library is not installed; the text names the extra that brings it."""
 
 
 def need(*modules: str, extra: str) -> None:
     """Check that modules can be imported.
 
     Raises:
-        ImportError: One is missing; names the extra that brings it.
+        MissingExtra: One is missing.
     """
     for name in modules:
         if importlib.util.find_spec(name) is None:
-            raise ImportError(f"{name} is not installed; run: pip install 'urlab-client[{extra}]'", name=name)
+            raise MissingExtra(f"{name} is not installed; run: pip install 'urlab-client[{extra}]'", name=name)
