@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from urlab_client.cli._arguments import Commands, count
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._files import replaced
-from urlab_client.cli._progress import progress_bar
+from urlab_client.cli._output import progress_bar
 
 if TYPE_CHECKING:
     from urlab_client.integrations.record import Run

@@ -23,6 +23,7 @@ from urlab_client.cli._arguments import Commands, count
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._files import replaced
 from urlab_client.cli._mujoco import import_mujoco
+from urlab_client.cli._output import output
 from urlab_client.integrations._extras import need
 
 if TYPE_CHECKING:
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
 __all__ = ["add_parser", "run"]
 
 _ASYNC_SHARE = 4  # the async run takes a quarter of the steps
-_COLUMNS = 120  # where the output is no terminal
 _REPORT_EVERY = 20  # steps between two updates of the progress bar
 
 
@@ -97,7 +97,7 @@ def run(arguments: DemoArguments) -> int:
     robot = read_robot(arguments.model)
     folder = _writable(arguments.output)
     steps, fewer = arguments.steps, max(1, arguments.steps // _ASYNC_SHARE)
-    console = _console()
+    console = output()
     server = SimulatedServer(model_roots=[robot.path.parent], mjcf_options=True)
     with _warnings_of(robot), server, _progress(console) as progress:
         one = drive_one(server, robot, steps, _bar(progress, "blocking client, one robot", steps))
@@ -134,13 +134,6 @@ def _writable(folder: Path) -> Path:
 
 class _Probed(Exception):
     """Takes a probe back."""
-
-
-def _console() -> Console:
-    from rich.console import Console  # noqa: PLC0415
-
-    console = Console()
-    return console if console.is_terminal else Console(width=_COLUMNS)
 
 
 def _progress(console: Console) -> Progress:

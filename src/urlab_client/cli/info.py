@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from urlab_client.cli._arguments import Commands
-from urlab_client.cli._progress import progress_bar
+from urlab_client.cli._output import counted, output, progress_bar
 
 if TYPE_CHECKING:
     from urlab_client.integrations.record import Summary
@@ -60,7 +60,6 @@ def run(arguments: InfoArguments) -> int:
 
 def _print(summary: Summary) -> None:
     from rich import box  # noqa: PLC0415
-    from rich.console import Console  # noqa: PLC0415
     from rich.table import Table  # noqa: PLC0415
 
     about = summary.about
@@ -69,12 +68,12 @@ def _print(summary: Summary) -> None:
         f"{about.get('started', '?')}  {about.get('address', '?')}  {about.get('step_mode', '?')} mode  "
         f"server {about.get('urlab_version', '?')}, MuJoCo {about.get('mujoco_version', '?')}"
     )
-    print(f"{summary.duration_s:.3f} s simulated in {summary.wall_s:.3f} s, {_counted(summary.episodes, 'episode')}")
+    print(f"{summary.duration_s:.3f} s simulated in {summary.wall_s:.3f} s, {counted(summary.episodes, 'episode')}")
     if not summary.complete:
         print(f"not finished: {summary.damage or 'the end of the file is missing'}")
     if summary.dropped_states or summary.dropped_frames:
         print(
-            f"dropped: {_counted(summary.dropped_states, 'state')}, {_counted(summary.dropped_frames, 'picture')}, "
+            f"dropped: {counted(summary.dropped_states, 'state')}, {counted(summary.dropped_frames, 'picture')}, "
             "which came faster than the file could be written"
         )
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
@@ -91,9 +90,4 @@ def _print(summary: Summary) -> None:
             str(topic.gaps),
             f"{topic.longest_gap_s:.3f}" if topic.longest_gap_s else "",
         )
-    console = Console()
-    (console if console.is_terminal else Console(width=120)).print(table)
-
-
-def _counted(number: int, noun: str) -> str:
-    return f"{number} {noun}{'' if number == 1 else 's'}"
+    output().print(table)

@@ -24,6 +24,7 @@ from urlab_client.cli._arguments import (
     seconds,
 )
 from urlab_client.cli._mujoco import import_mujoco
+from urlab_client.cli._output import counted
 from urlab_client.protocol.errors import ModeLocked, URLabRPCError, URLabVersionMismatch
 from urlab_client.protocol.messages.runtime import SetMode
 
@@ -268,15 +269,15 @@ def _titled(title: str, texts: list[str]) -> list[tuple[str, str]]:
 
 def _articulation_text(articulation: Articulation) -> str:
     counts = [
-        _plural(articulation.joints, "joint"),
-        _plural(articulation.actuators, "actuator"),
-        _plural(articulation.sensors, "sensor"),
-        _plural(articulation.cameras, "camera"),
+        counted(number, noun)
+        for number, noun in (
+            (articulation.joints, "joint"),
+            (articulation.actuators, "actuator"),
+            (articulation.sensors, "sensor"),
+            (articulation.cameras, "camera"),
+        )
+        if number is not None
     ]
     control = f"{articulation.controller} controller" if articulation.controller else "no controller"
     actor = f" (actor {articulation.actor_id})" if articulation.actor_id else ""
-    return f"{articulation.key}{actor}: {', '.join([text for text in counts if text] + [control])}"
-
-
-def _plural(number: int | None, noun: str) -> str:
-    return "" if number is None else f"{number} {noun}{'' if number == 1 else 's'}"
+    return f"{articulation.key}{actor}: {', '.join([*counts, control])}"

@@ -11,7 +11,7 @@ import numpy as np
 
 from urlab_client.cli._arguments import Commands
 from urlab_client.cli._failure import CommandError
-from urlab_client.cli._progress import progress_bar
+from urlab_client.cli._output import progress_bar
 from urlab_client.integrations._extras import need
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from urlab_client.cli._arguments import (
 )
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._mujoco import import_mujoco
-from urlab_client.cli._progress import progress_bar
+from urlab_client.cli._output import progress_bar
 from urlab_client.cli._watching import go_on, interruptible
 from urlab_client.protocol.enums import StepMode
 

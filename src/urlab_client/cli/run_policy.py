@@ -26,7 +26,7 @@ from urlab_client.cli._arguments import (
 )
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._mujoco import import_mujoco
-from urlab_client.cli._progress import progress_bar
+from urlab_client.cli._output import output, progress_bar
 from urlab_client.protocol.enums import StepMode
 
 if TYPE_CHECKING:
@@ -219,7 +219,6 @@ async def _recorded(client: URLabClient, arguments: RunPolicyArguments | None) -
 
 def _print(runs: dict[str, PolicyRun]) -> None:
     from rich import box  # noqa: PLC0415
-    from rich.console import Console  # noqa: PLC0415
     from rich.table import Table  # noqa: PLC0415
 
     last = runs["policy"]
@@ -244,5 +243,4 @@ def _print(runs: dict[str, PolicyRun]) -> None:
             f"{found.actions / found.wall_time:.0f}",
             str(found.late) if live else f"{found.steps_per_second:.0f}",
         )
-    console = Console()
-    (console if console.is_terminal else Console(width=100)).print(table)
+    output().print(table)

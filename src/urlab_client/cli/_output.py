@@ -1,17 +1,23 @@
-"""Progress bars on standard error, where that is a terminal."""
+"""What commands show: progress bars, tables, counts."""
 
 from __future__ import annotations
 
 import contextlib
 import sys
 from collections.abc import Callable, Generator
+from typing import TYPE_CHECKING
 
-__all__ = ["progress_bar"]
+if TYPE_CHECKING:
+    from rich.console import Console
+
+__all__ = ["counted", "output", "progress_bar"]
+
+_COLUMNS = 120  # where the output is no terminal
 
 
 @contextlib.contextmanager
 def progress_bar(description: str, total: float) -> Generator[Callable[[float], None]]:
-    """Show a bar while the block runs; yields what is told how far it is."""
+    """Show a bar while the block runs, if standard error is a terminal; yields what is told how far it is."""
     if not sys.stderr.isatty():
         yield lambda _: None
         return
@@ -22,3 +28,16 @@ def progress_bar(description: str, total: float) -> Generator[Callable[[float], 
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(description, total=total)
         yield lambda done: progress.update(task, completed=done)
+
+
+def output() -> Console:
+    """Return what writes tables to standard output."""
+    from rich.console import Console  # noqa: PLC0415
+
+    console = Console()
+    return console if console.is_terminal else Console(width=_COLUMNS)
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number of things, as in `1 joint` and `2 joints`."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
