@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import ctypes
+import itertools
 import json
 import os
 import subprocess
@@ -26,7 +27,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
-from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +51,9 @@ PATIENCE_S = 60.0
 
 SHM = "/dev/shm"  # noqa: S108  # a tmpfs; the server makes a private directory below it
 PORTS = ("step", "state", "ctrl", "info", "camera")
+_BLOCKS = itertools.count(21000, 100)
+"""First ports of the servers, among those that the system gives to nobody who asks for any: a server that starts again
+must find its own free. That of the cameras is the last, as more follow it."""
 
 
 @dataclass(kw_only=True)
@@ -105,7 +108,7 @@ class Server:
         self.starts = 0
         self.most = Held(at=0.0, rss_mib=0.0, allocated_mib=None, threads=0, descriptors=0)
         self._shm = shm
-        self._ports = dict.fromkeys(PORTS, 0)
+        self._ports = dict(zip(PORTS, itertools.count(next(_BLOCKS)), strict=False))
         self.start()
 
     def start(self) -> None:
@@ -121,10 +124,8 @@ class Server:
             line = self._process.stdout.readline()
             if line or time.monotonic() > deadline:
                 break
-            self._process.wait()  # for a moment some other connection has one of its ports
-        ready = json.loads(line)
-        self._ports = {name: ready[f"{name}_port"] for name in PORTS}
-        self.address = ready["address"]
+            self._process.wait()  # the one before has one of its ports, for another moment
+        self.address = json.loads(line)["address"]
         self.starts += 1
 
     @property
@@ -173,7 +174,7 @@ class Pair:
             with ExitStack() as readers:
                 readers.enter_context(self._reader(self._read_state))
                 readers.enter_context(self._reader(self._read_events))
-                for kill in cycle([True, False]):
+                for kill in itertools.cycle([True, False]):
                     if self.restarted and self.told["rounds"]:
                         self._restart(kill=kill)
                     self._round()
