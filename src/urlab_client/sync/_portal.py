@@ -484,7 +484,8 @@ class Portal:
             else:
                 io.abandon(job)
             raise
-        error = job.error
+        # Since Python 3.13 the traceback leads to frames that refer to the job.
+        error, job.error = job.error, None
         if error is None:
             return job.value
         # A refusal by the server is told by its message and its notes; frames of the client would only bury them.
