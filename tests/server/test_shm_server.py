@@ -26,7 +26,7 @@ from waiting import eventually
 
 from urlab_client.server import SimulatedServer
 from urlab_client.server.region_files import InstanceDirectory, RegionFile
-from urlab_client.server.shared_memory import SharedMemory
+from urlab_client.server.shared_memory import MAX_LISTENERS, SharedMemory
 
 Rpc = Callable[..., dict[str, Any]]
 
@@ -276,6 +276,16 @@ def test_nonsense_at_the_doorbell_disturbs_nobody(server: SimulatedServer, sessi
             reply = shm.call({"op": "step", "session_id": session})
             assert reply is not None
             assert reply["step"] == count
+
+
+def test_the_doorbell_has_room_for_so_many(server: SimulatedServer) -> None:
+    with ExitStack() as crowd:
+        clients = [crowd.enter_context(socket.socket(socket.AF_UNIX)) for _ in range(MAX_LISTENERS + 8)]
+        for client in clients:
+            client.settimeout(10)
+            client.connect(os.fspath(directory_of(server) / "doorbell.sock"))
+        welcomes = [client.recv(1) for client in clients]
+    assert welcomes == [b"r"] * MAX_LISTENERS + [b""] * 8
 
 
 def test_a_path_too_long_for_a_socket_leaves_polling(tmp_path: Path) -> None:
