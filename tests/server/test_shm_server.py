@@ -282,8 +282,8 @@ def test_the_doorbell_has_room_for_so_many(server: SimulatedServer) -> None:
     with ExitStack() as crowd:
         clients = [crowd.enter_context(socket.socket(socket.AF_UNIX)) for _ in range(MAX_LISTENERS + 8)]
         for client in clients:
+            client.connect(os.fspath(directory_of(server) / "doorbell.sock"))  # waits while the queue is full
             client.settimeout(10)
-            client.connect(os.fspath(directory_of(server) / "doorbell.sock"))
         welcomes = [client.recv(1) for client in clients]
     assert welcomes == [b"r"] * MAX_LISTENERS + [b""] * 8
 
