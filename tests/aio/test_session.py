@@ -290,3 +290,26 @@ async def test_a_client_stays_with_its_loop(scripted: Any) -> None:
         await client.discover()
         with pytest.raises(Exception, match="another event loop"):
             await asyncio.to_thread(asyncio.run, client.discover())
+
+
+@pytest.mark.parametrize(
+    "address",
+    ["tcp://localhost:rpc", "tcp://localhost:70000", "tcp://localhost:0", "tcp://:5559", "tcp://::1", "tcp://", "lab"],
+)
+def test_what_is_no_address_is_refused_at_once(address: str) -> None:
+    with pytest.raises(ValueError, match=r"is no address; write tcp://HOST"):
+        URLabClient(address)
+
+
+@pytest.mark.parametrize(
+    ("address", "endpoint"),
+    [
+        ("tcp://lab-7", "tcp://lab-7:5559"),
+        ("tcp://10.0.0.7:65535", "tcp://10.0.0.7:65535"),
+        ("tcp://[::1]", "tcp://[::1]:5559"),
+        ("tcp://[fe80::1%eth0]:7", "tcp://[fe80::1%eth0]:7"),
+        ("ipc:///tmp/lab", "ipc:///tmp/lab:5559"),
+    ],
+)
+def test_an_address_may_have_a_port_of_its_own(address: str, endpoint: str) -> None:
+    assert URLabClient(address)._transport.endpoint == endpoint

@@ -6,6 +6,7 @@ import contextlib
 import logging
 import operator
 import os
+import re
 import warnings
 from collections.abc import Collection, Mapping
 from threading import RLock
@@ -59,6 +60,9 @@ R = TypeVar("R", bound=Reply)
 
 _SYNC_CAMERA_S = 3.0  # the server waits up to 2 s + 1 s for each
 _REVERT_S = 1.0
+
+_HOST = re.compile(r"(\[[^\[\]\s]+\]|[^:\[\]\s]+)(:(?P<port>[0-9]+))?")
+_LAST_PORT = 65535
 
 
 class SessionLevel(str):
@@ -704,5 +708,10 @@ def _transport(address: str, step_port: int, keys: ClientKeys | None, *, shm: bo
     scheme, separator, rest = address.partition("://")
     if not separator or scheme not in {"tcp", "ipc"} or not rest:
         raise ValueError(f"{address!r} is no address; write tcp://HOST, ipc://PATH or sim://MODEL")
-    own_port = scheme == "tcp" and rest.rpartition(":")[2].isdigit()
+    own_port = False
+    if scheme == "tcp":
+        host = _HOST.fullmatch(rest)
+        if host is None or not 0 < int(host["port"] or 1) <= _LAST_PORT:
+            raise ValueError(f"{address!r} is no address; write tcp://HOST or tcp://HOST:PORT, as in tcp://[::1]:5559")
+        own_port = host["port"] is not None
     return ZmqTransport(address if own_port else f"{address}:{step_port}", keys)
