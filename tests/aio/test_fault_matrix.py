@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import pytest
 from samples import filled
 
-from urlab_client.aio import URLabClient
+from urlab_client.aio import URLabClient, launch
 from urlab_client.protocol.base import Timing
 from urlab_client.protocol.codec import encode_reply
 from urlab_client.protocol.errors import (
@@ -90,7 +90,8 @@ async def test_a_server_that_dies_with_the_request_and_comes_back(client: Any, s
         await asyncio.to_thread(reborn.close)
 
 
-async def test_closing_while_the_server_is_stopped() -> None:
+async def test_closing_while_the_server_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(launch, "_STOP_S", 2.0)
     client = URLabClient("sim://arm", step_mode="direct")
     await client.discover()
     pid = client._transport._process.pid  # type: ignore[attr-defined]
