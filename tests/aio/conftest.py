@@ -117,6 +117,6 @@ def scripted() -> Iterator[ScriptedServer]:
 
 @pytest.fixture
 async def client(scripted: ScriptedServer) -> AsyncIterator[URLabClient]:
-    """A client of the scripted server, with a deadline of half a second."""
-    async with URLabClient("tcp://127.0.0.1", step_port=scripted.port, rcv_timeout_ms=500, local_model=False) as made:
+    """A client of the scripted server."""
+    async with URLabClient("tcp://127.0.0.1", step_port=scripted.port, local_model=False) as made:
         yield made

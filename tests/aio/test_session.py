@@ -7,6 +7,7 @@ import socket
 from typing import Any
 
 import pytest
+from waiting import DEADLINE_S
 
 from urlab_client.aio import URLabClient
 from urlab_client.protocol.errors import (
@@ -97,10 +98,11 @@ async def test_silence_is_a_timeout_and_the_late_reply_is_dropped(client: Any, s
     assert client.transport_stats.late == 1
 
 
-async def test_default_timeout_comes_from_the_client(client: Any) -> None:
-    await client.discover()
-    with pytest.raises(URLabTimeoutError, match="within 500 ms"):
-        await client.runtime.set_paused(True)
+async def test_default_timeout_comes_from_the_client(scripted: Any) -> None:
+    async with URLabClient("tcp://127.0.0.1", step_port=scripted.port, rcv_timeout_ms=200, local_model=False) as client:
+        await client.discover(timeout=DEADLINE_S)
+        with pytest.raises(URLabTimeoutError, match="within 200 ms"):
+            await client.runtime.set_paused(True)
 
 
 async def test_cancelled_call_leaves_the_client_usable(client: Any, scripted: Any) -> None:

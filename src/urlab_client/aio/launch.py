@@ -35,7 +35,7 @@ log = logging.getLogger("urlab_client.launch")
 
 SCHEME = "sim://"
 _START_S = 60.0
-_STOP_S = 10.0  # an idle machine takes 0.2; what is killed leaves its folders behind
+_STOP_S = 10.0  # it takes 0.2 on an idle machine, and 3 where eight programs want a processor
 
 
 class _Ready(Struct):
