@@ -16,7 +16,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Sequence
-from functools import partial
+from typing import IO
 from urllib.parse import parse_qsl
 
 import msgspec
@@ -35,6 +35,7 @@ log = logging.getLogger("urlab_client.launch")
 
 SCHEME = "sim://"
 _START_S = 60.0
+_CHUNK_BYTES = 65536
 _STOP_S = 10.0  # it takes 0.2 on an idle machine, and 3 where eight programs want a processor
 
 
@@ -219,26 +220,17 @@ class LaunchedTransport:
 
 async def _start(command: Sequence[str]) -> asyncio.subprocess.Process | _Watched:
     pipe = subprocess.PIPE
-    if sys.platform != "win32" and sys.version_info < (3, 12):
-        try:
-            asyncio.get_event_loop_policy().get_child_watcher()  # pyright: ignore[reportDeprecated] - not there
-        except NotImplementedError:
-            if isinstance(asyncio.get_running_loop(), asyncio.SelectorEventLoop):
-                process = _Watched(subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe))  # noqa: ASYNC220, S603
-                try:
-                    await process.connect()
-                except BaseException:
-                    process.kill()
-                    raise
-                return process
-    return await asyncio.create_subprocess_exec(*command, stdin=pipe, stdout=pipe, stderr=pipe)
+    try:
+        return await asyncio.create_subprocess_exec(*command, stdin=pipe, stdout=pipe, stderr=pipe)
+    except NotImplementedError:
+        return _Watched(subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe))  # noqa: ASYNC220, S603
 
 
 class _Watched:
-    """A process whose end a thread waits for; what is used of `asyncio.subprocess.Process`.
+    """A process that threads read from and wait for; what is used of `asyncio.subprocess.Process`.
 
-    Up to Python 3.11 asyncio's own loop starts processes only with a child watcher of the loop policy, and uvloop's
-    policy has none.
+    For loops that start none: the selector loop on Windows, and up to Python 3.13 with a loop policy that, as uvloop's,
+    has no child watcher.
     """
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:
@@ -249,12 +241,12 @@ class _Watched:
         self._process = process
         self._loop = asyncio.get_running_loop()
         self._ended = asyncio.Event()
-        threading.Thread(target=self._watch, name="urlab-server-end", daemon=True).start()
-
-    async def connect(self) -> None:
-        """Make the pipes readable."""
-        for reader, pipe in ((self.stdout, self._process.stdout), (self.stderr, self._process.stderr)):
-            await self._loop.connect_read_pipe(partial(asyncio.StreamReaderProtocol, reader), pipe)
+        for target, *arguments in (
+            (self._watch,),
+            (self._feed, self.stdout, process.stdout),
+            (self._feed, self.stderr, process.stderr),
+        ):
+            threading.Thread(target=target, args=arguments, name="urlab-server", daemon=True).start()
 
     @property
     def returncode(self) -> int | None:
@@ -268,6 +260,12 @@ class _Watched:
     async def wait(self) -> None:
         """Wait for the end."""
         await self._ended.wait()
+
+    def _feed(self, reader: asyncio.StreamReader, pipe: IO[bytes]) -> None:
+        with contextlib.suppress(RuntimeError), pipe:  # the loop is closed
+            while data := os.read(pipe.fileno(), _CHUNK_BYTES):
+                self._loop.call_soon_threadsafe(reader.feed_data, data)
+            self._loop.call_soon_threadsafe(reader.feed_eof)
 
     def _watch(self) -> None:
         self._process.wait()
