@@ -146,7 +146,7 @@ async def test_live_mode_is_followed_and_another_servers_robots_replace_the_firs
         servers.enter_context(first)
         options = first.client_options()
         ports = {name: number for name, number in options.items() if name.endswith("_port")}
-        async with AsyncClient(**options, step_mode="live") as client:
+        async with AsyncClient(**options, step_mode="live", rcv_timeout_ms=30_000) as client:
             await client.discover()
             await client.runtime.set_paused(False)
             async with rerun_view(client, save=path, cameras=["wrist"]) as view:
@@ -332,7 +332,7 @@ async def test_another_servers_robots_and_cameras_replace_the_first_in_foxglove(
     with contextlib.ExitStack() as servers:
         reach = servers.enter_context(SimulatedServer("arm", **options)).client_options()
         ports = {name: number for name, number in reach.items() if name.endswith("_port")}
-        async with AsyncClient(**reach, step_mode="live") as client, asyncio.timeout(60):
+        async with AsyncClient(**reach, step_mode="live", rcv_timeout_ms=30_000) as client, asyncio.timeout(100):
             await client.discover()
             await client.runtime.set_paused(False)
             async with (
