@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from waiting import eventually, until
+from waiting import DEADLINE_S, eventually, until
 
 import urlab_client
 from urlab_client.aio import URLabClient as AsyncClient
@@ -137,6 +137,14 @@ def test_stepping_never_waits_and_the_newest_state_is_shown(
     assert [times["sim_time"] for times, _ in shown] == [round(time * 1e9)]
 
 
+async def published(client: AsyncClient, key: str) -> None:
+    """Wait until some states of this articulation have arrived, whatever the client was told of it."""
+    seen = 0
+    async with client.state_stream(timeout=DEADLINE_S) as states:
+        while seen < 5:
+            seen += key in (await states.receive()).per_articulation
+
+
 async def test_live_mode_is_followed_and_another_servers_robots_replace_the_first(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -153,6 +161,7 @@ async def test_live_mode_is_followed_and_another_servers_robots_replace_the_firs
                 await until(lambda: view.stats.states >= 5)
                 servers.close()
                 servers.enter_context(SimulatedServer("quadruped", play=True, **ports))
+                await published(client, "quadruped")
                 await client.discover()
                 await client.runtime.set_paused(False)
                 before = view.stats.states
@@ -244,7 +253,7 @@ class Foxglove:
     def __init__(self, socket: Any) -> None:
         self.socket = socket
         self.channels: dict[str, dict[str, Any]] = {}
-        self.topics: dict[int, str] = {}
+        self.topics: dict[int, str] = {}  # of all that there ever were
         self.newest: dict[str, bytes] = {}
 
     async def until(self, *topics: str) -> None:
@@ -344,6 +353,7 @@ async def test_another_servers_robots_and_cameras_replace_the_first_in_foxglove(
                 assert "arm" in drawn(seen)
                 servers.close()
                 servers.enter_context(SimulatedServer("quadruped", **options, **ports))
+                await published(client, "quadruped")
                 await client.discover()
                 await client.runtime.set_paused(False)
                 await seen.until("/tf", "/scene", "/state/quadruped", "/camera/quadruped/side")
@@ -354,6 +364,7 @@ async def test_another_servers_robots_and_cameras_replace_the_first_in_foxglove(
     assert view.error is None
     assert "/state/quadruped" in seen.channels
     assert "/state/arm" not in seen.channels
+    assert list(seen.topics.values()).count("/state/quadruped") == 1  # nothing of it before the handshake
     assert "quadruped/side" in frames
     assert not any(frame.startswith("arm") for frame in frames)
     picture = json.loads(seen.newest["/camera/quadruped/side"])

@@ -345,6 +345,17 @@ class SimState:
                 record.pose = None
             self.absorb(reply, "reset")
 
+    def matches(self, snapshot: StateSnapshot) -> bool:
+        """Whether a published state is of the world that the handshake described, as far as that can be seen."""
+        if not self.session.confirmed or snapshot.per_articulation.keys() != self._records.keys():
+            return False
+        try:
+            for key, state in snapshot.per_articulation.items():
+                self._records[key].check(state, "state/full")
+        except ProtocolError:
+            return False
+        return True
+
     def _absorb_live(self, snapshot: StateSnapshot) -> None:
         age = self.wall_time_sec - snapshot.wall_time.sec + (self.wall_time_nsec - snapshot.wall_time.nsec) / 1e9
         if 0 < age < _OVERTAKEN_S:

@@ -225,9 +225,9 @@ class Follower:
                     continue
                 except ClientClosed:
                     return
-                if (
-                    self._state.mode is StepMode.LIVE and snapshot.time != last
-                ):  # while paused the same state comes with every tick
+                # While paused the same state comes with every tick, and another server's comes before its handshake.
+                fresh = self._state.mode is StepMode.LIVE and snapshot.time != last
+                if fresh and self._state.matches(snapshot):
                     last = snapshot.time
                     self._hand_on(snapshot)
 
