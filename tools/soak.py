@@ -8,8 +8,8 @@ are open all the time.
 
 Prints a table of samples and a verdict: it fails (1) when the memory of a lasting server grows, or what this process
 has allocated, when there are always more threads or descriptors in the end than after warming up, or when a client
-gave a wrong answer. What this process occupies is printed and not judged: glibc keeps what was freed, in a heap for each of
-several threads, so that it grows for long to a bound of its own.
+gave a wrong answer. What this process occupies is printed and not judged: glibc keeps what was freed, in a heap for
+each of several threads, so that it grows for long to a bound of its own.
 """
 
 from __future__ import annotations
