@@ -36,7 +36,7 @@ async def test_a_client_that_finds_no_server_gives_it_back_and_one_without_an_ad
             await lost.meta()
         assert shared._shared._users == users + 1
     assert shared._shared._users == users
-    async with URLabClient("tcp://no address:9") as wrong:
+    async with URLabClient(f"ipc:///tmp/{'a' * 200}") as wrong:  # longer than a path may be there
         with pytest.raises(ValueError, match="not an address"):
             await wrong.meta()
         assert shared._shared._users == users
