@@ -92,8 +92,8 @@ async def test_closing_while_the_server_starts_leaves_none_behind(moment: str) -
     client = URLabClient("sim://ball")
     call = asyncio.create_task(client.discover())
     await asyncio.sleep(0)
-    while moment == "before it is ready" and not children():  # noqa: ASYNC110  # the process table has no event
-        await asyncio.sleep(0)
+    if moment == "before it is ready":
+        await until(children, look=0)
     await client.close()
     assert children() == set()
     with pytest.raises(ClientClosed):

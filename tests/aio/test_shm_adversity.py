@@ -16,6 +16,8 @@ from typing import Any
 
 import pytest
 from plugin_memory import PluginMemory, WrittenRegion
+from shm_clients import shared, shm_clients
+from waiting import until
 
 from urlab_client.aio import URLabClient
 from urlab_client.protocol import shm
@@ -64,28 +66,8 @@ def silent(answers: dict[str, Any], directory: Path) -> Iterator[tuple[WrittenRe
 
 @pytest.fixture
 async def connect(scripted: Any, answers: dict[str, Any]) -> AsyncIterator[Callable[..., URLabClient]]:
-    made: list[URLabClient] = []
-
-    def connect(**options: Any) -> URLabClient:
-        defaults: dict[str, Any] = {"step_port": scripted.port, "rcv_timeout_ms": 500, "local_model": False}
-        made.append(URLabClient("tcp://127.0.0.1", transport="shm", **(defaults | options)))
-        return made[-1]
-
-    yield connect
-    for client in made:
-        await client.close()
-
-
-async def shared(client: URLabClient) -> URLabClient:
-    await client.discover()
-    await client.step()
-    return client
-
-
-async def until(condition: Callable[[], Any]) -> None:
-    async with asyncio.timeout(10):
-        while not condition():  # noqa: ASYNC110 - memory has no event
-            await asyncio.sleep(0)
+    async with shm_clients(scripted.port) as connect:
+        yield connect
 
 
 async def step_in_flight(client: URLabClient, plugin: PluginMemory, **options: Any) -> asyncio.Task[Any]:
@@ -101,7 +83,7 @@ async def test_a_server_that_is_lost_while_a_session_opens_is_no_puzzle(
     requests, _ = silent
     client = connect()
     opening = asyncio.create_task(client.discover())
-    await until(lambda: requests.region.sequence)  # the client asks whether an old reply is still to come
+    await until(lambda: requests.region.sequence, look=0)  # the client asks whether an old reply is still to come
     await asyncio.to_thread(scripted.close)
     with contextlib.suppress(URLabConnectionError):
         await opening
@@ -115,7 +97,7 @@ async def test_a_reply_region_damaged_while_a_session_opens_leaves_zmq(
     requests, replies = silent
     client = connect()
     opening = asyncio.create_task(client.discover())
-    await until(lambda: requests.region.sequence)
+    await until(lambda: requests.region.sequence, look=0)
     replies.region._latest[0] = 9
     replies.region._sequence[0] += 1
     await opening
@@ -129,8 +111,8 @@ async def test_a_client_closed_while_its_session_opens_gives_the_regions_back(
     (directory / shm.REPLY_FILE).rename(directory / "later")
     client = connect()
     opening = asyncio.create_task(client.discover())
-    await until(lambda: client.connected)
-    await until(lambda: client.transport_stats.received == 2)  # now it waits for the file
+    await until(lambda: client.connected, look=0)
+    await until(lambda: client.transport_stats.received == 2, look=0)  # now it waits for the file
     await client.close()
     (directory / "later").rename(directory / shm.REPLY_FILE)
     await asyncio.gather(opening, return_exceptions=True)
@@ -185,7 +167,7 @@ async def test_no_memory_of_a_lost_server_is_touched(
         assert frame is not None
         assert frame.valid()
         await asyncio.to_thread(scripted.close)
-        await until(lambda: not client.connected)
+        await until(lambda: not client.connected, look=0)
         assert not frame.valid()
         assert eye.shared_frame() is None, "its files are there, as a killed server leaves them"
     region.close()

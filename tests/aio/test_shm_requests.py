@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from plugin_memory import PluginMemory
+from shm_clients import shared, shm_clients
 from waiting import until
 
 from urlab_client.aio import URLabClient
@@ -51,23 +52,8 @@ def plugin(scripted: Any, directory: Path) -> Any:
 
 @pytest.fixture
 async def connect(scripted: Any, plugin: PluginMemory) -> AsyncIterator[Callable[..., URLabClient]]:
-    made: list[URLabClient] = []
-
-    def connect(**options: Any) -> URLabClient:
-        defaults: dict[str, Any] = {"step_port": scripted.port, "rcv_timeout_ms": 500, "local_model": False}
-        made.append(URLabClient("tcp://127.0.0.1", transport="shm", **(defaults | options)))
-        return made[-1]
-
-    yield connect
-    for client in made:
-        await client.close()
-
-
-async def shared(client: URLabClient) -> URLabClient:
-    """Discover, and step once: the first reply's size is not known yet, so that goes over ZMQ."""
-    await client.discover()
-    await client.step()
-    return client
+    async with shm_clients(scripted.port) as connect:
+        yield connect
 
 
 async def test_a_step_goes_over_shared_memory_once_its_size_is_known(connect: Any, plugin: PluginMemory) -> None:

@@ -222,7 +222,7 @@ async def _start(command: Sequence[str]) -> asyncio.subprocess.Process | _Watche
     pipe = subprocess.PIPE
     try:
         return await asyncio.create_subprocess_exec(*command, stdin=pipe, stdout=pipe, stderr=pipe)
-    except NotImplementedError:
+    except NotImplementedError:  # what asyncio says of a loop that starts no processes
         return _Watched(subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe))  # noqa: ASYNC220, S603
 
 
