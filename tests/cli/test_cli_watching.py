@@ -88,7 +88,7 @@ async def test_live_mode_ends_when_the_server_stays_away(monkeypatch: pytest.Mon
 @pytest.mark.parametrize("mode", ["direct", "live"])
 def test_ctrl_c_ends_a_recording_early_and_whole(mode: str, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    command = ["record", "sim://ball", path, "--step-mode", mode, "--duration", "1000"]
+    command = ["record", "sim://ball", path, "--step-mode", mode, "--seconds", "1000"]
     with child("-m", "urlab_client", *command, cwd=tmp_path) as recording:
         eventually(lambda: path.exists() and path.stat().st_size > 2_000)
         recording.send_signal(signal.SIGINT)

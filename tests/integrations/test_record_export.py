@@ -237,7 +237,7 @@ def test_record_steps_or_watches(mode: str, tmp_path: Path, capsys: pytest.Captu
     path = tmp_path / "run.mcap"
     with SimulatedServer("arm", play=True) as server:
         ports = ["--step-port", server.step_port, "--state-port", server.state_port]
-        command = ["record", server.address, path, *ports, "--step-mode", mode, "--duration", "0.3"]
+        command = ["record", server.address, path, *ports, "--step-mode", mode, "--seconds", "0.3"]
         assert run(*command) == 0
         assert run(*command) == 2
     assert "--overwrite" in capsys.readouterr().err

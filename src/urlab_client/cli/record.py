@@ -63,7 +63,7 @@ def add_parser(commands: Commands) -> None:
     add_ports(parser)
     add_step_mode(parser)
     parser.add_argument(
-        "--duration", type=seconds, default=10.0, metavar="S", help="simulated seconds (default: %(default)s)"
+        "--seconds", type=seconds, default=10.0, metavar="S", help="simulated seconds (default: %(default)s)"
     )
     parser.add_argument("--keyframe", metavar="NAME", help="keyframe to start from, in direct mode")
     add_cameras(parser, "a camera to keep")
@@ -125,8 +125,8 @@ async def _record(arguments: RecordArguments) -> AsyncRecorder:
             if arguments.step_mode is StepMode.DIRECT:
                 await client.reset(arguments.keyframe)
             async with recorder:
-                with progress_bar(f"recording {arguments.output.name}", arguments.duration) as progress:
+                with progress_bar(f"recording {arguments.output.name}", arguments.seconds) as progress:
                     await go_on(
-                        client, arguments.duration, over=lambda: stop.is_set() or recorder.failed, progress=progress
+                        client, arguments.seconds, over=lambda: stop.is_set() or recorder.failed, progress=progress
                     )
     return recorder
