@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import base64
 import contextlib
+import importlib
 import io
 import json
 import threading
@@ -18,6 +19,8 @@ from waiting import DEADLINE_S, eventually, until
 
 import urlab_client
 from urlab_client.aio import URLabClient as AsyncClient
+from urlab_client.integrations._feed.messages import CompressedImage, RawImage, Time
+from urlab_client.integrations._feed.samples import Picture, picture_message
 from urlab_client.integrations.view import foxglove_view, rerun_view, window_view
 from urlab_client.integrations.view import view as viewing
 from urlab_client.integrations.view.geometry import Kind, shapes_of
@@ -326,6 +329,32 @@ async def test_foxglove_is_told_frames_geometry_joints_and_contacts(server: Simu
     assert len(markers.spheres) == len(contacts) > 3
     for sphere, contact in zip(markers.spheres, contacts, strict=True):
         assert [getattr(sphere.pose.position, axis) for axis in "xyz"] == list(contact["position"].values())
+
+
+async def test_pictures_are_compressed_only_for_somebody_who_looks(monkeypatch: pytest.MonkeyPatch) -> None:
+    from websockets.asyncio.client import connect
+
+    made: list[CompressedImage | RawImage] = []
+
+    def compressing(picture: Picture, stamp: Time, quality: int | None) -> CompressedImage | RawImage:
+        made.append(picture_message(picture, stamp, quality))
+        return made[-1]
+
+    module = importlib.import_module("urlab_client.integrations.view.foxglove_view")  # the package's is the function
+    monkeypatch.setattr(module, "picture_message", compressing)
+    with SimulatedServer("arm", play=True, camera_size=(80, 60)) as server:
+        async with (
+            AsyncClient(**server.client_options(), step_mode="live") as client,
+            asyncio.timeout(60),
+        ):
+            await client.discover()
+            await client.runtime.set_paused(False)
+            async with foxglove_view(client, port=0, cameras=["wrist"]) as view:
+                await until(lambda: view.stats.frames >= 5)
+                assert len(made) == 1  # tells the topic's schema
+                async with connect(view.address, subprotocols=["foxglove.sdk.v1"], max_size=None) as socket:
+                    await Foxglove(socket).until("/camera/arm/wrist")
+    assert len(made) > 1
 
 
 async def test_another_servers_robots_and_cameras_replace_the_first_in_foxglove() -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Literal, overload
 
 import numpy as np
@@ -106,10 +107,10 @@ class _Foxglove:
         """See `Sink`."""
         self._last = moment
         stamp, simulation = Time.of(moment.ns), moment.simulation
-        self._send("/tf", FrameTransforms(simulation.transforms(stamp)), moment.ns)
+        self._send("/tf", lambda: FrameTransforms(simulation.transforms(stamp)), moment.ns)
         joints = simulation.joints()
         if joints:
-            self._send("/joint_states", JointStates(stamp, joints), moment.ns)
+            self._send("/joint_states", lambda: JointStates(stamp, joints), moment.ns)
         if moment.state is not None:
             self._send_states(moment, moment.state)
         if moment.contacts:
@@ -118,8 +119,8 @@ class _Foxglove:
     def show_picture(self, picture: Picture, ns: int) -> None:
         """See `Sink`."""
         stamp, topic = Time.of(ns), f"/camera/{picture.camera.name}"
-        self._send(topic, picture_message(picture, stamp, _JPEG_QUALITY), ns)
-        self._send(f"{topic}/calibration", calibration(picture.camera, stamp), ns)
+        self._send(topic, lambda: picture_message(picture, stamp, _JPEG_QUALITY), ns)
+        self._send(f"{topic}/calibration", lambda: calibration(picture.camera, stamp), ns)
 
     def idle(self) -> bool:
         """See `Sink`."""
@@ -136,40 +137,44 @@ class _Foxglove:
         if self._server is not None:
             self._server.stop()
 
-    def _send(self, topic: str, message: Struct, ns: int, metadata: dict[str, str] | None = None) -> None:
+    def _send(self, topic: str, make: Callable[[], Struct], ns: int, metadata: dict[str, str] | None = None) -> None:
+        """Send what `make` returns; it is asked only when somebody has subscribed, and once for the topic's schema."""
         import foxglove  # noqa: PLC0415
 
-        kind = type(message)
         key = topic, (metadata or {}).get("layout", "")
         channel = self._channels.get(key)
         if channel is None:
+            kind = type(make())
             schema = foxglove.Schema(name=schema_name(kind), encoding="jsonschema", data=schema_of(kind))
-            channel = foxglove.Channel(
+            self._channels[key] = foxglove.Channel(
                 topic, schema=schema, message_encoding="json", context=self._context, metadata=metadata or {}
             )
-            self._channels[key] = channel
-        if channel.has_sinks():
-            channel.log(encode(message), log_time=ns)
+        elif channel.has_sinks():
+            channel.log(encode(make()), log_time=ns)
 
     def _send_states(self, moment: Moment, item: State) -> None:
-        reply = item.reply
-        for key, state in reply.per_articulation.items():
+        for key in item.reply.per_articulation:
             names = moment.scene.names.get(key)
-            message = ArticulationMessage(
-                timestamp=Time.of(moment.ns),
-                sim_time=reply.time,
-                sample=reply.step,
-                step=reply.step,
-                episode=moment.episode,
-                wall_time=Time.of(moment.wall_ns),
-                qpos=state.qpos.tolist(),
-                qvel=state.qvel.tolist(),
-                set_points=item.set_points.get(key, []),
-                ctrl=values(state.ctrl),
-                act=values(state.act),
-                sensors=(state.sensors or {}) if self._sensors else {},
-            )
+            message = functools.partial(self._state_message, moment, item, key)
             self._send(f"/state/{key}", message, moment.ns, to_metadata(names) if names else {})
+
+    def _state_message(self, moment: Moment, item: State, key: str) -> ArticulationMessage:
+        reply = item.reply
+        state = reply.per_articulation[key]
+        return ArticulationMessage(
+            timestamp=Time.of(moment.ns),
+            sim_time=reply.time,
+            sample=reply.step,
+            step=reply.step,
+            episode=moment.episode,
+            wall_time=Time.of(moment.wall_ns),
+            qpos=state.qpos.tolist(),
+            qvel=state.qvel.tolist(),
+            set_points=item.set_points.get(key, []),
+            ctrl=values(state.ctrl),
+            act=values(state.act),
+            sensors=(state.sensors or {}) if self._sensors else {},
+        )
 
     def _send_geometry(self, ns: int) -> None:
         from foxglove import messages as fox  # noqa: PLC0415
@@ -188,7 +193,7 @@ class _Foxglove:
         from foxglove import messages as fox  # noqa: PLC0415
 
         contacts = moment.simulation.contacts()
-        self._send("/contacts", ContactsMessage(Time.of(moment.ns), contacts), moment.ns)
+        self._send("/contacts", lambda: ContactsMessage(Time.of(moment.ns), contacts), moment.ns)
         channel = self._contact_channel
         if channel is None or not channel.has_sinks():
             return
