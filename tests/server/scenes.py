@@ -5,13 +5,16 @@ from __future__ import annotations
 import atexit
 import shutil
 import tempfile
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 
 from urlab_client.server.actors import Actor, ActorKind
 from urlab_client.server.content import Blueprint, ContentRoot
+from urlab_client.server.engine import Engine
 from urlab_client.server.scene import Scene, compile_scene
 
 ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
@@ -83,3 +86,17 @@ def make_scene(*others: Actor, **robots: str | Path) -> Scene:
         for at, (key, source) in enumerate(robots.items())
     ]
     return compile_scene([*actors, *others])
+
+
+def hasty(step_timeout_s: float) -> Callable[..., Engine]:
+    """Return what makes engines that give up on a step so soon, and wait for physics as long as any other.
+
+    The argument `step_timeout_s` bounds every wait for the lock, which a busy machine may well exceed.
+    """
+
+    def make(*args: Any, **options: Any) -> Engine:
+        engine = Engine(*args, **options)
+        engine._step_timeout_s = step_timeout_s
+        return engine
+
+    return make

@@ -468,7 +468,7 @@ def test_names_that_could_leave_the_content_root_are_refused(name: str) -> None:
 
 
 @given(st.text(max_size=30) | st.text("/.\\~ab_- \0:", max_size=12).map(lambda text: f"/Game/{text}"))
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 def test_no_level_file_lies_outside_the_content_root(tmp_path: Path, name: str) -> None:
     content = ContentRoot(tmp_path)
     try:

@@ -346,7 +346,7 @@ def fuzzed(models: Path) -> Iterator[tuple[Dispatcher, ServerCore]]:
 
 
 @given(request_=plain_requests | mangled_requests)
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow], deadline=None)
 def test_no_request_makes_the_server_fail(fuzzed: tuple[Dispatcher, ServerCore], request_: dict[str, Any]) -> None:
     dispatcher, core = fuzzed
     core.session.json = False

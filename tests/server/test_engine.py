@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import ASSETS, BALL, BOT, make_scene
+from scenes import ASSETS, BALL, BOT, hasty, make_scene
 
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.messages.session import ArticulationCommand, Step
@@ -58,8 +58,14 @@ Start = Callable[..., Sim]
 def start() -> Iterator[Start]:
     engines: list[Engine] = []
 
-    def _start(*, mode: StepMode = StepMode.DIRECT, options: dict[str, Any] | None = None, **parts: str | Path) -> Sim:
-        engine = Engine(make_scene(**(parts or {"bot": BOT})), **(options or {})).start()
+    def _start(
+        *,
+        mode: StepMode = StepMode.DIRECT,
+        make: Callable[..., Engine] = Engine,
+        options: dict[str, Any] | None = None,
+        **parts: str | Path,
+    ) -> Sim:
+        engine = make(make_scene(**(parts or {"bot": BOT})), **(options or {})).start()
         engines.append(engine)
         engine.set_mode(mode)
         return Sim(engine)
@@ -142,8 +148,8 @@ def test_live_time_grows_without_requests_once_unpaused_and_does_not_count_steps
 def test_live_step_stages_positional_controls_only(start: Start, *, paused: bool) -> None:
     sim = start(mode=StepMode.LIVE)
     sim.engine.set_paused(paused)
-    ticks = Beat(sim.engine.on_tick, sim.engine)
     sim.command(ctrl=[0.7], ctrl_map={"m": 0.1}, control_mode="raw", xfrc_applied={"base": [0, 0, 9, 0, 0, 0]})
+    ticks = Beat(sim.engine.on_tick, sim.engine)
     ticks.wait(2)
     with sim.engine.lock:
         assert sim.data.ctrl.tolist() == [0.699999988079071]
@@ -370,7 +376,7 @@ def test_reset_and_the_same_controls_give_the_same_trajectory(start: Start) -> N
 
 
 def test_paused_direct_times_out_and_the_step_runs_once_unpaused(start: Start) -> None:
-    sim = start(options={"step_timeout_s": 0.05})
+    sim = start(make=hasty(0.05))
     sim.engine.set_paused(True)
     assert refused(lambda: sim.step(7)) == "step_timeout"
     assert sim.engine.time == 0.0
@@ -481,7 +487,7 @@ def test_the_active_mode_again_changes_nothing(start: Start) -> None:
 
 
 def test_a_pinned_mode_is_in_force_from_the_start_paused_and_locked() -> None:
-    with Engine(make_scene(bot=BOT), pinned_mode=StepMode.DIRECT, step_timeout_s=0.02) as engine:
+    with hasty(0.02)(make_scene(bot=BOT), pinned_mode=StepMode.DIRECT) as engine:
         assert (engine.mode, engine.paused) == (StepMode.DIRECT, True)
         assert refused(lambda: engine.set_mode(StepMode.DIRECT)) == "mode_locked_by_server"
         assert refused(lambda: engine.step(Step(), lambda mode: None)) == "step_timeout"
@@ -519,8 +525,8 @@ def test_puppet_without_time_sets_time_to_zero_and_ignores_what_does_not_fit(sta
 def test_puppet_works_while_paused_and_ignores_commands(start: Start) -> None:
     sim = start(mode=StepMode.PUPPET)
     sim.engine.set_paused(True)
-    ticks = Beat(sim.engine.on_tick, sim.engine)
     assert sim.command(ctrl=[0.9]) == [0.0]
+    ticks = Beat(sim.engine.on_tick, sim.engine)
     ticks.wait(2)
     assert sim.data.ctrl.tolist() == [0.0]
 
@@ -821,8 +827,7 @@ def test_closing_ends_a_very_long_request(way: InlineOrQueued, pool: ThreadPoolE
 
 
 def test_nothing_hangs_behind_a_request_that_outlasts_its_timeout() -> None:
-    engine = Engine(make_scene(bot=BOT), step_timeout_s=0.05).start()
-    engine.set_mode(StepMode.DIRECT)
+    engine = Engine(make_scene(bot=BOT), pinned_mode=StepMode.DIRECT, paused=False, step_timeout_s=0.05).start()
     under_way = threading.Event()
     mujoco.set_mjcb_control(lambda model, data: under_way.set())
     try:

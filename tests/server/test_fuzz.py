@@ -10,13 +10,14 @@ import random
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
 import zmq
 from mangling import FACTOR, golden_replies, golden_requests, mutated, strange
+from scenes import hasty
 from wire import Wire, pack
 
 from urlab_client import ProtocolError, URLabRPCError
@@ -34,7 +35,6 @@ from urlab_client.protocol.rows import (
     decode_row,
 )
 from urlab_client.server import Limits, SimulatedServer
-from urlab_client.server.engine import Engine
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.requests import Incoming, RequestReader
 
@@ -149,7 +149,7 @@ def test_a_live_server_answers_every_frame(
     models: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Some frames pause physics, and then each step waits for its whole time.
-    monkeypatch.setitem(cast("dict[str, Any]", Engine.__init__.__kwdefaults__), "step_timeout_s", 0.01)
+    monkeypatch.setattr("urlab_client.server.core.Engine", hasty(0.01))
     codes = {*RPC_ERRORS} - {"internal_error"}
     replies = {op.reply_name for op in OPS.values()}
     refused = served = 0

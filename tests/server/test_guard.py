@@ -12,6 +12,8 @@ from typing import Any
 
 import msgspec
 import pytest
+from waiting import eventually
+from wire import server_threads
 
 from urlab_client import AuthenticationFailed, URLabClient
 from urlab_client.cli import main
@@ -61,7 +63,7 @@ def test_pictures_need_the_key_as_well(guarded: SimulatedServer) -> None:
                 socket.connect(f"{guarded.address}:{port}")
                 from zmq.utils.monitor import recv_monitor_message
 
-                assert monitor.poll(10_000)
+                assert monitor.poll(30_000)
                 assert recv_monitor_message(monitor)["event"] == zmq.Event.HANDSHAKE_FAILED_PROTOCOL, port
                 socket.disable_monitor()
                 monitor.close(0)
@@ -97,12 +99,14 @@ def test_keys_for_a_server_without(keys: Path) -> None:
 
 def test_a_client_is_let_in_once_the_server_knows_it(keys: Path) -> None:
     secret = keys / "server.key_secret"
+    before = server_threads()
     with SimulatedServer(curve=CurveServer(server_key=secret, allow=[keys / "stranger.key"])) as server:
         options = server.client_options()
         client = URLabClient(**options, client_key=keys / "clients/me.key_secret")
         with pytest.raises(AuthenticationFailed):
             client.discover()
     ports = {name: port for name, port in options.items() if name.endswith("_port")}
+    eventually(lambda: server_threads() <= before)
     with client, SimulatedServer(curve=CurveServer(server_key=secret, allow=[keys / "clients"]), **ports):
         client.discover()
         assert client.session_id

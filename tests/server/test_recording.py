@@ -226,6 +226,8 @@ for _ in range(60):
         while True:
             for one in contents:
                 write_atomic(file, one)
+    while killed == 0 and not file.exists():  # the first one has time to write it
+        time.sleep(0.001)
     time.sleep(chance.uniform(0.0, 0.02))
     os.kill(child, signal.SIGKILL)
     killed += os.WIFSIGNALED(os.waitpid(child, 0)[1])

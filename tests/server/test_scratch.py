@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
@@ -51,7 +52,9 @@ def test_the_next_one_removes_what_a_killed_process_left_and_nothing_else(tempor
 
 def test_a_forked_child_removes_nothing() -> None:
     with Scratch() as scratch:
-        pid = os.fork()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # other tests may have left a thread
+            pid = os.fork()
         if pid == 0:
             scratch.close()
             os._exit(0)

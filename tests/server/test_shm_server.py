@@ -49,7 +49,7 @@ def zmq_line(server: SimulatedServer) -> Iterator[Rpc]:
     """Requests over ZeroMQ, for what shared memory does not take."""
     context = zmq.Context()
     line = context.socket(zmq.REQ)
-    line.rcvtimeo = 10_000
+    line.rcvtimeo = 30_000
     line.connect(f"{server.address}:{server.step_port}")
 
     def call(**request: Any) -> dict[str, Any]:
@@ -74,7 +74,10 @@ def session(rpc: Rpc) -> str:
 
 
 def snapshot_of(state: RawRegion, step: int) -> dict[str, Any] | None:
-    snapshot = msgspec.msgpack.decode(state.read()[1])
+    sequence, payload = state.read()
+    if not sequence:  # its file is there before the first snapshot is
+        return None
+    snapshot = msgspec.msgpack.decode(payload)
     return snapshot if snapshot["step"] == step else None
 
 
@@ -204,7 +207,7 @@ def test_pictures_come_to_whom_asks_for_them_in_every_mode(server: SimulatedServ
         shm.bell.send(b"C")
         region = RawRegion(directory / "cam_arm_overview.shm")
         eventually(lambda: region.sequence >= 3)
-        assert b"c" in shm.wait(5.0)
+        eventually(lambda: b"c" in shm.wait(1.0))  # those may have been published before there was whom to tell
         _, pixels = region.read()
         assert len(pixels) == 32 * 24 * 4
         assert len(set(pixels)) > 10
@@ -245,6 +248,7 @@ def test_files_that_are_cut_off_do_not_kill_the_server(
 ) -> None:
     directory = directory_of(server)
     eventually((directory / name).is_file)
+    whole, header = (directory / name).stat().st_size, (directory / name).read_bytes()[:16]
     requests = RawRegion(directory / "req.shm")
     with socket.socket(socket.AF_UNIX) as bell:
         bell.connect(os.fspath(directory / "doorbell.sock"))
@@ -256,7 +260,7 @@ def test_files_that_are_cut_off_do_not_kill_the_server(
         for _ in range(20):
             assert rpc(op="step", session_id=session)["op"] == "step_ok"
     requests.close()
-    eventually(lambda: (directory / name).stat().st_size > 64)
+    eventually(lambda: (directory / name).stat().st_size == whole and (directory / name).read_bytes()[:16] == header)
     with RawShm(directory, bell=True) as shm:
         eventually(lambda: shm.call({"op": "meta"}, 0.5))
 
@@ -283,7 +287,7 @@ def test_the_doorbell_has_room_for_so_many(server: SimulatedServer) -> None:
         clients = [crowd.enter_context(socket.socket(socket.AF_UNIX)) for _ in range(MAX_LISTENERS + 8)]
         for client in clients:
             client.connect(os.fspath(directory_of(server) / "doorbell.sock"))  # waits while the queue is full
-            client.settimeout(10)
+            client.settimeout(30)
         welcomes = [client.recv(1) for client in clients]
     assert welcomes == [b"r"] * MAX_LISTENERS + [b""] * 8
 
@@ -301,7 +305,7 @@ def test_two_servers_share_a_base_and_leave_nothing(base: Path) -> None:
         for server in (one, two):
             with RawShm(directory_of(server), bell=True) as shm:
                 assert shm.call({"op": "meta"}) is not None
-    assert list(base.iterdir()) == []
+    eventually(lambda: list(base.iterdir()) == [])
 
 
 def serve(base: Path) -> tuple[subprocess.Popen[bytes], Path]:
@@ -314,7 +318,7 @@ def serve(base: Path) -> tuple[subprocess.Popen[bytes], Path]:
 
 def end(process: subprocess.Popen[bytes], number: int) -> None:
     process.send_signal(number)
-    process.wait(20)
+    process.wait(60)
     assert process.stdout is not None
     process.stdout.close()
 
@@ -358,7 +362,7 @@ def test_a_server_for_which_there_is_no_room_keeps_nothing(base: Path, monkeypat
     before = os.listdir("/dev/fd")
     with pytest.raises(OSError, match="No space left"):
         SharedMemory(base)
-    assert os.listdir("/dev/fd") == before
+    assert set(os.listdir("/dev/fd")) <= set(before)  # what was garbage before may have been collected meanwhile
     assert list(base.iterdir()) == []
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Self
@@ -89,6 +90,12 @@ def write_level(path: Path, *, size: float, quick_convert: bool = False) -> Path
     actors = [crate, {"name": "AMjManager_0", "kind": "manager"}]
     path.write_bytes(msgspec.json.encode({"format": "urlab-level", "version": 1, "blueprints": {}, "actors": actors}))
     return path
+
+
+def server_threads() -> set[threading.Thread]:
+    """Return the threads of the servers in this process. One that was closed may take a moment to end its own."""
+    urlab = {thread for thread in threading.enumerate() if thread.name.startswith("urlab")}
+    return {thread for thread in urlab if thread.name != "urlab-io"}  # a client's
 
 
 class Wire:

@@ -85,7 +85,7 @@ class RawShm:
         if self.bell is not None:
             self.bell.close()
 
-    def call(self, request: dict[str, Any] | bytes, seconds: float = 10.0) -> dict[str, Any] | None:
+    def call(self, request: dict[str, Any] | bytes, seconds: float = 30.0) -> dict[str, Any] | None:
         """The reply, or None if there is none in time."""
         before = self.replies.sequence
         self.requests.publish(request if isinstance(request, bytes) else msgspec.msgpack.encode(request))
