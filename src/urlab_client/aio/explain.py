@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -20,10 +21,33 @@ from urlab_client.protocol.messages.session import Meta
 from urlab_client.protocol.messages.sim import PieStatus
 from urlab_client.protocol.types import ClientConfig, Diagnosis, Finding, Verdict
 
-__all__ = ["diagnose"]
+__all__ = ["diagnose", "watched"]
 
-_PROBE_S = 1.0
-_WATCH_S = 0.25
+_CONNECT_S = 2.0
+_LOOKS = 5
+_LOOK_S = 0.05
+
+
+class _Status(Protocol):
+    @property
+    def sim_time(self) -> float | None: ...
+
+
+S = TypeVar("S", bound=_Status)
+
+
+async def watched(look: Callable[[], Awaitable[S]], first: S) -> S:
+    """Look at play again until simulation time has passed, or it seems to stand still, and return the last look.
+
+    What counts is looks, not seconds: a server that has to wait for its processor is late with its answers, too.
+    """
+    last = first
+    for _ in range(_LOOKS):
+        await asyncio.sleep(_LOOK_S)
+        last = await look()
+        if last.sim_time != first.sim_time:
+            break
+    return last
 
 
 async def diagnose(config: ClientConfig, session: Session, state: SimState) -> Diagnosis:
@@ -37,7 +61,7 @@ async def _examine(config: ClientConfig, session: Session, state: SimState) -> A
     loop = asyncio.get_running_loop()
     before = loop.time()
     try:
-        ops = (await session.call(Meta(), timeout=_PROBE_S)).ops
+        ops = (await session.call(Meta())).ops
     except URLabError as error:
         yield Finding(Verdict.PROBLEM, "server", f"It does not answer: {error}")
         return
@@ -78,10 +102,10 @@ async def _reachability(config: ClientConfig, session: Session) -> AsyncIterator
 
 async def _connect(host: str, port: int) -> str | None:
     try:
-        async with asyncio.timeout(_PROBE_S):
+        async with asyncio.timeout(_CONNECT_S):
             _, writer = await asyncio.open_connection(host, port)
     except TimeoutError:
-        return f"no answer within {_PROBE_S:g} s; is a firewall in between?"
+        return f"no answer within {_CONNECT_S:g} s; is a firewall in between?"
     except OSError as error:
         reason = os.strerror(error.errno) if error.errno else str(error)
         return f"{reason}; is the server running, and on this port?"
@@ -103,9 +127,8 @@ def _versions(state: SimState) -> Finding:
 
 async def _play(session: Session, state: SimState) -> tuple[Finding, bool]:
     try:
-        first = await session.call(PieStatus(), timeout=_PROBE_S)
-        await asyncio.sleep(_WATCH_S)
-        second = await session.call(PieStatus(), timeout=_PROBE_S)
+        first = await session.call(PieStatus())
+        second = await watched(lambda: session.call(PieStatus()), first)
     except URLabRPCError as refusal:
         if isinstance(refusal, RPC_ERRORS["unknown_op"]):
             return Finding(Verdict.NOTE, "play", "A packaged build: its play state cannot be asked for."), True

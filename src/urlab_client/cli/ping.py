@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import msgspec
 from msgspec import Struct
 
+from urlab_client.aio.explain import watched
 from urlab_client.aio.launch import SCHEME
 from urlab_client.cli._arguments import (
     Commands,
@@ -32,8 +33,6 @@ if TYPE_CHECKING:
     from urlab_client.aio import URLabArticulation, URLabClient
 
 __all__ = ["add_parser", "run"]
-
-_WATCH_S = 0.1  # several steps even at the slowest pace of live mode
 
 
 class PingArguments(ServerArguments):
@@ -207,8 +206,7 @@ async def _play(client: URLabClient) -> Play:
     play = Play(state=before.state, sim_time=before.sim_time, physics=None, step_mode=None, step_mode_pinned=False)
     if before.sim_time is None or not client.manager_present:
         return play
-    await asyncio.sleep(_WATCH_S)
-    after = await client.sim.status()
+    after = await watched(client.sim.status, before)
     advancing = after.sim_time is not None and after.sim_time > before.sim_time
     play.sim_time, play.physics = after.sim_time, "advancing" if advancing else "standing still"
     pinned = await _pinned_mode(client)
