@@ -13,16 +13,15 @@ from urlab_client.server import SimulatedServer
 
 def test_a_paused_simulation(tmp_path: Path) -> None:
     with SimulatedServer("arm", play=True) as server:
-        done = urlab(
-            "doctor", f"{server.address}:{server.step_port}", f"--state-port={server.state_port}", cwd=tmp_path
-        )
+        address, state_port = f"{server.address}:{server.step_port}", f"--state-port={server.state_port}"
+        done = urlab("doctor", address, state_port, "--timeout=30", cwd=tmp_path)
     assert done.returncode == 1, done.stderr
     assert "it is paused. Call runtime.set_paused(False)." in done.stdout
 
 
 def test_json_of_a_running_one(tmp_path: Path) -> None:
     with SimulatedServer("arm", play=True, unpaused=True) as server:
-        done = urlab("doctor", f"{server.address}:{server.step_port}", "--json", cwd=tmp_path)
+        done = urlab("doctor", f"{server.address}:{server.step_port}", "--json", "--timeout=30", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     subjects = {finding["subject"]: finding["verdict"] for finding in json.loads(done.stdout)["findings"]}
     assert subjects["play"] == "ok"

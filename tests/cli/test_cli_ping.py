@@ -25,7 +25,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Generator[Server]:
 
 
 def ping_json(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
-    assert main(["ping", "--json", *arguments]) == 0
+    assert main(["ping", "--json", "--timeout", "30", *arguments]) == 0
     return json.loads(capsys.readouterr().out)
 
 
@@ -54,7 +54,8 @@ def test_reports_who_is_there(server: Server, capsys: pytest.CaptureFixture[str]
 
 
 def test_the_same_in_words(server: Server, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["ping", server.ready["address"], "--step-port", str(server.ready["step_port"])]) == 0
+    port = str(server.ready["step_port"])
+    assert main(["ping", server.ready["address"], "--step-port", port, "--timeout", "30"]) == 0
     text = capsys.readouterr().out
     for words in (mujoco.mj_versionString(), "9 joints, 8 actuators", "pd controller", "round trip", "--no-session"):
         assert words in text
@@ -89,7 +90,7 @@ def test_a_server_without_play(tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 
 def test_a_server_of_its_own(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["ping", "sim://pallet?model=ball"]) == 0
+    assert main(["ping", "sim://pallet?model=ball", "--timeout", "30"]) == 0
     text = capsys.readouterr().out
     assert "pallet" in text
     assert "--no-session" not in text  # nobody to disturb
@@ -97,7 +98,7 @@ def test_a_server_of_its_own(capsys: pytest.CaptureFixture[str]) -> None:
 
 def refused(capsys: pytest.CaptureFixture[str], address: str) -> str:
     """Return the line with which the command ended."""
-    assert main(["ping", address, "--timeout", "0.2"]) == 2
+    assert main(["ping", address, "--timeout", "2"]) == 2
     out, err = capsys.readouterr()
     (line,) = err.splitlines()
     assert out == ""

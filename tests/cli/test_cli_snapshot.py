@@ -66,7 +66,7 @@ def test_a_camera_of_a_running_server(capsys: pytest.CaptureFixture[str]) -> Non
         address = f"{server.address}:{server.step_port}"
         assert main(["snapshot", address]) == 2
         assert "--camera, one of arm/overview, arm/wrist" in capsys.readouterr().err
-        assert picture(address, "--camera", "arm/overview").shape == (480, 640, 4)
+        assert picture(address, "--camera", "arm/overview", "--timeout", "60").shape == (480, 640, 4)
         assert main(["snapshot", address, "--camera", "arm/overview", "--seconds", "1"]) == 2
         assert "--seconds are for models" in capsys.readouterr().err
 
@@ -74,7 +74,7 @@ def test_a_camera_of_a_running_server(capsys: pytest.CaptureFixture[str]) -> Non
 def test_a_stepped_server_publishes_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     with SimulatedServer("arm", play=True, step_mode="direct") as server:
         address = f"{server.address}:{server.step_port}"
-        assert main(["snapshot", address, "--camera", "arm/wrist", "--timeout", "0.3"]) == 2
+        assert main(["snapshot", address, "--camera", "arm/wrist", "--timeout", "2"]) == 2
     assert "live mode only" in capsys.readouterr().err
 
 

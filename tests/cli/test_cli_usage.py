@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import socket
 import subprocess
@@ -124,10 +125,19 @@ def test_ctrl_c_is_exit_code_130_without_a_traceback(tmp_path: Path) -> None:
 
 
 def test_a_reader_that_has_gone_is_no_traceback(tmp_path: Path) -> None:
-    with child("-m", "urlab_client", "ping", "sim://ball", "--no-session", cwd=tmp_path) as ping:
-        assert ping.stdout is not None
-        ping.stdout.close()
-        ping.stdout = None
-        _, err = ping.communicate(timeout=DEADLINE_S)
-    assert ping.returncode == 2
-    assert err == ""
+    reading, writing = os.pipe()
+    os.close(reading)
+    try:
+        ping = subprocess.run(
+            [sys.executable, "-m", "urlab_client", "ping", "sim://ball", "--no-session"],
+            cwd=tmp_path,
+            stdin=subprocess.DEVNULL,
+            stdout=writing,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=DEADLINE_S,
+            check=False,
+        )
+    finally:
+        os.close(writing)
+    assert (ping.returncode, ping.stderr) == (2, "")

@@ -19,6 +19,9 @@ from urlab_client.cli._watching import go_on
 from urlab_client.integrations.record import read_run
 from urlab_client.server import SimulatedServer
 
+HEARTBEATS = 100
+"""Bytes of more heartbeats than come while a step is on its way; the reply to one is larger."""
+
 
 @pytest.fixture
 async def server() -> AsyncIterator[SimulatedServer]:
@@ -35,7 +38,7 @@ async def test_a_connection_that_breaks_between_step_and_reply_is_no_end(server:
         await client.discover()
         going = asyncio.create_task(go_on(client, 0.5, over=lambda: False))
         relay.hold_replies()
-        await relay.until_held(1)
+        await relay.until_held(HEARTBEATS)
         relay.cut()
         relay.thaw()
         await going
@@ -54,7 +57,7 @@ async def test_another_client_that_takes_over_meanwhile_is_an_end(server: Simula
         await client.discover()
         going = asyncio.create_task(go_on(client, None, over=lambda: False))
         relay.hold_replies()
-        await relay.until_held(1)
+        await relay.until_held(HEARTBEATS)
         await thief.discover()
         relay.cut()
         relay.thaw()

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import secrets
 import select
 import tempfile
+import time
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import anyio.to_thread
@@ -219,13 +223,25 @@ def waits_forever(notes: Path, fifo: Path) -> Any:
     return policy
 
 
-def test_an_attempt_that_takes_too_long_is_ended_with_its_server(cluster: Any, tmp_path: Path) -> None:
+def test_an_attempt_that_takes_too_long_is_ended_with_its_server(
+    cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from urlab_client.cluster import RolloutError, rollouts
 
     policy = waits_forever(tmp_path / "notes", tmp_path / "fifo")
-    with pytest.raises(RolloutError, match=r"Episode 0 failed 1 times.*not finished within 8 s"):
-        list(rollouts(policy, "sim://arm", 1, retries=0, episode_timeout=8, **OPTIONS))
+    writers: list[int] = []
+
+    def clock() -> float:
+        if not writers:
+            with contextlib.suppress(OSError):  # as long as nobody reads: the policy does not wait yet
+                writers.append(os.open(tmp_path / "fifo", os.O_WRONLY | os.O_NONBLOCK))
+        return time.monotonic() + 100 * len(writers)
+
+    monkeypatch.setattr(import_module("urlab_client.cluster.rollouts"), "time", SimpleNamespace(monotonic=clock))
+    with pytest.raises(RolloutError, match=r"Episode 0 failed 1 times.*not finished within 90 s"):
+        list(rollouts(policy, "sim://arm", 1, retries=0, episode_timeout=90, **OPTIONS))
     assert gone(tmp_path / "notes")
+    os.close(writers[0])
 
 
 async def test_a_cancelled_run_leaves_no_worker_and_no_server(cluster: Any, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from waiting import until
 
 from urlab_client import URLabClient, URLabError, aio
 from urlab_client.integrations import policy as policies
@@ -363,10 +364,11 @@ async def test_in_live_mode_actions_keep_the_pace_of_the_simulation(monkeypatch:
         found = await run(client, policy, seconds=0.5, on_action=lambda so_far: times.append(so_far.sim_time))
         assert found.step_mode == "live"
         assert found.sim_time >= 0.49
-        assert np.diff(times).min() > 0
-        assert client.articulations["quadruped"].get_qpos()["FL_thigh"] == pytest.approx(0.5, abs=0.15)
+        assert all(time > 0.02 * n - 1e-9 for n, time in enumerate(times, 1)), "an action before its period"
+        robot = client.articulations["quadruped"]
+        await until(lambda: abs(robot.get_qpos()["FL_thigh"] - 0.5) < 0.15)  # physics goes on with the last action
 
-        monkeypatch.setattr("urlab_client.integrations.policy.runner._STANDSTILL_S", 0.3)
+        monkeypatch.setattr("urlab_client.integrations.policy.runner._STANDSTILL_S", 2.0)
         tasks: list[asyncio.Task[Any]] = []
         loop = asyncio.get_running_loop()
 

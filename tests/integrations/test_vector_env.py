@@ -125,14 +125,14 @@ def test_a_slow_environment_counts_as_failed_and_holds_up_nobody_for_longer(made
         SimulatedServer("arm", play=True) as quick,
     ):
         addresses = [f"{server.address}:{server.step_port}" for server in (quick, slow)]
-        env = URLabVectorEnv(addresses, step_timeout=0.3)
+        env = URLabVectorEnv(addresses, step_timeout=3.0)
         made.append(env)
         env.reset(seed=0)
         faults.add(Drop("step", times=1))
         action = np.zeros(env.action_space.shape)
         *_, truncated, infos = env.step(action)
         assert truncated.tolist() == [False, True]
-        assert "environment 1 did not answer within 0.3 s" in str(infos["error"][1])
+        assert "environment 1 did not answer within 3 s" in str(infos["error"][1])
         *_, truncated, infos = env.step(action)
         assert not truncated.any()
         assert infos["restarts"].tolist() == [0, 1]

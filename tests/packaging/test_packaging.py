@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 import tarfile
 import tomllib
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from email import message_from_bytes
 from pathlib import Path
 
@@ -151,14 +152,15 @@ def test_the_wheel_works_without_the_repository(venv: Path, tmp_path: Path) -> N
 
 
 @pytest.fixture
-def rival(venv: Path) -> Path:
+def rival(venv: Path) -> Iterator[Path]:
     """Install a distribution of another name that says it brings a package `urlab_client`."""
     (packages,) = venv.glob("lib/python*/site-packages")
     info = packages / "other_bridge-1.0.dist-info"
     info.mkdir(exist_ok=True)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other-bridge\nVersion: 1.0\n", encoding="utf-8")
     (info / "RECORD").write_text("urlab_client/__init__.py,,\n", encoding="utf-8")
-    return packages
+    yield packages
+    shutil.rmtree(info)
 
 
 def test_the_doctor_names_a_package_in_the_way(venv: Path, rival: Path, tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from starlette.applications import Starlette
 from starlette.routing import Mount
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
+from waiting import eventually
 
 from urlab_client.aio import URLabClient
 from urlab_client.protocol.registry import OPS
@@ -32,7 +33,7 @@ def server() -> Iterator[SimulatedServer]:
 def mounted(server: SimulatedServer, at: str, access: Access | None = None) -> Starlette:
     """Mount the console in an application of one's own, which owns the client."""
     client = URLabClient(**server.client_options())
-    inner = app(client, access=access, lease_seconds=30.0)
+    inner = app(client, access=access, lease_seconds=600.0)
 
     @contextlib.asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncGenerator[None]:
@@ -223,8 +224,13 @@ def test_a_replay_goes_to_any_frame_of_it(http: TestClient) -> None:
 
 def test_live_pictures_come_as_files_too(http: TestClient) -> None:
     http.post("/api/run", json={"running": True})
-    picture = http.get("/api/cameras/arm/overview.jpg")
-    assert Image.open(io.BytesIO(picture.content)).size == (64, 48)
+
+    def shown() -> bytes | None:  # the answer does not wait long for a first picture
+        answer = http.get("/api/cameras/arm/overview.jpg")
+        return answer.content if answer.status_code == 200 else None
+
+    picture = eventually(shown)
+    assert Image.open(io.BytesIO(picture)).size == (64, 48)
     assert http.get("/api/cameras/arm/nothing.jpg").status_code == 404
 
 

@@ -182,6 +182,7 @@ def test_the_stop_button_stops_and_space_goes_on(page: Page) -> None:
 def test_steps_and_reset_in_direct_mode(page: Page) -> None:
     choose = "const m = document.querySelector('#mode'); m.value = '{}'; m.dispatchEvent(new Event('change'))"
     page.driver.execute_script(choose.format("direct"))
+    page.until("!document.querySelector('#step').disabled")
     page.click("#reset")
     page.until("parseFloat(document.querySelector('#time').textContent) === 0")
     page.driver.execute_script("document.querySelector('#steps').value = 50")
@@ -340,9 +341,9 @@ def test_it_fits_a_phone(page: Page) -> None:
 
 
 def test_a_second_viewer_drives_only_when_the_first_lets_go(page: Page, tmp_path: Path) -> None:
-    page.slide(0.2)
-    page.until("document.querySelector('#driver').dataset.who === 'me'")
     with opened(tmp_path, page.invitation()) as second:
+        page.slide(0.2)  # only now: the controls are lost by not using them, and a browser may take long to start
+        page.until("document.querySelector('#driver').dataset.who === 'me'")
         second.until("document.querySelector('#driver')?.dataset.who === 'other'")
         assert second.look("document.querySelector('#drive').disabled")
         second.slide(0.8)
@@ -357,6 +358,7 @@ def test_a_second_viewer_drives_only_when_the_first_lets_go(page: Page, tmp_path
 
 def test_the_3d_view_shows_the_robot_and_follows_it(page: Page, tmp_path: Path) -> None:
     page.until("document.querySelector('#view').innerText.includes('no WebGL')")
+    page.until("document.querySelector('#driver').dataset.who !== 'other'")  # who drove has closed their browser
     page.slide(0.0)
     page.until(page.elbow_is(0.0))
     with opened(tmp_path, page.invitation(), (*SOLID, "--window-size=1000,500")) as one:
