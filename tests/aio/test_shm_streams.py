@@ -128,6 +128,27 @@ async def test_without_a_region_it_comes_by_socket_until_there_is_one(
         region.close()
 
 
+@pytest.mark.parametrize("behind", [[2.0], [1.0, 2.0]])
+async def test_what_the_socket_brought_does_not_come_again_from_the_region(
+    publishers: Publishers, publisher: Publisher, tmp_path: Path, behind: list[float]
+) -> None:
+    async with states(publishers) as stream:
+        await publisher.subscribed(STATE)
+        for time in (1.0, 2.0):
+            publisher.send(STATE, snapshot(time))
+            assert (await stream.receive()).time == time
+        region = WrittenRegion(tmp_path / shm.STATE_FILE, 16_384)
+        region.publish(snapshot(behind[0]))  # a server sends first and writes then
+        async with states(publishers) as beside:
+            await publisher.subscribed()
+            for time in behind:
+                assert (await beside.receive()).time == time
+                assert stream.receive_nowait() is None
+                region.publish(snapshot(time + 1.0))
+        assert (await stream.receive()).time == 3.0
+        region.close()
+
+
 async def test_snapshots_that_outgrow_their_slot_come_by_socket(
     publishers: Publishers, publisher: Publisher, state_region: WrittenRegion
 ) -> None:

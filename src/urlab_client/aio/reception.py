@@ -80,7 +80,8 @@ class LiveReception(Sink):
     def on_message(self, topic: bytes, payload: BytesLike) -> None:
         """Take one message."""
         self.stats.received += 1
-        self._payload = payload
+        if self._source.wants(topic, payload):
+            self._payload = payload
 
     def on_drained(self) -> None:
         """Take the newest one over."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable, Collection
 from typing import Protocol
 
@@ -335,10 +336,19 @@ class SharedStateSource(_Shared, StateSource):
     def __init__(self, regions: Regions, subscriptions: Subscriptions, endpoint: Callable[[], str]) -> None:
         super().__init__(subscriptions, endpoint)
         self.regions = regions
+        # The socket may be one ahead of the region. Two are never equal: each tells when it was built.
+        self._came = deque[BytesLike](maxlen=2)
 
     def place(self) -> Place:
         """See the base class."""
         return Place(STATE_FILE, STATE_FULL, doorbell.STATE)
+
+    def wants(self, topic: bytes, payload: BytesLike) -> bool:
+        """Leave out what came already: where the region takes over from the socket, both bring it."""
+        if payload in self._came:
+            return False
+        self._came.append(payload)
+        return True
 
 
 class SharedCameraSource(_Shared, CameraSource):
