@@ -20,6 +20,7 @@ from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.rows import camera_filter
 from urlab_client.server.endpoint import PortInUse, bind_tcp, bound_peers, tcp
 from urlab_client.server.guard import Door, Guard
+from urlab_client.server.patience import ended
 from urlab_client.server.play import Running
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.shared_memory import SharedMemory
@@ -158,7 +159,7 @@ class CameraStreams:
     def join(self, timeout: float) -> bool:
         """Wait for the end and release the sockets; return False when a picture was still being drawn."""
         if self._thread.ident is not None:
-            self._thread.join(max(0.0, timeout))
+            ended(self._thread, timeout)
         with self._lock:
             self._running = None
             for stream in self._streams:

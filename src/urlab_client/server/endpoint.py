@@ -18,6 +18,7 @@ import zmq
 
 from urlab_client.server.guard import Door, Guard
 from urlab_client.server.limits import Limits
+from urlab_client.server.patience import ended
 
 __all__ = ["PortInUse", "RpcEndpoint", "bind_tcp", "bound_peers", "connect_host", "numeric_host", "tcp"]
 
@@ -221,7 +222,7 @@ class RpcEndpoint:
         if self._thread.ident is None:
             self._close()
         elif self._thread is not threading.current_thread():
-            self._thread.join(timeout)
+            return ended(self._thread, timeout)
         return not self._thread.is_alive()
 
     def _run(self) -> None:

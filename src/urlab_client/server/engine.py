@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.messages.session import ArticulationCommand, Step
 from urlab_client.server.controllers import ArticulationControl, ControllerConfig, ControlSource, Twist, float32
+from urlab_client.server.patience import ended, within
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.replay import Player
 from urlab_client.server.scene import Scene
@@ -191,13 +192,12 @@ class Engine:
         """
         first, self._stopping = not self._stopping, True
         deadline = time.monotonic() + timeout
-        idle = self.lock.inner.acquire(timeout=max(0.0, timeout))
+        idle = within(timeout, lambda seconds: self.lock.inner.acquire(timeout=seconds))
         if idle:
             self._wake.notify_all()
             self.lock.inner.release()
         if self._thread.is_alive() and self._thread is not threading.current_thread():
-            self._thread.join(max(0.0, deadline - time.monotonic()))
-            idle = idle and not self._thread.is_alive()
+            idle = ended(self._thread, deadline - time.monotonic()) and idle
         if first and self._thread.ident is not None:
             _mujoco_warnings.release()
             atexit.unregister(self.close)

@@ -47,6 +47,7 @@ from urlab_client.server.controllers import ArticulationControl, Twist
 from urlab_client.server.endpoint import bind_tcp, bound_peers
 from urlab_client.server.guard import Door, Guard
 from urlab_client.server.observe import Observer, sim_clock, wall_clock
+from urlab_client.server.patience import ended
 from urlab_client.server.play import Running
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.scene import Scene
@@ -544,9 +545,8 @@ class StreamServer:
         """
         if self._thread.ident is None:
             self._close()
-        else:
-            self._thread.join(timeout)
-        return not self._thread.is_alive()
+            return True
+        return ended(self._thread, timeout)
 
     def _hand_over(self, broadcast: _Broadcast, tick: _Tick) -> None:
         self._ticks.append((broadcast, tick))

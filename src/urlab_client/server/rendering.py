@@ -39,6 +39,7 @@ from numpy.typing import NDArray
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import CameraFrame
+from urlab_client.server.patience import ended
 from urlab_client.server.picture import (
     Picture,
     add_primitives,
@@ -426,8 +427,7 @@ class CameraStudio:
             return True
         atexit.unregister(self.close)
         self._queue.put(None)
-        thread.join(max(0.0, timeout))
-        return not thread.is_alive()
+        return ended(thread, timeout)
 
     def _copy_state(self) -> mujoco.MjData:
         if self._model is None:

@@ -30,6 +30,7 @@ from urlab_client.protocol.shm import (
     camera_stride,
     state_stride,
 )
+from urlab_client.server.patience import ended
 from urlab_client.server.region_files import InstanceDirectory, RegionFile, RequestFile
 
 __all__ = ["MAX_REPLY_BYTES", "SharedMemory"]
@@ -140,7 +141,7 @@ class SharedMemory:
             False when the request under way took longer.
         """
         if self._thread is not None:
-            self._thread.join(timeout)
+            ended(self._thread, timeout)
             with self._lock:
                 self._given_up = self._thread.is_alive()
             if self._given_up:
