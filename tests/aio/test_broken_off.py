@@ -7,6 +7,7 @@ import threading
 from typing import Any
 
 import pytest
+from waiting import DEADLINE_S, pass_time, until
 
 from urlab_client import ClientClosed, URLabTimeoutError
 from urlab_client.aio import URLabClient
@@ -23,7 +24,7 @@ async def test_closing_while_the_model_loads(monkeypatch: pytest.MonkeyPatch, pl
 
     def slowly(*args: Any, **options: Any) -> Any:
         loop.call_soon_threadsafe(loading.set)
-        assert go_on.wait(10)
+        assert go_on.wait(DEADLINE_S)
         return load(*args, **options)
 
     monkeypatch.setattr(Mirror, "load", staticmethod(slowly))
@@ -40,19 +41,23 @@ async def test_closing_while_the_model_loads(monkeypatch: pytest.MonkeyPatch, pl
 
 
 async def test_the_end_of_play_is_noticed_after_a_handshake_whose_last_reply_was_lost() -> None:
-    faults = Faults(Drop("set_mode", times=1))
+    faults = Faults()
+    lost = faults.add(Drop("set_mode", times=1))
     async with (
         SimulatedServer("ball", play=True, faults=faults) as server,
         URLabClient(**server.client_options(), step_mode="direct") as client,
     ):
         events = client.events()
+        call = asyncio.create_task(client.discover(timeout=DEADLINE_S))
+        await until(lambda: lost.applied)
+        pass_time(DEADLINE_S)
         with pytest.raises(URLabTimeoutError):
-            await client.discover(timeout=1)
+            await call
         await client.resync()
         assert client.step_mode == "direct"
         await client.runtime.set_mode("live")
         await client.state_stream().receive()
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(DEADLINE_S):
             await client.call(StopPie())  # as somebody at the editor: the client takes nothing over
             async for event in events:
                 if isinstance(event, PlayEnded):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-import select
 import socket
 import sys
 from contextlib import ExitStack
 from typing import Any
 
 import pytest
+import zmq
+from waiting import DEADLINE_S, eventually, until
 
 from urlab_client import ServerUnreachable, SessionTakenOver
 from urlab_client.aio import URLabClient
@@ -24,19 +25,21 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 async def test_what_accepts_and_says_nothing_is_tried_again() -> None:
     with socket.create_server(("127.0.0.1", 0)) as mute:
-        mute.settimeout(10)
+        mute.settimeout(DEADLINE_S)
         port = mute.getsockname()[1]
         async with URLabClient("tcp://127.0.0.1", step_port=port, local_model=False) as client:
-            call = asyncio.create_task(client.meta(timeout=15))
+            call = asyncio.create_task(client.meta(timeout=None))
             for _ in range(2):
                 connection, _ = await asyncio.to_thread(mute.accept)
                 with connection:
-                    connection.settimeout(10)
+                    connection.settimeout(DEADLINE_S)
                     while await asyncio.to_thread(connection.recv, 65536):  # until the client gives it up
                         pass
             call.cancel()
-            with pytest.raises(ServerUnreachable, match="does not speak ZeroMQ, or is suspended"):
-                await client.meta(timeout=0.1)
+            await asyncio.wait((call,))
+            for _ in range(10):  # also between two attempts
+                with pytest.raises(ServerUnreachable, match="does not speak ZeroMQ, or is suspended"):
+                    await client.meta(timeout=0.03)
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="how connections are dropped there")
@@ -50,8 +53,21 @@ async def test_a_host_that_drops_what_is_sent_is_not_said_to_refuse() -> None:
             filler.setblocking(False)
             filler.connect_ex(deaf.getsockname())
         async with URLabClient("tcp://127.0.0.1", step_port=deaf.getsockname()[1], local_model=False) as client:
+            tried, attempts = 0, client._transport._attempts
+
+            def count(event: zmq.Event, value: int, now: float) -> str | None:
+                nonlocal tried
+                tried += event is zmq.Event.CONNECT_RETRIED
+                return told(event, value, now)
+
+            told, attempts.obstacle = attempts.obstacle, count
+            call = asyncio.create_task(client.meta(timeout=None))
+            # Where the loop was held up for longer than an attempt takes, only the next one shows what it is.
+            await until(lambda: tried > 2 and client._transport._obstacle == line.UNANSWERED)
+            call.cancel()
+            await asyncio.wait((call,))
             with pytest.raises(ServerUnreachable, match="the host does not answer"):
-                await client.meta(timeout=1)
+                await client.meta(timeout=0)
 
 
 async def test_a_request_is_not_left_in_a_queue_for_a_later_server(client: Any, scripted: Any) -> None:
@@ -60,8 +76,9 @@ async def test_a_request_is_not_left_in_a_queue_for_a_later_server(client: Any, 
         scripted.request()
     scripted.close()
     # The connection is gone, and the client, whose loop did not run, does not know it yet.
-    assert select.select([client._transport._monitor], [], [], 5)[0]
-    call = asyncio.create_task(client.reset(timeout=5))
+    eventually(lambda: not client._transport._socket.getsockopt(zmq.EVENTS) & zmq.POLLOUT)
+    assert client.connected
+    call = asyncio.create_task(client.reset(timeout=DEADLINE_S))
     await asyncio.sleep(0)
     reborn = type(scripted)(scripted.port)
     reborn.on("reset", {"op": "error", "code": "session_expired", "message": "who is that?"})

@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 import pytest
 from samples import sample
+from waiting import DEADLINE_S
 
 import urlab_client
 from urlab_client.aio import URLabClient
@@ -82,7 +83,7 @@ async def test_cancelled_and_timed_out_ops_leave_the_client_usable(scripted: Any
         with pytest.raises(urlab_client.URLabTimeoutError):
             await method(**given, timeout=0.01)
         call = asyncio.create_task(method(**given))
-        await asyncio.to_thread(scripted.held.get, timeout=5)
+        await asyncio.to_thread(scripted.held.get, timeout=DEADLINE_S)
         call.cancel()
         with pytest.raises(asyncio.CancelledError):
             await call

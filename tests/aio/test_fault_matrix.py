@@ -10,12 +10,12 @@ import gc
 import os
 import signal
 import threading
-from collections.abc import Awaitable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import pytest
 from samples import filled
+from waiting import in_time, until
 
 from urlab_client.aio import URLabClient, launch
 from urlab_client.protocol.base import Timing
@@ -29,18 +29,10 @@ from urlab_client.protocol.errors import (
 )
 from urlab_client.protocol.registry import OPS
 
-T = TypeVar("T")
 LONG = bool(os.environ.get("URLAB_LONG_TESTS"))
 SOME = list(OPS) if LONG else ["hello", "step", "reset", "spawn_actor", "recording_start", "list_keyframes"]
-SLACK_S = 1.0
 FAULTS = ["cancelled", "timed out", "truncated", "garbage"]
 PAIRS = [(fault, name) for i, name in enumerate(OPS) for j, fault in enumerate(FAULTS) if LONG or (i + j) % 4 == 0]
-
-
-async def in_time(deadline: float, call: Awaitable[T]) -> T:
-    """Fail when a call outlives its deadline by more than a second."""
-    async with asyncio.timeout(deadline + SLACK_S):
-        return await call
 
 
 async def arrived(scripted: Any, op: str) -> None:
@@ -121,10 +113,11 @@ async def test_nothing_is_left_of_many_clients(scripted: Any) -> None:
         await client.close()
 
     await use()
-    before = left()
+    threads, files = left()
     for _ in range(10):
         await use()
-    assert left() == before
+    # The server's ends of the connections are among the files, and it closes them when it comes to that.
+    await until(lambda: (now := left())[0] <= threads and now[1] <= files)
 
 
 async def test_taking_over_is_not_an_answer(client: Any, scripted: Any) -> None:

@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import AsyncIterator
 
 import pytest
+from waiting import DEADLINE_S, pass_time, until
 
 from urlab_client import ConnectionLost
 from urlab_client.aio import URLabClient
@@ -28,12 +29,19 @@ async def announce(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -
 
 @pytest.fixture
 async def port() -> AsyncIterator[int]:
-    server = await asyncio.start_server(announce, "127.0.0.1", 0)
+    async def once(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        server.close()  # or the client would ask again and again, and its time would be up somewhere in that
+        await announce(reader, writer)
+
+    server = await asyncio.start_server(once, "127.0.0.1", 0)
     async with server:
         yield server.sockets[0].getsockname()[1]
 
 
 async def test_a_reply_that_is_too_long_is_not_even_received(port: int) -> None:
     async with URLabClient("tcp://127.0.0.1", step_port=port, local_model=False) as client:
+        call = asyncio.create_task(client.outliner.list_actors(timeout=DEADLINE_S))
+        await until(lambda: client.transport_stats.connects and not client.connected)
+        pass_time(DEADLINE_S)
         with pytest.raises(ConnectionLost):
-            await client.outliner.list_actors(timeout=1)
+            await call

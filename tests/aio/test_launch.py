@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from waiting import until
+from waiting import DEADLINE_S, until
 
 import urlab_client
 from urlab_client import ClientClosed, OutcomeUnknown, ServerUnreachable
@@ -68,7 +68,7 @@ async def test_a_killed_server_is_noticed() -> None:
         (server,) = children()
         os.kill(server, signal.SIGKILL)
         with pytest.raises((OutcomeUnknown, ServerUnreachable)):
-            await client.step(timeout=2)
+            await client.step(timeout=10)
         assert not client.connected
         await client._transport._process.wait()  # type: ignore[attr-defined]  # until the event loop knows, too
         with pytest.raises(ServerUnreachable, match=r"ended with code -9.*discover\(\)"):
@@ -133,9 +133,9 @@ def test_the_server_dies_with_its_client() -> None:
         return  # already gone
     import select
 
-    ready, _, _ = select.select([descriptor], [], [], 10)
+    ready, _, _ = select.select([descriptor], [], [], DEADLINE_S)
     os.close(descriptor)
-    assert ready, "the server outlived its client by ten seconds"
+    assert ready, "the server outlived its client"
 
 
 def test_a_blocking_client_starts_servers_under_uvloops_policy() -> None:

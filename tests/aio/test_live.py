@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 import pytest
 from publisher import Publisher
-from waiting import eventually, until
+from waiting import DEADLINE_S, eventually, until
 
 import urlab_client
 from urlab_client.aio import URLabClient
@@ -113,7 +113,7 @@ def plugin(scripted: Any, publisher: Publisher) -> Plugin:
 
 @pytest.fixture
 def options(scripted: Any, publisher: Publisher) -> dict[str, Any]:
-    return {"step_port": scripted.port, "state_port": publisher.port, "rcv_timeout_ms": 2000}
+    return {"step_port": scripted.port, "state_port": publisher.port, "rcv_timeout_ms": round(1e3 * DEADLINE_S)}
 
 
 @pytest.fixture
@@ -194,7 +194,7 @@ class TestInTheBackground:
             async with camera.frames("latest") as frames:
                 await publisher.subscribed(STATE, TOPIC)
                 publisher.send(TOPIC, PIXELS)
-                assert (await frames.receive(timeout=5)).pixels.shape == (2, 2, 4)
+                assert (await frames.receive(timeout=DEADLINE_S)).pixels.shape == (2, 2, 4)
             assert camera.latest_frame is None
 
     async def test_a_malformed_picture_is_skipped(
@@ -338,7 +338,7 @@ class TestBlocking:
         reader.start()
         asyncio.run(publisher.subscribed(STATE))
         client.close()
-        reader.join(5)
+        reader.join(DEADLINE_S)
         assert len(ended) == 1
         stream.close()
 
@@ -354,5 +354,5 @@ class TestBlocking:
                 assert item.time == 1.0
                 break
             del item
-            publishing.join(5)
+            publishing.join(DEADLINE_S)
             asyncio.run(publisher.subscribed())

@@ -12,10 +12,10 @@ import msgspec
 import pytest
 import zmq
 from relay import Relay
-from waiting import DEADLINE_S
+from waiting import DEADLINE_S, pass_time
 from waiting import until as wait_until
 
-from urlab_client.aio import Stream, URLabClient
+from urlab_client.aio import Stream, URLabClient, watch
 from urlab_client.aio.transport import line
 from urlab_client.protocol.errors import ConnectionLost, OutcomeUnknown, URLabConnectionError, URLabTimeoutError
 from urlab_client.protocol.messages.streams import (
@@ -32,6 +32,7 @@ from urlab_client.protocol.messages.streams import (
 from urlab_client.server import SimulatedServer
 
 E = TypeVar("E", bound=ClientEvent)
+REPLY = 60  # bytes: more than a heartbeat, less than any reply
 LEVEL = {"op": "current_level_ok", "level_path": "/Game/Levels/lab"}
 
 
@@ -56,7 +57,7 @@ async def behind_its_back(server: SimulatedServer, client: URLabClient, op: str)
     def ask() -> None:
         with zmq.Context() as context, context.socket(zmq.REQ) as socket:
             socket.linger = 0
-            socket.rcvtimeo = 5000
+            socket.rcvtimeo = round(1e3 * DEADLINE_S)
             socket.connect(f"tcp://127.0.0.1:{server.client_options()['step_port']}")
             socket.send(msgspec.msgpack.encode({"op": op, "session_id": client.session_id}))
             assert msgspec.msgpack.decode(socket.recv())["op"] == f"{op}_ok"
@@ -147,8 +148,11 @@ async def test_a_stuck_worker_behind_a_live_connection_is_told_from_a_dead_serve
     scripted.on("current_level", None)
     loop = asyncio.get_running_loop()
     asked = loop.time()
+    call = asyncio.create_task(client.scene.current_level(timeout=5))
+    await wait_until(scripted.held.qsize)
+    pass_time(5)
     with pytest.raises(URLabTimeoutError, match="busy or blocked"):
-        await client.scene.current_level(timeout=0.05)
+        await call
     gave_up = loop.time()
     silent = await until(events, ServerSilent)
     assert (silent.op, client.connected) == ("current_level", True)
@@ -161,7 +165,7 @@ async def test_a_stuck_worker_behind_a_live_connection_is_told_from_a_dead_serve
 async def test_a_read_is_asked_again_on_the_next_connection(client: Any, scripted: Any) -> None:
     await client.discover()
     scripted.on("current_level", None)
-    pending = asyncio.create_task(client.scene.current_level(timeout=5))
+    pending = asyncio.create_task(client.scene.current_level(timeout=DEADLINE_S))
     while (await asyncio.to_thread(scripted.request))["op"] != "current_level":
         pass
     await asyncio.to_thread(scripted.close)
@@ -176,10 +180,12 @@ async def test_a_read_is_asked_again_on_the_next_connection(client: Any, scripte
 
 async def test_a_read_whose_server_stays_away_says_that_it_was_lost(client: Any, scripted: Any) -> None:
     await client.discover()
-    pending = asyncio.create_task(client.scene.current_level(timeout=1.5))
+    pending = asyncio.create_task(client.scene.current_level(timeout=DEADLINE_S))
     while (await asyncio.to_thread(scripted.request))["op"] != "current_level":
         pass
     await asyncio.to_thread(scripted.close)
+    await wait_until(lambda: not client.connected)
+    pass_time(DEADLINE_S)
     with pytest.raises(ConnectionLost):
         await pending
 
@@ -195,7 +201,7 @@ async def test_garbage_on_the_line_is_a_typed_error_and_the_next_call_works(
     options = server.client_options() | {"step_mode": "direct"}
     async with Relay(options["step_port"]) as relay, URLabClient(**(options | {"step_port": relay.port})) as client:
         await client.discover()
-        relay.garble(junk)
+        relay.garble(junk, at_least=REPLY)
         with pytest.raises((URLabConnectionError, URLabTimeoutError)):
             await client.step(timeout=0.5)
         if client.connected:
@@ -220,8 +226,9 @@ async def test_garbage_in_the_handshake_of_a_reconnection_does_not_end_it_for_go
         await client.step()
 
 
-async def test_a_probe_gives_way_to_a_call(client: Any, scripted: Any) -> None:
+async def test_a_probe_gives_way_to_a_call(client: Any, scripted: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """A server that leaves the client's own question unanswered must not delay the user's."""
+    monkeypatch.setattr(watch, "_PROBE_S", 10 * DEADLINE_S)
     scripted.on("hello", scripted.answers["hello"]({}) | {"manager_present": True, "entities": {}})
     await client.discover()
     events = client.events()
@@ -233,7 +240,7 @@ async def test_a_probe_gives_way_to_a_call(client: Any, scripted: Any) -> None:
     try:
         while (await asyncio.to_thread(reborn.request))["op"] != "list_keyframes":
             pass
-        assert await client.scene.current_level(timeout=1.5) == "/Game/Levels/lab"
+        assert await client.scene.current_level(timeout=DEADLINE_S) == "/Game/Levels/lab"
     finally:
         await asyncio.to_thread(reborn.close)
 
@@ -259,5 +266,5 @@ with SimulatedServer("arm", play=True) as server:
         client.state_stream().receive()
     print("done", flush=True)
 """
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=30, check=False)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (0, "done\n", "")

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 from relay import Relay
+from waiting import DEADLINE_S, pass_time, until
 
 import urlab_client
 from urlab_client import OutcomeUnknown, SessionTakenOver, StepTimeout, URLabTimeoutError
@@ -115,11 +116,17 @@ async def test_the_blocking_client_does_the_same(server: SimulatedServer, relay:
 
 async def test_a_timed_out_and_a_cancelled_step_are_counted_together(client: URLabClient, relay: Relay) -> None:
     relay.hold_replies()
+    sent = client.transport_stats.sent
+    timed_out = asyncio.create_task(client.step(2, timeout=DEADLINE_S))
+    await until(lambda: client.transport_stats.sent == sent + 1)
+    pass_time(DEADLINE_S)
     with pytest.raises(URLabTimeoutError):
-        await client.step(2, timeout=0.05)
-    with pytest.raises(TimeoutError):
-        async with asyncio.timeout(0.05):
-            await client.step(4)
+        await timed_out
+    cancelled = asyncio.create_task(client.step(4))
+    await until(lambda: client.transport_stats.sent == sent + 2)
+    cancelled.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await cancelled
     relay.thaw()
     found = await client.resync()
     assert (found.session_held, found.session_renewed) == (True, False), "the connection stood: nothing is on its way"

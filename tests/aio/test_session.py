@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import socket
+from collections.abc import Callable
 from typing import Any
 
 import pytest
-from waiting import DEADLINE_S
+from waiting import DEADLINE_S, pass_time, until
 
 from urlab_client.aio import URLabClient
 from urlab_client.protocol.errors import (
@@ -27,24 +28,39 @@ PAUSED = {"op": "set_paused_ok", "paused": True}
 LEVEL = {"op": "current_level_ok", "level_path": "/Game/Levels/lab"}
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
 async def discovered(client: Any, scripted: Any) -> None:
     await client.discover()
     assert [scripted.request()["op"] for _ in range(2)] == ["hello", "meta"]
 
 
+async def expired(client: URLabClient, call: Any, sent: Callable[[], object]) -> asyncio.Task[Any]:
+    """Let a call's deadline pass once its request has left and `sent` says so; return the call."""
+    before = client.transport_stats.sent
+    pending = asyncio.create_task(call)
+    await until(lambda: client.transport_stats.sent > before and sent())
+    pass_time(DEADLINE_S)
+    await asyncio.wait((pending,))
+    return pending
+
+
+async def met(client: URLabClient, obstacle: str) -> None:
+    """Try to connect until it is known what stands in the way."""
+    trying = asyncio.create_task(client.meta(timeout=None))
+    await until(lambda: obstacle in client._transport._obstacle)  # type: ignore[attr-defined]
+    trying.cancel()
+    await asyncio.wait((trying,))
+
+
 async def test_refused_names_address_and_stage() -> None:
-    port = free_port()
-    async with URLabClient("tcp://127.0.0.1", step_port=port, rcv_timeout_ms=300) as client:
-        with pytest.raises(
-            ServerUnreachable, match=rf"tcp://127.0.0.1:{port} within \d+ ms: connection refused"
-        ) as info:
-            await client.discover()
+    with socket.socket() as nobody:  # has the port, and does not listen
+        nobody.bind(("127.0.0.1", 0))
+        port = nobody.getsockname()[1]
+        async with URLabClient("tcp://127.0.0.1", step_port=port, rcv_timeout_ms=300) as client:
+            await met(client, "refused")
+            with pytest.raises(
+                ServerUnreachable, match=rf"tcp://127.0.0.1:{port} within \d+ ms: connection refused"
+            ) as info:
+                await client.discover()
     assert isinstance(info.value, ConnectionError)
     assert info.value.op == "hello"
     assert "urlab serve" in str(info.value)
@@ -56,6 +72,7 @@ async def test_something_else_listens_there() -> None:
         listener.listen()
         port = listener.getsockname()[1]
         async with URLabClient("tcp://127.0.0.1", step_port=port, rcv_timeout_ms=300) as client:
+            await met(client, "does not speak")
             with pytest.raises(ServerUnreachable, match="does not speak ZeroMQ"):
                 await client.discover()
 
@@ -71,7 +88,7 @@ async def test_client_started_before_the_server_connects_when_it_comes(scripted:
     port = scripted.port
     scripted.close()
     async with URLabClient("tcp://127.0.0.1", step_port=port, local_model=False) as client:
-        call = asyncio.create_task(client.discover())
+        call = asyncio.create_task(client.discover(timeout=DEADLINE_S))
         await asyncio.to_thread(_refused, port)
         reborn = type(scripted)(port)
         try:
@@ -88,8 +105,9 @@ def _refused(port: int) -> None:
 
 async def test_silence_is_a_timeout_and_the_late_reply_is_dropped(client: Any, scripted: Any) -> None:
     await client.discover()
-    with pytest.raises(URLabTimeoutError, match=r"set_paused: no reply from .* within 50 ms.*may still be executed"):
-        await client.runtime.set_paused(True, timeout=0.05)
+    call = await expired(client, client.runtime.set_paused(True, timeout=5), scripted.held.qsize)
+    with pytest.raises(URLabTimeoutError, match=r"set_paused: no reply from .* within 5000 ms.*may still be executed"):
+        await call
     scripted.release({"op": "set_paused_ok", "paused": False})
     scripted.on("set_paused", PAUSED)
     assert await client.runtime.set_paused(True) is True
@@ -99,16 +117,19 @@ async def test_silence_is_a_timeout_and_the_late_reply_is_dropped(client: Any, s
 
 
 async def test_default_timeout_comes_from_the_client(scripted: Any) -> None:
-    async with URLabClient("tcp://127.0.0.1", step_port=scripted.port, rcv_timeout_ms=200, local_model=False) as client:
-        await client.discover(timeout=DEADLINE_S)
-        with pytest.raises(URLabTimeoutError, match="within 200 ms"):
-            await client.runtime.set_paused(True)
+    async with URLabClient(
+        "tcp://127.0.0.1", step_port=scripted.port, rcv_timeout_ms=12345, local_model=False
+    ) as client:
+        await client.discover()
+        call = await expired(client, client.runtime.set_paused(True), lambda: True)
+        with pytest.raises(URLabTimeoutError, match="within 12345 ms"):
+            await call
 
 
 async def test_cancelled_call_leaves_the_client_usable(client: Any, scripted: Any) -> None:
     await client.discover()
     call = asyncio.create_task(client.runtime.set_paused(True))
-    await asyncio.to_thread(scripted.held.get, timeout=5)
+    await asyncio.to_thread(scripted.held.get, timeout=DEADLINE_S)
     call.cancel()
     with pytest.raises(asyncio.CancelledError):
         await call
@@ -164,9 +185,9 @@ async def test_a_queued_call_times_out_without_being_sent(client: Any, scripted:
 @pytest.mark.parametrize(
     ("call", "error"),
     [
-        (lambda c: c.call(Step(), timeout=5), OutcomeUnknown),
-        (lambda c: c.runtime.set_paused(True, timeout=5), OutcomeUnknown),
-        (lambda c: c.scene.current_level(timeout=0.3), ConnectionLost),
+        (lambda c: c.call(Step(), timeout=DEADLINE_S), OutcomeUnknown),
+        (lambda c: c.runtime.set_paused(True, timeout=DEADLINE_S), OutcomeUnknown),
+        (lambda c: c.scene.current_level(timeout=DEADLINE_S), ConnectionLost),
     ],
 )
 async def test_a_server_that_dies_mid_call(client: Any, scripted: Any, call: Any, error: type[Exception]) -> None:
@@ -174,6 +195,8 @@ async def test_a_server_that_dies_mid_call(client: Any, scripted: Any, call: Any
     pending = asyncio.create_task(call(client))
     await asyncio.to_thread(scripted.request)
     await asyncio.to_thread(scripted.close)
+    await until(lambda: not client.connected)
+    pass_time(DEADLINE_S)  # until then a read waits for another server
     with pytest.raises(error, match="was lost after the request was sent"):
         await pending
     assert not client.connected
@@ -182,9 +205,10 @@ async def test_a_server_that_dies_mid_call(client: Any, scripted: Any, call: Any
 async def test_a_restarted_server_is_found_again(client: Any, scripted: Any) -> None:
     await client.discover()
     await asyncio.to_thread(scripted.close)
+    await until(lambda: not client.connected)
     reborn = type(scripted)(scripted.port)
     try:
-        await client.discover(timeout=5)
+        await client.discover(timeout=DEADLINE_S)
         assert client.transport_stats.connects == 2
     finally:
         await asyncio.to_thread(reborn.close)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import os
 import threading
 from typing import Any
@@ -30,6 +31,7 @@ async def test_those_that_stay_go_on_when_others_are_closed(scripted: Any) -> No
 
 
 async def test_a_client_that_finds_no_server_gives_it_back_and_one_without_an_address_does_at_once() -> None:
+    gc.collect()  # clients of other tests that were not closed
     users = shared._shared._users
     async with URLabClient("tcp://127.0.0.1:9", rcv_timeout_ms=100) as lost:
         with pytest.raises(ServerUnreachable):

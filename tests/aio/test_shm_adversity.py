@@ -17,9 +17,10 @@ from typing import Any
 import pytest
 from plugin_memory import PluginMemory, WrittenRegion
 from shm_clients import shared, shm_clients
-from waiting import until
+from waiting import DEADLINE_S, until
 
 from urlab_client.aio import URLabClient
+from urlab_client.aio.transport import shm as shm_transport
 from urlab_client.protocol import shm
 from urlab_client.protocol.errors import OutcomeUnknown, URLabConnectionError
 from urlab_client.protocol.fence import processor_fence
@@ -73,7 +74,7 @@ async def connect(scripted: Any, answers: dict[str, Any]) -> AsyncIterator[Calla
 async def step_in_flight(client: URLabClient, plugin: PluginMemory, **options: Any) -> asyncio.Task[Any]:
     plugin.answers = plugin.answers | {"step": lambda _: None}
     task = asyncio.create_task(client.step(**options))
-    await asyncio.to_thread(plugin.held.get)
+    await asyncio.to_thread(plugin.held.get, timeout=DEADLINE_S)
     return task
 
 
@@ -85,10 +86,11 @@ async def test_a_server_that_is_lost_while_a_session_opens_is_no_puzzle(
     opening = asyncio.create_task(client.discover())
     await until(lambda: requests.region.sequence, look=0)  # the client asks whether an old reply is still to come
     await asyncio.to_thread(scripted.close)
+    await until(lambda: not client.connected)
     with contextlib.suppress(URLabConnectionError):
         await opening
     with pytest.raises(URLabConnectionError):
-        await client.step()
+        await client.step(timeout=0.5)
 
 
 async def test_a_reply_region_damaged_while_a_session_opens_leaves_zmq(
@@ -125,7 +127,7 @@ async def test_opening_a_session_does_not_disturb_a_step_of_another_task(
     connect: Any, plugin: PluginMemory, scripted: Any
 ) -> None:
     plugin._period = 5e-3  # so that requests are under way most of the time
-    client = await shared(connect(rcv_timeout_ms=2000))
+    client = await shared(connect())
     answering = plugin.answers
     for _ in range(15):
         abandoned = await step_in_flight(client, plugin)
@@ -162,7 +164,7 @@ async def test_no_memory_of_a_lost_server_is_touched(
     client = await shared(connect())
     eye = client.articulations["arm"].cameras["eye"]
     async with eye.frames() as frames:
-        await frames.receive(timeout=10)
+        await frames.receive(timeout=DEADLINE_S)
         frame = eye.shared_frame()
         assert frame is not None
         assert frame.valid()
@@ -179,11 +181,11 @@ async def test_a_server_lost_during_a_step_is_noticed_before_the_deadline(
     client = await shared(connect())
     task = await step_in_flight(client, plugin, timeout=None)
     await asyncio.to_thread(scripted.close)
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(DEADLINE_S):
         with pytest.raises(OutcomeUnknown):
             await task
     with pytest.raises(URLabConnectionError):
-        await client.step()
+        await client.step(timeout=0.5)
 
 
 async def test_regions_removed_during_a_step_are_noticed_before_the_deadline(
@@ -193,7 +195,7 @@ async def test_regions_removed_during_a_step_are_noticed_before_the_deadline(
     task = await step_in_flight(client, plugin, timeout=None)
     for file in (shm.REQUEST_FILE, shm.REPLY_FILE):
         (directory / file).unlink()
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(DEADLINE_S):
         with pytest.raises(OutcomeUnknown):
             await task
     assert (await client.step()).time == 0.5
@@ -208,7 +210,7 @@ async def test_a_doorbell_that_never_rings_delays_a_reply_and_no_more(
         client = await shared(connect())
         task = await step_in_flight(client, plugin, timeout=None)
         plugin.reply(STEP | {"time": 0.75})
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(DEADLINE_S):
             assert (await task).time == 0.75
 
 
@@ -232,26 +234,31 @@ async def test_a_doorbell_that_hangs_up_at_once_is_done_without(
 
 
 async def test_a_reply_region_begun_anew_during_a_step_brings_the_reply(connect: Any, plugin: PluginMemory) -> None:
-    client = await shared(connect(rcv_timeout_ms=5000))
+    client = await shared(connect())
     await client.step()
     region = plugin.replies.region
     while region.sequence > 1:  # the number that the next reply has, too
         region._sequence[0] -= 1
     task = await step_in_flight(client, plugin)
-    before, began = time.process_time(), time.monotonic()
     region = plugin.replies.region = shm.create(plugin.replies._map, shm.RPC_STRIDE, fence=processor_fence())
-    while time.monotonic() - began < 0.3:
-        await asyncio.to_thread(plugin.held.empty)
-        await asyncio.sleep(0.05)
-    assert time.process_time() - before < 0.5 * (time.monotonic() - began), "it looks without a pause"
+    for _ in range(10):  # something else may keep the process busy for a while
+        before, began = time.process_time(), time.monotonic()
+        while time.monotonic() - began < 0.3:
+            await asyncio.to_thread(plugin.held.empty)
+            await asyncio.sleep(0.05)
+        if time.process_time() - before < 0.5 * (time.monotonic() - began):
+            break
+    else:
+        pytest.fail("it looks without a pause")
     plugin.reply(STEP | {"time": 0.75})
     assert (await task).time == 0.75
 
 
 @pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="the system cannot be asked for a file's memory")
 async def test_memory_for_requests_is_there_before_they_are_written(
-    connect: Any, silent: tuple[WrittenRegion, WrittenRegion], directory: Path
+    connect: Any, silent: tuple[WrittenRegion, WrittenRegion], directory: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(shm_transport, "_SETTLE_S", 0.0)
     # Writing into a hole of a file on a full tmpfs would kill the process.
     path = directory / shm.REQUEST_FILE
     header = path.read_bytes()[: shm.HEADER_SIZE]
@@ -267,6 +274,8 @@ async def test_memory_for_requests_is_there_before_they_are_written(
 FORKING = """
 import asyncio, os, sys
 from urlab_client.aio import URLabClient
+from urlab_client.aio.transport import shm
+shm._SETTLE_S = 30
 
 async def shared(port):
     client = URLabClient(f"tcp://127.0.0.1:{port}", transport="shm", local_model=False)
@@ -293,6 +302,8 @@ asyncio.run(main())
 FORGETFUL = """
 import asyncio, gc, sys
 from urlab_client.aio import URLabClient
+from urlab_client.aio.transport import shm
+shm._SETTLE_S = 30
 
 async def main():
     client = URLabClient(f"tcp://127.0.0.1:{sys.argv[1]}", transport="shm", local_model=False)
@@ -314,7 +325,7 @@ async def printed_by(program: str, port: int, lines: int) -> list[bytes]:
     assert process.stdout is not None
     assert process.stdin is not None
     try:
-        async with asyncio.timeout(30):
+        async with asyncio.timeout(2 * DEADLINE_S):
             printed = [await process.stdout.readline() for _ in range(lines)]
             process.stdin.close()
             assert await process.wait() == 0

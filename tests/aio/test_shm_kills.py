@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from waiting import in_time
 
 from urlab_client.aio import URLabClient
 from urlab_client.protocol.errors import URLabError
@@ -47,7 +48,7 @@ async def start(directory: Path, port: str = "*") -> tuple[asyncio.subprocess.Pr
 
 def client_of(port: str) -> URLabClient:
     address = f"tcp://127.0.0.1:{port}"
-    return URLabClient(address, transport="shm", step_mode="direct", local_model=False, rcv_timeout_ms=5000)
+    return URLabClient(address, transport="shm", step_mode="direct", local_model=False, rcv_timeout_ms=30_000)
 
 
 async def over_shared_memory(client: URLabClient, first: int) -> int:
@@ -71,13 +72,10 @@ async def test_servers_killed_while_a_client_steps(tmp_path: Path) -> None:
                 await client.discover(timeout=60)
                 number = await over_shared_memory(client, number)
                 loop.call_later(chance.uniform(0.0, 0.05), server.kill)
-                begun = loop.time()
                 with pytest.raises(URLabError):  # noqa: PT012 - which of them fails is up to chance
                     while True:
-                        begun = loop.time()
-                        assert (await client.step(number, timeout=DEADLINE_S)).step == number
+                        assert (await in_time(DEADLINE_S, client.step(number, timeout=DEADLINE_S))).step == number
                         number += 1
-                assert loop.time() - begun < DEADLINE_S + 1.0
                 await server.wait()
                 # The plugin's files are still there, and cut short in place while the client may have them mapped.
                 server, _ = await start(tmp_path, port)

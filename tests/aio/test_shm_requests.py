@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 from plugin_memory import PluginMemory
 from shm_clients import shared, shm_clients
-from waiting import until
+from waiting import DEADLINE_S, until
 
 from urlab_client.aio import URLabClient
+from urlab_client.aio.transport import shm as shm_transport
 from urlab_client.protocol import shm
 from urlab_client.protocol.errors import (
     ProtocolError,
@@ -144,8 +145,12 @@ async def test_a_reply_that_turned_out_too_large_is_asked_for_again_only_if_that
     assert (await client.call(ReadMocapPose(body="b"))).body == "b"
     with pytest.raises(URLabRPCError, match="reply_too_large"):
         await client.runtime.set_paused(True)
-    asked = [scripted.seen.get_nowait()["op"] for _ in range(scripted.seen.qsize())]
-    assert "read_mocap_pose" in asked
+    asked = [scripted.request()["op"]]
+    while asked[-1] != "read_mocap_pose":
+        asked.append(scripted.request()["op"])
+    await client.meta()
+    while asked[-1] != "meta":
+        asked.append(scripted.request()["op"])
     assert "set_paused" not in asked, "it was executed already"
     assert plugin.seen == ["read_mocap_pose", "set_paused"]
 
@@ -155,6 +160,7 @@ async def test_a_late_reply_is_not_taken_for_the_next_one(connect: Any, plugin: 
     scripted.on("step", None)
     with pytest.raises(URLabTimeoutError, match="may still be executed"):
         await client.step(timeout=0.05)
+    await until(plugin.held.qsize)  # the next request would take its place
     plugin.reply(STEP | {"time": 99.0})  # at last
     scripted.on("step", STEP | {"time": 0.75})
     for _ in range(5):
@@ -198,13 +204,14 @@ async def test_a_real_refusal_is_raised(connect: Any, plugin: PluginMemory) -> N
 
 
 async def test_what_a_dead_client_left_behind_is_waited_out(
-    connect: Any, plugin: PluginMemory, scripted: Any, directory: Path
+    connect: Any, plugin: PluginMemory, scripted: Any, directory: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(shm_transport, "_SETTLE_S", 0.0)
     busy, done = threading.Event(), threading.Event()
 
     def be_slow(request: dict[str, Any]) -> dict[str, Any]:
         busy.set()
-        done.wait(10)
+        done.wait(DEADLINE_S)
         return STEP | {"time": 99.0}
 
     # The worker is still busy with the dead client's step while the next client says hello, and begins to step.

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from plugin_memory import WrittenRegion
 from publisher import Publisher
+from waiting import DEADLINE_S
 
 from urlab_client.aio.publishers import Publishers
 from urlab_client.aio.streams import Stream
@@ -68,7 +69,7 @@ async def memory(tmp_path: Path) -> AsyncIterator[SharedMemory]:
 
 @pytest.fixture
 async def publishers(publisher: Publisher, memory: SharedMemory) -> AsyncIterator[Publishers]:
-    made = Publishers(lambda: "tcp://127.0.0.1:1", lambda: publisher.port, default_timeout=5.0, memory=memory)
+    made = Publishers(lambda: "tcp://127.0.0.1:1", lambda: publisher.port, default_timeout=DEADLINE_S, memory=memory)
     yield made
     made.close()
 
@@ -88,11 +89,11 @@ def camera_region(tmp_path: Path) -> Iterator[WrittenRegion]:
 
 
 def states(publishers: Publishers, policy: str = "latest") -> Stream[Any]:
-    return Stream(publishers.state(policy), policy=policy, default_timeout=5.0)
+    return Stream(publishers.state(policy), policy=policy, default_timeout=DEADLINE_S)
 
 
 def frames(publishers: Publishers, policy: str = "latest") -> Stream[Any]:
-    return Stream(publishers.camera(Camera(), policy), policy=policy, default_timeout=5.0)
+    return Stream(publishers.camera(Camera(), policy), policy=policy, default_timeout=DEADLINE_S)
 
 
 async def test_state_comes_from_the_region(publishers: Publishers, state_region: WrittenRegion) -> None:
@@ -255,13 +256,15 @@ async def test_no_torn_picture_is_handed_out(
     monkeypatch.setattr(Camera, "info", msgspec.structs.replace(Camera.info, resolution=size))
     region = WrittenRegion(tmp_path / "cam_arm_eye.shm", shm.camera_stride(*size))
     pictures = [bytes([value, value + 1, value + 2, 0]) * (size[0] * size[1]) for value in range(16)]
-    stop = threading.Event()
+    stop, taken = threading.Event(), threading.Event()
 
     def hammer() -> None:
         while not stop.is_set():
+            taken.clear()
             for number, payload in enumerate(pictures):
                 region.publish(payload)
                 stop.wait(1e-3 * (number % 4))
+            taken.wait(DEADLINE_S)  # a reader that is too slow for all of them gets the last one
 
     region.publish(pictures[0])
     writer = threading.Thread(target=hammer)
@@ -270,9 +273,11 @@ async def test_no_torn_picture_is_handed_out(
         async with frames(publishers) as stream:
             for _ in range(100):
                 pixels = (await stream.receive()).pixels
+                taken.set()
                 assert (pixels == pixels[0, 0]).all()
     finally:
         stop.set()
+        taken.set()
         writer.join()
         region.close()
 

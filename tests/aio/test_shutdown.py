@@ -45,7 +45,7 @@ for other in others:
     other.start()
 client.close()
 for other in others:
-    other.join(5)
+    other.join(30)
     assert not other.is_alive()
 """,
     "without closing anything": "",
@@ -58,7 +58,7 @@ def test_the_blocking_client_ends_without_a_word(end: str) -> None:
     threads = "assert not [t.name for t in threading.enumerate() if t.name == 'urlab-io'], threading.enumerate()"
     check = threads if "clos" in ENDS[end] else ""
     script = SERVED + ENDS[end] + "\n" + check
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=30, check=False)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=100, check=False)
     assert (done.returncode, done.stderr) == (0, "")
 
 

@@ -28,6 +28,7 @@ class Relay:
         self._to_client.set()
         self._to_server.set()
         self._garble: bytes | None = None
+        self._garble_from = 0
         self._server: asyncio.Server | None = None
         self._tasks: set[asyncio.Task[None]] = set()
         self._writers: set[asyncio.StreamWriter] = set()
@@ -61,9 +62,9 @@ class Relay:
         self._to_client.set()
         self._to_server.set()
 
-    def garble(self, junk: bytes) -> None:
-        """Put `junk` in place of the next bytes to the client."""
-        self._garble = junk
+    def garble(self, junk: bytes, *, at_least: int = 0) -> None:
+        """Put `junk` in place of the next bytes to the client; of so many at least, where a heartbeat is not meant."""
+        self._garble, self._garble_from = junk, at_least
 
     def cut(self) -> None:
         """Close every connection on both sides; what was held back is lost."""
@@ -86,7 +87,7 @@ class Relay:
 
     async def pass_on(self, data: bytes, writer: asyncio.StreamWriter, *, up: bool) -> bool:
         """Write what arrived; return whether the connection goes on."""
-        if not up and self._garble is not None:
+        if not up and self._garble is not None and len(data) >= self._garble_from:
             data, self._garble = self._garble, None
         writer.write(data)
         await writer.drain()
@@ -109,17 +110,43 @@ class Relay:
 
     async def _pump(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, *, up: bool) -> None:
         gate = self._to_server if up else self._to_client
+        pieces: asyncio.Queue[tuple[bytes, bool]] = asyncio.Queue()
+        receiving = asyncio.create_task(self._receive(reader, pieces, gate, up=up))
+        try:
+            with suppress(OSError):
+                while (piece := await pieces.get())[0]:
+                    data, counted = piece
+                    if not gate.is_set():
+                        if not counted:
+                            self._count(len(data), up=up)
+                        await gate.wait()
+                    if writer.transport.is_closing():
+                        break
+                    if not await self.pass_on(data, writer, up=up):
+                        break
+        finally:
+            receiving.cancel()
+            writer.transport.abort()
+
+    async def _receive(
+        self,
+        reader: asyncio.StreamReader,
+        pieces: asyncio.Queue[tuple[bytes, bool]],
+        gate: asyncio.Event,
+        *,
+        up: bool,
+    ) -> None:
+        """Go on receiving, and counting, while the gate is shut: what is held back first may be a heartbeat."""
         with suppress(OSError):
             while data := await reader.read(65536):
                 if not gate.is_set():
-                    if up:
-                        self.swallowed += len(data)
-                    else:
-                        self.held += len(data)
-                    self._changed.set()
-                    await gate.wait()
-                if writer.transport.is_closing():
-                    break
-                if not await self.pass_on(data, writer, up=up):
-                    break
-        writer.transport.abort()
+                    self._count(len(data), up=up)
+                pieces.put_nowait((data, not gate.is_set()))
+        pieces.put_nowait((b"", False))
+
+    def _count(self, size: int, *, up: bool) -> None:
+        if up:
+            self.swallowed += size
+        else:
+            self.held += size
+        self._changed.set()

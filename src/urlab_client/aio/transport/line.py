@@ -8,6 +8,7 @@ the peer's I/O thread, also while its worker is busy for minutes: they tell a de
 from __future__ import annotations
 
 import contextlib
+import errno
 from typing import Final
 
 import zmq
@@ -84,6 +85,7 @@ class Attempts:
 
     def __init__(self, now: float) -> None:
         self._began = now
+        self._ended = False
 
     def obstacle(self, event: zmq.Event, value: int, now: float) -> str | None:
         """Return what stands in the way after a monitor's event, None if the event does not say.
@@ -94,10 +96,16 @@ class Attempts:
             now: The time, seconds.
         """
         took, self._began = now - self._began, now
+        ended, self._ended = self._ended, event is zmq.Event.DISCONNECTED
         if event is zmq.Event.CONNECT_RETRIED:
             self._began += value / 1000
+            if ended or took < 0:
+                # It tells when the next attempt begins, and of none that failed; or events were read too late to tell.
+                return None
             if took >= _SILENT * _CONNECT_MS / 1000:
                 return UNANSWERED
+        if event is zmq.Event.HANDSHAKE_FAILED_NO_DETAIL and value == errno.EAGAIN:  # which says that time was up
+            event = zmq.Event.CONNECTED
         return OBSTACLES.get(event)
 
 

@@ -258,8 +258,8 @@ class _Subscriber:
                 for sink in tuple(self._sinks):
                     sink.on_gap(why)
         elif event is zmq.Event.DISCONNECTED:
-            self.obstacle = "the connection was lost and not restored"
             if self.connected:
+                self.obstacle = "the connection was lost and not restored"
                 log.info("lost %s; reconnecting", self.endpoint)
                 self.connected = False
                 self._down_since = self._loop.time()

@@ -369,6 +369,7 @@ class ZmqTransport:
             log.info("lost %s; reconnecting", self._endpoint)
             if self._loop is not None:
                 self.lost_at = self._loop.time()
+            self._obstacle = "the connection was lost and not restored"
             self._tell(ServerLost(endpoint=self._endpoint))
         if self._loop is not None:
             # Also when a handshake broke off: ZeroMQ does not try again after garbage in it.
@@ -376,7 +377,6 @@ class ZmqTransport:
             self._loop.call_later(line.REVIVE_S if self._connected else line.RETRY_S, self._revive)
         self._connected = False
         self._silent_since = None
-        self._obstacle = "the connection was lost and not restored"
         self._fail_sent(self._lost)
 
     def _revive(self) -> None:
