@@ -43,7 +43,7 @@ async def test_what_accepts_and_says_nothing_is_tried_again() -> None:
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="how connections are dropped there")
-async def test_a_host_that_drops_what_is_sent_is_not_said_to_refuse() -> None:
+async def test_a_host_that_drops_what_is_sent_is_not_said_to_refuse(monkeypatch: pytest.MonkeyPatch) -> None:
     with ExitStack() as stack:
         deaf = stack.enter_context(socket.socket())
         deaf.bind(("127.0.0.1", 0))
@@ -53,14 +53,14 @@ async def test_a_host_that_drops_what_is_sent_is_not_said_to_refuse() -> None:
             filler.setblocking(False)
             filler.connect_ex(deaf.getsockname())
         async with URLabClient("tcp://127.0.0.1", step_port=deaf.getsockname()[1], local_model=False) as client:
-            tried, attempts = 0, client._transport._attempts
+            tried, told = 0, line.Attempts.obstacle
 
-            def count(event: zmq.Event, value: int, now: float) -> str | None:
+            def count(attempts: line.Attempts, event: zmq.Event, value: int, now: float) -> str | None:
                 nonlocal tried
                 tried += event is zmq.Event.CONNECT_RETRIED
-                return told(event, value, now)
+                return told(attempts, event, value, now)
 
-            told, attempts.obstacle = attempts.obstacle, count
+            monkeypatch.setattr(line.Attempts, "obstacle", count)
             call = asyncio.create_task(client.meta(timeout=None))
             # Where the loop was held up for longer than an attempt takes, only the next one shows what it is.
             await until(lambda: tried > 2 and client._transport._obstacle == line.UNANSWERED)
