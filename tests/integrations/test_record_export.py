@@ -242,5 +242,10 @@ def test_record_steps_or_watches(mode: str, tmp_path: Path, capsys: pytest.Captu
         assert run(*command) == 2
     assert "--overwrite" in capsys.readouterr().err
     table = read_run(path).table()
-    assert table.sim_time[-1] - table.sim_time[0] >= 0.29
-    assert np.allclose(np.diff(table.sim_time), 0.002)
+    steps = np.diff(table.sim_time) / 0.002
+    assert table.sim_time[-1] >= 0.29
+    assert np.allclose(steps, steps.round(), atol=1e-6)
+    assert steps.min() > 0.5
+    if mode == "direct":  # in live mode a server that is short of time leaves snapshots out
+        assert table.sim_time[0] < 0.003
+        assert steps.max() < 1.5
