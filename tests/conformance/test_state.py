@@ -221,5 +221,5 @@ async def test_state_belongs_together_under_the_lock(connect: Any, bot: str) -> 
         for _ in range(100):
             await client.step()
         stop.set()
-        watcher.join(5)
+        watcher.join(60)
         assert torn == []

@@ -84,7 +84,7 @@ class PluginMemory:
     def close(self) -> None:
         """Stop serving and remove the files."""
         self._stop.set()
-        self._thread.join(5)
+        self._thread.join(60)
         self.requests.close()
         self.replies.close()
 

@@ -50,10 +50,9 @@ class Served:
     def send(self, number: signal.Signals) -> None:
         """Signal it; return once a signal to stop has stopped it, which on a busy machine takes a moment."""
         assert self._process is not None
-        stat = Path(f"/proc/{self._process.pid}/stat")
         with contextlib.suppress(OSError):
             os.kill(self._process.pid, number)
-            while number is signal.SIGSTOP and stat.read_text().rpartition(")")[2].split()[0] not in "TZX":
+            while number is signal.SIGSTOP and _runs(self._process.pid):
                 os.sched_yield()
 
     async def kill(self) -> None:
@@ -70,3 +69,12 @@ class Served:
     def options(self) -> dict[str, Any]:
         """Options of a client of it."""
         return {"address": self.address, **{f"{name}_port": self.ports[name] for name in PORTS[:-1]}}
+
+
+def _runs(process: int) -> bool:
+    """Return whether a thread of the process is not stopped yet."""
+    for stat in Path(f"/proc/{process}/task").glob("*/stat"):
+        with contextlib.suppress(OSError):  # it has ended
+            if stat.read_text().rpartition(")")[2].split()[0] not in "TZX":
+                return True
+    return False
