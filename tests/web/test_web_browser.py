@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from selenium import webdriver
+from selenium.common.exceptions import TimeoutException
 from selenium.webdriver.chrome.options import Options
 from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.action_chains import ActionChains
@@ -374,9 +375,10 @@ def test_the_3d_view_shows_the_robot_and_follows_it(page: Page, tmp_path: Path) 
         def blue() -> bool:  # as parts of the arm are, and nothing else
             return bool(((picture() @ [-1.0, -0.5, 1.0]) > 60).mean() > 0.003)
 
-        wait = WebDriverWait(one.driver, 1.5 * PATIENCE_S, 0.3)
+        # A screenshot gets 10 seconds, which may be too few where the processor draws and has other things to do.
+        wait = WebDriverWait(one.driver, 1.5 * PATIENCE_S, 0.3, ignored_exceptions=[TimeoutException])
         wait.until(lambda _: blue(), "the arm never appeared")
-        before = picture()
+        (before,) = wait.until(lambda _: [picture()], "no picture")
         page.slide(1.2)
         wait.until(lambda _: differ(before, picture()) > 0.005, "the arm never moved")
 
