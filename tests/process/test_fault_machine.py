@@ -6,10 +6,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import gc
 import os
 import sys
 import threading
+from collections import Counter
 from collections.abc import Coroutine
 from pathlib import Path
 from typing import Any
@@ -20,6 +22,7 @@ from fault_proxy import Delay, Fault, FaultProxy, Garbage, Throttle, Truncate
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+from waiting import eventually, in_time
 
 from urlab_client.aio import Stream, URLabClient
 from urlab_client.aio.transport import line
@@ -41,7 +44,6 @@ from urlab_client.server.engine import Engine
 
 LONG = bool(os.environ.get("URLAB_LONG_TESTS"))
 TIMEOUT_S = 0.3
-SLACK_S = 1.0
 # A request or none: what these say about a step is that it was not executed.
 REFUSED = (ServerUnreachable, SessionTakenOver, NoActiveManager, NotReady)
 UNDECIDED = (URLabConnectionError, URLabTimeoutError, ProtocolError, StepTimeout, ShuttingDown)
@@ -74,7 +76,6 @@ class Machine(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        gc.collect()
         self.before = self.held()
         self.loop = asyncio.new_event_loop()
         self.began = self.steps.taken
@@ -84,6 +85,7 @@ class Machine(RuleBasedStateMachine):
         self.states: Stream[Any] | None = None
 
     def held(self) -> tuple[list[str], int]:
+        gc.collect()
         ours = sorted(t.name for t in threading.enumerate() if t.name.startswith("urlab"))
         return ours, len(list(Path("/proc/self/fd").iterdir()))
 
@@ -93,10 +95,8 @@ class Machine(RuleBasedStateMachine):
         async def bounded() -> Any:
             call = asyncio.ensure_future(coro)
             self.calls.append(call)
-            done, _ = await asyncio.wait([call], timeout=deadline + SLACK_S)
-            assert done, f"a call outlives its deadline of {deadline} s: {call}"
             try:
-                return call.result()
+                return await in_time(deadline, call)
             except URLabError as error:
                 return error
 
@@ -258,12 +258,16 @@ class Machine(RuleBasedStateMachine):
             """Whatever happened: once the line is whole, the client works."""
             self.proxy.heal()
             self.proxy.cut()
-            async with asyncio.timeout(20):
-                await self.client.discover(timeout=15)
-                if not self.client.manager_present:
-                    await self.client.sim.start(timeout=15)
-                reached = self.client.step_count
-                assert (await self.client.step(2, timeout=15)).step == reached + 2
+            async with asyncio.timeout(60):
+                while True:
+                    # With heartbeats as hurried as here, a busy machine may lose a connection that is whole.
+                    with contextlib.suppress(URLabConnectionError):
+                        await self.client.discover(timeout=30)
+                        if not self.client.manager_present:
+                            await self.client.sim.start(timeout=30)
+                        reached = self.client.step_count
+                        assert (await self.client.step(2, timeout=30)).step == reached + 2
+                        break
             await self.client.close()
             await self.other.close()
             await self.proxy.__aexit__()
@@ -278,8 +282,8 @@ class Machine(RuleBasedStateMachine):
             self.loop.run_until_complete(self.loop.shutdown_asyncgens())
             self.loop.close()
         assert all(call.done() for call in self.calls)
-        gc.collect()
-        assert self.held() == self.before
+        threads, files = self.before
+        eventually(lambda: not Counter((now := self.held())[0]) - Counter(threads) and now[1] <= files)
 
 
 @pytest.mark.timeout(3600 if LONG else 120)

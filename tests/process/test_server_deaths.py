@@ -11,28 +11,20 @@ import gc
 import os
 import signal
 import threading
+from collections import Counter
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import TypeVar
 
 import pytest
 from served import Served
-from waiting import until
+from waiting import in_time, until
 
 from urlab_client.aio import URLabClient
 from urlab_client.protocol.errors import NotReady, URLabConnectionError, URLabRPCError, URLabTimeoutError
 
-T = TypeVar("T")
-SLACK_S = 1.0
 TIMEOUT_S = 0.3
 LOST = (URLabTimeoutError, URLabConnectionError, URLabRPCError)
 Strike = Callable[[], None]
-
-
-async def in_time(deadline: float, call: Awaitable[T]) -> T:
-    """Fail when a call outlives its deadline by more than a second."""
-    async with asyncio.timeout(deadline + SLACK_S):
-        return await call
 
 
 async def sent(client: URLabClient, number: int) -> None:
@@ -117,7 +109,8 @@ def held() -> tuple[list[str], int]:
 
 async def released(before: tuple[list[str], int]) -> None:
     """Wait until nothing more is held than before."""
-    await until(lambda: (now := held())[0] == before[0] and now[1] <= before[1])
+    # Fewer is as good: something of another test may have gone meanwhile.
+    await until(lambda: not Counter((now := held())[0]) - Counter(before[0]) and now[1] <= before[1])
 
 
 @pytest.mark.parametrize(("state", "death", "transport"), COMBINATIONS)
@@ -135,14 +128,14 @@ async def test_no_call_outlives_its_server(
             else:
                 await served.kill()
                 await served.start()
-            async with asyncio.timeout(20):
+            async with asyncio.timeout(60):
                 while True:
                     with contextlib.suppress(NotReady):  # it is at the long step again
-                        await client.discover(timeout=10)
+                        await client.discover(timeout=30)
                         break
                 if not client.manager_present:
-                    await client.sim.start(timeout=10)
-                    await client.discover(timeout=10)
+                    await client.sim.start(timeout=30)
+                    await client.discover(timeout=30)
             reached = client.step_count
             assert (await client.step(3)).step == reached + 3
             assert client.articulations["arm"].qpos_array.size

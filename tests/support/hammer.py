@@ -43,7 +43,7 @@ def publish(put: Callable[[bytes], None], seconds: float) -> str:
     chance = random.Random(3)
     payloads = [number.to_bytes(8, "little") * WORDS[number % len(WORDS)] for number in range(BURST)]
     count = 0
-    while time.monotonic() < end:
+    while not count or time.monotonic() < end:
         hurried = chance.random() < 0.5
         for payload in payloads:
             put(payload)
@@ -58,7 +58,8 @@ def take(news: Callable[[int], tuple[int, bytes | None]], seconds: float) -> str
     """Print how many reads were made, how many payloads accepted, and how many of those were torn or others'."""
     end = time.monotonic() + seconds
     seen = tries = accepted = wrong = 0
-    while time.monotonic() < end:
+    # Whoever writes may come late.
+    while time.monotonic() < end or (not accepted and time.monotonic() < end + START_S):
         for _ in range(1000):
             sequence, payload = news(seen)
             tries += sequence != seen
