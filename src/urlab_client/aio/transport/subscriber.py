@@ -136,6 +136,9 @@ class _Subscriber:
         socket = self._socket = context.socket(zmq.SUB)
         line.configure(socket)
         socket.rcvhwm = _QUEUED_PICTURES if pictures else _QUEUED_MESSAGES
+        # A full queue holds heartbeats up until the connection is given up. Without this, libzmq 4.3.5 (issue 3937)
+        # ends the whole process when the queue is read after that: the next connection would have the old one's pipe.
+        socket.immediate = True
         socket.maxmsgsize = _MAX_MESSAGE_BYTES
         if keys is not None:
             keys.protect(socket)

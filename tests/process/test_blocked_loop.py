@@ -1,0 +1,34 @@
+"""A program that keeps its event loop for long while a stream is open. In a child, which libzmq might end."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+BLOCKED = """
+import asyncio, time
+from urlab_client.aio import URLabClient
+from urlab_client.aio.transport import line, subscriber
+from urlab_client.server import SimulatedServer
+
+line.HEARTBEAT_MS, line.SILENCE_MS, subscriber._QUEUED_MESSAGES = 100, 300, 10
+
+async def main():
+    async with SimulatedServer("arm", play=True) as server, URLabClient(**server.client_options()) as client:
+        await client.discover()
+        async with client.state_stream(timeout=None) as states:
+            for _ in range(3):
+                await states.receive()
+                time.sleep(1.0)  # the queue fills, heartbeats are not seen, and the connection is given up
+            for _ in range(20):
+                await states.receive()
+            await client.runtime.forward()
+
+asyncio.run(main())
+print("well")
+"""
+
+
+def test_a_stream_goes_on_after_its_connection_was_given_up() -> None:
+    done = subprocess.run([sys.executable, "-c", BLOCKED], capture_output=True, text=True, timeout=100, check=False)
+    assert (done.returncode, done.stdout.strip(), done.stderr) == (0, "well", "")
