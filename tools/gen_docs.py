@@ -193,6 +193,7 @@ def wire_type(hint: Any, structs: list[type[Any]]) -> str:
     """Return how a field's type is called on the wire; append the structs it names to `structs`."""
     import msgspec
     import numpy as np
+    from numpy.typing import NDArray
 
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Annotated:
@@ -207,7 +208,7 @@ def wire_type(hint: Any, structs: list[type[Any]]) -> str:
         name = f"{len(arguments)} numbers"
     elif origin is dict:
         name = f"map of {wire_type(arguments[1], structs)}"
-    elif origin is np.ndarray:
+    elif origin in (np.ndarray, NDArray):  # the latter from NumPy 2.5 on Python 3.12 on
         name = "list of number"
     elif isinstance(hint, type) and issubclass(hint, msgspec.Struct):
         if hint not in structs:
