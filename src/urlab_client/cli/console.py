@@ -122,7 +122,14 @@ async def _serve(arguments: ConsoleArguments) -> None:
                         if arguments.open:
                             webbrowser.open(link)
 
-            await Server(config).serve(sockets=[listener])
+            try:
+                await Server(config).serve(sockets=[listener])
+                await asyncio.sleep(0)
+            except asyncio.CancelledError:
+                # uvicorn repeats the signal that ended it, and what asyncio makes of it must not break off the closing.
+                task = asyncio.current_task()
+                if task is None or task.uncancel():
+                    raise
 
 
 def _bound(host: str, number: int) -> socket.socket:
