@@ -3,10 +3,10 @@
 import importlib.util
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 # A test that is slow because the machine is busy has not failed; pytest's own limit ends those that hang.
-settings.register_profile("urlab", deadline=None)
+settings.register_profile("urlab", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("urlab")
 
 # Marker of the tests that need an extra which the test command does not install -> its modules, and what to install.
