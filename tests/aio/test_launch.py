@@ -21,9 +21,18 @@ from urlab_client.aio.launch import serve_arguments
 
 def children() -> set[int]:
     listing = subprocess.run(
-        ["ps", "--ppid", str(os.getpid()), "-o", "pid=,args="], capture_output=True, text=True, check=False
+        ["ps", "-ww", "--ppid", str(os.getpid()), "-o", "pid=,args="], capture_output=True, text=True, check=False
     )
     return {int(line.split()[0]) for line in listing.stdout.splitlines() if "urlab_client serve" in line}
+
+
+@pytest.fixture
+def never_ready(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Servers that start for as long as their input is open."""
+    program = tmp_path / "python"
+    program.write_text("#!/bin/sh\nread line\n")
+    program.chmod(0o700)
+    monkeypatch.setattr(sys, "executable", str(program))
 
 
 async def test_a_script_needs_no_server_of_its_own() -> None:
@@ -77,7 +86,7 @@ async def test_a_killed_server_is_noticed() -> None:
         assert (await client.step()).step == 1
 
 
-async def test_cancelling_the_first_call_leaves_no_server_behind() -> None:
+async def test_cancelling_the_first_call_leaves_no_server_behind(never_ready: None) -> None:
     async with URLabClient("sim://ball") as client:
         call = asyncio.create_task(client.discover())
         await until(children)
@@ -88,7 +97,7 @@ async def test_cancelling_the_first_call_leaves_no_server_behind() -> None:
 
 
 @pytest.mark.parametrize("moment", ["before there is a process", "before it is ready"])
-async def test_closing_while_the_server_starts_leaves_none_behind(moment: str) -> None:
+async def test_closing_while_the_server_starts_leaves_none_behind(moment: str, never_ready: None) -> None:
     client = URLabClient("sim://ball")
     call = asyncio.create_task(client.discover())
     await asyncio.sleep(0)
@@ -103,7 +112,7 @@ async def test_closing_while_the_server_starts_leaves_none_behind(moment: str) -
         await client.discover()
 
 
-def test_closing_a_blocking_client_while_its_server_starts() -> None:
+def test_closing_a_blocking_client_while_its_server_starts(never_ready: None) -> None:
     client = urlab_client.URLabClient("sim://ball")
     with ThreadPoolExecutor(1) as pool:
         call = pool.submit(client.discover)
