@@ -10,20 +10,13 @@ from typing import Any
 import msgspec
 import pytest
 import zmq
+from hello import hello_ok
 from waiting import DEADLINE_S
 
 from urlab_client.aio import URLabClient
 from urlab_client.protocol.registry import OPS
 
-HELLO = {
-    "op": "hello_ok",
-    "session_id": "11111111-2222-3333-4444-555555555555",
-    "urlab_version": "urlab/0.1",
-    "mujoco_version_int": 3010000.0,
-    "mujoco_version": "3.10.0",
-    "manager_present": False,
-    "articulations": [],
-}
+HELLO = hello_ok(manager_present=False)
 
 META = {
     "op": "meta_ok",

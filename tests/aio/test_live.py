@@ -13,6 +13,7 @@ import msgspec
 import mujoco
 import numpy as np
 import pytest
+from hello import hello_ok
 from publisher import Publisher
 from waiting import DEADLINE_S, eventually, until
 
@@ -63,17 +64,7 @@ class Plugin:
             "original_names": {"actuators": {}, "joints": {}, "sensors": {}, "bodies": {}},
             "camera_topics": {"wrist": self.camera},
         }
-        self.hello = {
-            "op": "hello_ok",
-            "session_id": "11111111-2222-3333-4444-555555555555",
-            "urlab_version": "urlab/0.1",
-            "mujoco_version_int": float(mujoco.mj_version()),
-            "mujoco_version": mujoco.mj_versionString(),
-            "manager_present": True,
-            "mjb": mjb.tobytes(),
-            "articulations": [arm],
-            "entities": {},
-        }
+        self.hello = hello_ok(mjb=mjb.tobytes(), articulations=[arm], entities={})
         scripted.on("hello", lambda _: self.hello)
         scripted.on("set_mode", self.set_mode)
         scripted.on("stop_pie", {"op": "stop_pie_ok"})

@@ -15,6 +15,7 @@ import msgspec
 import mujoco
 import numpy as np
 import pytest
+from hello import hello_ok
 
 import urlab_client
 from urlab_client import (
@@ -124,19 +125,13 @@ class Plugin:
         self.level = request.get("observations", self.level)
         buffer = np.zeros(mujoco.mj_sizeModel(self.model), np.uint8)
         mujoco.mj_saveModel(self.model, None, buffer)
-        return {
-            "op": "hello_ok",
-            "session_id": "11111111-2222-3333-4444-555555555555",
-            "urlab_version": "urlab/0.1",
-            "mujoco_version_int": float(mujoco.mj_version()),
-            "mujoco_version": mujoco.mj_versionString(),
-            "manager_present": True,
-            "mjb": buffer.tobytes(),
-            "mjb_size": float(len(buffer)),
-            "articulations": [self.articulation(key) for key in KEYS],
-            "entities": {},
-            "global_cameras": {},
-        }
+        return hello_ok(
+            mjb=buffer.tobytes(),
+            mjb_size=float(len(buffer)),
+            articulations=[self.articulation(key) for key in KEYS],
+            entities={},
+            global_cameras={},
+        )
 
     def set_mode(self, request: dict[str, Any]) -> dict[str, Any]:
         previous, self.mode = self.mode, request["mode"]
@@ -633,14 +628,5 @@ def test_a_client_does_not_pickle_but_its_description_does(connect: Any) -> None
 
 
 def test_the_handshake_struct_needs_no_extras() -> None:
-    plain = {
-        "op": "hello_ok",
-        "session_id": "s",
-        "urlab_version": "urlab/0.1",
-        "mujoco_version_int": 1.0,
-        "mujoco_version": "1",
-        "manager_present": False,
-        "articulations": [],
-    }
-    hello = msgspec.convert(plain, HelloOk, strict=False)
+    hello = msgspec.convert(hello_ok(), HelloOk, strict=False)
     assert hello.mjb is None

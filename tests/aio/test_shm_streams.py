@@ -12,6 +12,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from hello import hello_ok
 from plugin_memory import WrittenRegion
 from publisher import Publisher
 from waiting import DEADLINE_S
@@ -61,8 +62,7 @@ async def publisher() -> AsyncIterator[Publisher]:
 @pytest.fixture
 async def memory(tmp_path: Path) -> AsyncIterator[SharedMemory]:
     made = SharedMemory(tmp_path)
-    hello = {"op": "hello_ok", "session_id": "s", "urlab_version": "", "mujoco_version": "", "mujoco_version_int": 0}
-    made.follow(msgspec.convert(hello | {"manager_present": True, "articulations": []}, HelloOk))
+    made.follow(msgspec.convert(hello_ok(), HelloOk, strict=False))
     yield made
     made.close()
 

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import pytest
+from hello import hello_ok
 
 from urlab_client import ProtocolError
 from urlab_client.aio import URLabClient, compilation
@@ -33,18 +33,7 @@ def told(scripted: Any, monkeypatch: pytest.MonkeyPatch) -> Callable[..., URLabC
     monkeypatch.setattr(client_module, "is_local", lambda address: False)
 
     def make(xml: str, assets: dict[str, bytes] | None = None, **options: Any) -> URLabClient:
-        reply = {
-            "op": "hello_ok",
-            "session_id": "11111111-2222-3333-4444-555555555555",
-            "urlab_version": "urlab/0.1",
-            "mujoco_version_int": float(mujoco.mj_version()),
-            "mujoco_version": mujoco.mj_versionString(),
-            "manager_present": True,
-            "articulations": [],
-            "mjcf_compiled": xml,
-            "vfs_assets": assets or {},
-        }
-        scripted.on("hello", reply)
+        scripted.on("hello", hello_ok(mjcf_compiled=xml, vfs_assets=assets or {}))
         return URLabClient("tcp://127.0.0.1", step_port=scripted.port, **options)
 
     return make

@@ -13,6 +13,7 @@ from typing import Any
 
 import msgspec
 import zmq
+from hello import hello_ok
 from plugin_memory import PluginMemory
 
 from urlab_client.protocol.registry import OPS
@@ -24,16 +25,7 @@ def main() -> None:
     """Serve until killed."""
     directory, port = Path(sys.argv[1]), sys.argv[2]
     session = str(uuid.uuid4())
-    hello = {
-        "op": "hello_ok",
-        "session_id": session,
-        "urlab_version": "urlab/0.1",
-        "mujoco_version_int": 3010000.0,
-        "mujoco_version": "3.10.0",
-        "manager_present": True,
-        "shm_session_dir": str(directory),
-        "articulations": [],
-    }
+    hello = hello_ok(session_id=session, shm_session_dir=str(directory))
     ops = [{"name": op.name, "category": str(op.needs), "namespace": op.ns} for op in OPS.values()]
     answers: dict[str, Any] = {
         "hello": lambda _: hello,
