@@ -11,6 +11,7 @@ import msgspec
 import pytest
 import zmq
 from hello import hello_ok
+from ports import free_port
 from waiting import DEADLINE_S
 
 from urlab_client.aio import URLabClient
@@ -45,9 +46,8 @@ class ScriptedServer:
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.ROUTER)
         self._socket.linger = 0
-        self.port = port or self._socket.bind_to_random_port("tcp://127.0.0.1")
-        if port:
-            self._socket.bind(f"tcp://127.0.0.1:{port}")
+        self.port = port or free_port()
+        self._socket.bind(f"tcp://127.0.0.1:{self.port}")
         self._wake = self._context.socket(zmq.PAIR)
         self._wake.bind("inproc://wake")
         self._control = self._context.socket(zmq.PAIR)

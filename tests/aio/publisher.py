@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import Callable
 
 import zmq
+from ports import free_port
 from waiting import DEADLINE_S
 
 
@@ -22,9 +23,8 @@ class Publisher:
         self._socket = self._context.socket(zmq.XPUB)
         self._socket.linger = 1000
         self._socket.rcvtimeo = round(1e3 * DEADLINE_S)
-        self.port = port or self._socket.bind_to_random_port("tcp://127.0.0.1")
-        if port:
-            self._socket.bind(f"tcp://127.0.0.1:{port}")
+        self.port = port or free_port()
+        self._socket.bind(f"tcp://127.0.0.1:{self.port}")
         self.filters: set[bytes] = set()
 
     @property

@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from ports import free_port
 from waiting import in_time
 
 from urlab_client.aio import URLabClient
@@ -39,14 +40,15 @@ asyncio.run(main())
 """
 
 
-async def start(directory: Path, port: str = "*") -> tuple[asyncio.subprocess.Process, str]:
-    command = (sys.executable, str(SUPPORT / "plugin_process.py"), str(directory), port)
+async def start(directory: Path, port: int) -> asyncio.subprocess.Process:
+    command = (sys.executable, str(SUPPORT / "plugin_process.py"), str(directory), str(port))
     process = await asyncio.create_subprocess_exec(*command, stdout=asyncio.subprocess.PIPE)
     assert process.stdout is not None
-    return process, (await process.stdout.readline()).decode().strip()
+    assert await process.stdout.readline()
+    return process
 
 
-def client_of(port: str) -> URLabClient:
+def client_of(port: int) -> URLabClient:
     address = f"tcp://127.0.0.1:{port}"
     return URLabClient(address, transport="shm", step_mode="direct", local_model=False, rcv_timeout_ms=30_000)
 
@@ -63,7 +65,8 @@ async def over_shared_memory(client: URLabClient, first: int) -> int:
 @pytest.mark.timeout(60 + 5 * KILLS)
 async def test_servers_killed_while_a_client_steps(tmp_path: Path) -> None:
     chance = random.Random(5)
-    server, port = await start(tmp_path)
+    port = free_port()
+    server = await start(tmp_path, port)
     loop = asyncio.get_running_loop()
     number = 1
     try:
@@ -78,7 +81,7 @@ async def test_servers_killed_while_a_client_steps(tmp_path: Path) -> None:
                         number += 1
                 await server.wait()
                 # The plugin's files are still there, and cut short in place while the client may have them mapped.
-                server, _ = await start(tmp_path, port)
+                server = await start(tmp_path, port)
             await client.discover(timeout=60)
             await over_shared_memory(client, number)
     finally:
@@ -89,11 +92,12 @@ async def test_servers_killed_while_a_client_steps(tmp_path: Path) -> None:
 @pytest.mark.timeout(60 + 5 * KILLS)
 async def test_clients_killed_while_they_step(tmp_path: Path) -> None:
     chance = random.Random(6)
-    server, port = await start(tmp_path)
+    port = free_port()
+    server = await start(tmp_path, port)
     try:
         for _ in range(KILLS):
             victim = await asyncio.create_subprocess_exec(
-                sys.executable, "-c", CLIENT, port, stdout=asyncio.subprocess.PIPE
+                sys.executable, "-c", CLIENT, str(port), stdout=asyncio.subprocess.PIPE
             )
             assert victim.stdout is not None
             assert await victim.stdout.readline() == b"stepping\n"

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
 import doctest
 import os
-import random
 import re
 import select
 import shutil
 import signal
-import socket
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from pages import ROOT, Block
+from ports import free_port
 
 DEADLINE_S = 100
 
@@ -78,14 +75,6 @@ def same(expected: str, got: str) -> str:
     if checker.check_output(wanted, got, flags):
         return ""
     return checker.output_difference(doctest.Example("", wanted), got, flags)
-
-
-def free_ports() -> Iterator[int]:
-    """Yield ports that are free, each once, and none that the system gives to whoever asks for any."""
-    for port in random.SystemRandom().sample(range(20_000, 32_000), 1000):
-        with socket.socket() as taken, contextlib.suppress(OSError):
-            taken.bind(("127.0.0.1", port))
-            yield port
 
 
 @dataclass
@@ -172,13 +161,13 @@ class Shell:
 
     def with_own_ports(self, command: str) -> str:
         if re.match(r"urlab serve\b", command):
-            self.ports = dict(zip([option for option in PORTS if option not in command], free_ports(), strict=False))
+            self.ports = {option: free_port() for option in PORTS if option not in command}
             command = " ".join([command, *(f"{option} {port}" for option, port in self.ports.items())])
         elif "--step-port" in self.ports:
             address = f"tcp://127.0.0.1:{self.ports['--step-port']}"
             command = re.sub(rf"tcp://({HOSTS})\b", address, command)
         if re.match(r"urlab console\b", command):
-            self.ports["--port"] = next(free_ports())
+            self.ports["--port"] = free_port()
             command = f"{command} --port {self.ports['--port']}"
         return command
 

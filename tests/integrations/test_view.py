@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ports import free_ports
 from waiting import DEADLINE_S, eventually, until
 
 import urlab_client
@@ -152,12 +153,11 @@ async def test_live_mode_is_followed_and_another_servers_robots_replace_the_firs
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "run.rrd"
-    first = SimulatedServer("arm", play=True)
+    ports = free_ports()
+    first = SimulatedServer("arm", play=True, **ports)
     with contextlib.ExitStack() as servers:
         servers.enter_context(first)
-        options = first.client_options()
-        ports = {name: number for name, number in options.items() if name.endswith("_port")}
-        async with AsyncClient(**options, step_mode="live", rcv_timeout_ms=30_000) as client:
+        async with AsyncClient(**first.client_options(), step_mode="live", rcv_timeout_ms=30_000) as client:
             await client.discover()
             await client.runtime.set_paused(False)
             async with rerun_view(client, save=path, cameras=["wrist"]) as view:
@@ -366,10 +366,9 @@ async def test_another_servers_robots_and_cameras_replace_the_first_in_foxglove(
         assert [deletion.type for deletion in update.deletions] == [1]  # all that there was before
         return {entity.id.partition("_")[0] for entity in update.entities}
 
-    options: dict[str, Any] = {"play": True, "camera_size": (80, 60)}
+    options: dict[str, Any] = {"play": True, "camera_size": (80, 60), **free_ports()}
     with contextlib.ExitStack() as servers:
         reach = servers.enter_context(SimulatedServer("arm", **options)).client_options()
-        ports = {name: number for name, number in reach.items() if name.endswith("_port")}
         async with AsyncClient(**reach, step_mode="live", rcv_timeout_ms=30_000) as client, asyncio.timeout(100):
             await client.discover()
             await client.runtime.set_paused(False)
@@ -381,7 +380,7 @@ async def test_another_servers_robots_and_cameras_replace_the_first_in_foxglove(
                 await seen.until("/tf", "/scene", "/state/arm", "/camera/arm/wrist")
                 assert "arm" in drawn(seen)
                 servers.close()
-                servers.enter_context(SimulatedServer("quadruped", **options, **ports))
+                servers.enter_context(SimulatedServer("quadruped", **options))
                 await published(client, "quadruped")
                 await client.discover()
                 await client.runtime.set_paused(False)

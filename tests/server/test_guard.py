@@ -12,6 +12,7 @@ from typing import Any
 
 import msgspec
 import pytest
+from ports import free_ports
 from waiting import eventually
 from wire import server_threads
 
@@ -100,12 +101,11 @@ def test_keys_for_a_server_without(keys: Path) -> None:
 def test_a_client_is_let_in_once_the_server_knows_it(keys: Path) -> None:
     secret = keys / "server.key_secret"
     before = server_threads()
-    with SimulatedServer(curve=CurveServer(server_key=secret, allow=[keys / "stranger.key"])) as server:
-        options = server.client_options()
-        client = URLabClient(**options, client_key=keys / "clients/me.key_secret")
+    ports = free_ports()
+    with SimulatedServer(curve=CurveServer(server_key=secret, allow=[keys / "stranger.key"]), **ports) as server:
+        client = URLabClient(**server.client_options(), client_key=keys / "clients/me.key_secret")
         with pytest.raises(AuthenticationFailed):
             client.discover()
-    ports = {name: port for name, port in options.items() if name.endswith("_port")}
     eventually(lambda: server_threads() <= before)
     with client, SimulatedServer(curve=CurveServer(server_key=secret, allow=[keys / "clients"]), **ports):
         client.discover()

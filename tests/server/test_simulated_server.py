@@ -18,6 +18,7 @@ from typing import Any
 import msgspec
 import pytest
 import zmq
+from ports import free_ports
 from waiting import eventually
 from wire import Wire, pack, server_threads, write_level
 
@@ -293,8 +294,8 @@ def test_two_servers_cannot_share_a_port(name: str) -> None:
 
 def test_a_released_port_can_be_taken_again(models: Path, connect: Connect) -> None:
     before = server_threads()
-    with SimulatedServer(models / "bot.xml") as server:
-        ports = {f"{name}_port": getattr(server, f"{name}_port") for name in PORTS}
+    ports = free_ports()
+    with SimulatedServer(models / "bot.xml", **ports) as server:
         connect(server).hello()
     eventually(lambda: server_threads() <= before)  # on a busy machine closing does not wait for them all
     with SimulatedServer(models / "bot.xml", **ports) as server:

@@ -1,7 +1,7 @@
 """The plugin's two transports in a process of its own, to be killed: `python plugin_process.py DIRECTORY PORT`.
 
-A step is answered with the number of steps that was asked for, so that no reply can pass for another one's. Prints its
-port when it serves.
+A step is answered with the number of steps that was asked for, so that no reply can pass for another one's. Prints a
+line when it serves.
 """
 
 from __future__ import annotations
@@ -39,12 +39,9 @@ def main() -> None:
         },
     }
     socket = zmq.Context().socket(zmq.REP)
-    if port == "*":
-        port = str(socket.bind_to_random_port("tcp://127.0.0.1"))
-    else:
-        socket.bind(f"tcp://127.0.0.1:{port}")
+    socket.bind(f"tcp://127.0.0.1:{port}")
     PluginMemory(directory, answers, session_id=session)
-    sys.stdout.write(f"{port}\n")
+    sys.stdout.write("ready\n")
     sys.stdout.flush()
     while True:
         request = msgspec.msgpack.decode(socket.recv())

@@ -11,6 +11,8 @@ import sys
 from pathlib import Path
 from typing import Any, Self
 
+from ports import free_port
+
 PORTS = ("step", "state", "ctrl", "info", "camera")
 
 
@@ -24,7 +26,7 @@ class Served:
 
     def __init__(self, shm_dir: Path | None = None) -> None:
         self.address = ""
-        self.ports = dict.fromkeys(PORTS, 0)
+        self.ports = {name: free_port() for name in PORTS}
         self._memory = ["--no-shm"] if shm_dir is None else [f"--shm-dir={shm_dir}"]
         self._process: asyncio.subprocess.Process | None = None
 
@@ -45,7 +47,6 @@ class Served:
         assert process.stdout is not None
         ready = json.loads(await process.stdout.readline())
         self.address = ready["address"]
-        self.ports = {name: ready[f"{name}_port"] for name in PORTS}
 
     def send(self, number: signal.Signals) -> None:
         """Signal it; return once a signal to stop has stopped it, which on a busy machine takes a moment."""
