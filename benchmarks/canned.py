@@ -31,6 +31,7 @@ class Requester:
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.REQ)
         self._socket.linger = 0
+        self._socket.rcvtimeo = 60_000  # or what goes wrong would hang
         self._socket.connect(f"tcp://127.0.0.1:{port}")
 
     def ask(self, request: bytes) -> bytes:

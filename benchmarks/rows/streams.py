@@ -26,6 +26,7 @@ from urlab_client.protocol.rows import STATE_FULL, camera_filter
 __all__ = ["ROWS"]
 
 _SNAPSHOTS = 500
+_HANGS_S = 60.0
 _HZ = 1000.0
 _PACED = 2000
 _PACED_RUNS = 3
@@ -50,14 +51,15 @@ def _state() -> Iterator[Pair]:
     ):
         client = aio.URLabClient(f"tcp://127.0.0.1:{port}", step_mode="live", state_port=source.ports[0])
         runner.run(client.discover())
-        source.wait_subscribed(0)
+        runner.run(_subscribed(source))
         robot = next(iter(client.articulations.values()))
 
         async def burst() -> float:
             source.send(0, _SNAPSHOTS)
             started = time.perf_counter()
-            while client.step_count != _SNAPSHOTS:  # noqa: ASYNC110  # an event would be set by what is measured
-                await asyncio.sleep(0.0002)
+            async with asyncio.timeout(_HANGS_S):
+                while client.step_count != _SNAPSHOTS:  # noqa: ASYNC110  # an event would be set by what is measured
+                    await asyncio.sleep(0.0002)
             took = time.perf_counter() - started
             client._state.step_count = 0  # noqa: SLF001  # so that the next burst's end is seen
             return took / _SNAPSHOTS
@@ -156,7 +158,7 @@ def _pictures(mode: str, width: int, height: int) -> Iterator[Pair]:
             return times
 
         runner.run(_open(stream))
-        source.wait_subscribed(0)
+        runner.run(_subscribed(source))
         source.wait_subscribed(1)
         yield Pair(ours=lambda count: [runner.run(read(per_burst)) for _ in range(count)], floor=receive)
         runner.run(_close(publishers))
@@ -164,6 +166,11 @@ def _pictures(mode: str, width: int, height: int) -> Iterator[Pair]:
 
 async def _open(stream: aio.Stream[object]) -> None:
     await stream.__aenter__()
+
+
+async def _subscribed(source: Publisher) -> None:
+    """Wait until the client has subscribed, which takes its loop."""
+    await asyncio.to_thread(source.wait_subscribed, 0)
 
 
 async def _close(publishers: Publishers) -> None:

@@ -168,7 +168,7 @@ async def test_calls_one_after_the_other_leave_other_tasks_their_turns(client: A
     for _ in range(100):
         await client.runtime.set_paused(True)
     counting.cancel()
-    assert turns >= 100
+    assert turns >= 99  # in the first turn it only begins to count
 
 
 async def test_a_queued_call_times_out_without_being_sent(client: Any, scripted: Any) -> None:
