@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from waiting import DEADLINE_S, pass_time, until
 
+from urlab_client import Verdict
 from urlab_client.aio import URLabClient
 from urlab_client.protocol.errors import (
     RPC_ERRORS,
@@ -169,6 +170,15 @@ async def test_calls_one_after_the_other_leave_other_tasks_their_turns(client: A
         await client.runtime.set_paused(True)
     counting.cancel()
     assert turns >= 99  # in the first turn it only begins to count
+
+
+async def test_a_play_state_that_nobody_tells_is_a_finding(client: Any, scripted: Any) -> None:
+    await discovered(client, scripted)
+    scripted.on("pie_status", None)
+    call = await expired(client, client.explain(), scripted.held.qsize)
+    (play,) = [finding for finding in (await call).findings if finding.subject == "play"]
+    assert play.verdict is Verdict.PROBLEM
+    assert "pie_status: no reply" in play.text
 
 
 async def test_a_queued_call_times_out_without_being_sent(client: Any, scripted: Any) -> None:
