@@ -69,7 +69,23 @@ def first_sentence(doc: str | None) -> str:
     return " ".join((doc or "").strip().partition("\n\n")[0].split())
 
 
-ELSEWHERE = {"configure_controller": ("URLabController", "articulation.controller.configure()")}
+ELSEWHERE = {
+    "configure_controller": ("URLabController", "articulation.controller.configure()"),
+    **dict.fromkeys(
+        (
+            "claim_control",
+            "release_control",
+            "set_camera_streaming",
+            "set_camera_delay",
+            "op_status",
+            "remove_actor",
+            "upload_model_manifest",
+            "upload_model_chunk",
+            "upload_model_commit",
+        ),
+        ("URLabClient", "call()"),
+    ),
+}
 """Ops whose method is not on the client or one of its namespaces: class and how users write it."""
 
 

@@ -233,8 +233,6 @@ OPS: Mapping[str, Op] = registry(
         ns="runtime",
         needs=_MANAGER,
         errors=("not_ready",),
-        generated=True,
-        returns="rejected",
         dialects=("beta",),
     ),
     *control.OPS,

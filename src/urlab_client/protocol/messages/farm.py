@@ -19,7 +19,8 @@ class AcquireLeaseOk(Reply, tag="acquire_lease_ok", kw_only=True):
 class AcquireLease(Request[AcquireLeaseOk], tag="acquire_lease", kw_only=True, omit_defaults=True):
     """Take the server's one driver lease and return its id.
 
-    The server enforces nothing by it: it tells other clients that the server is in use. Every request keeps it alive.
+    The server enforces nothing by it: it tells other clients that the server is in use. Every request keeps it
+    alive.
     """
 
     owner: Annotated[str, doc("Who takes it, for people.")] = ""
