@@ -13,7 +13,7 @@ import inspect
 import json
 import sys
 import textwrap
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -222,7 +222,7 @@ def wire_type(hint: Any, structs: list[type[Any]]) -> str:
         name = f"list of {wire_type(arguments[0], structs)}"
     elif origin is tuple:
         name = f"{len(arguments)} numbers"
-    elif origin is dict:
+    elif origin in (dict, Mapping):
         name = f"map of {wire_type(arguments[1], structs)}"
     elif origin in (np.ndarray, NDArray):  # the latter from NumPy 2.5 on Python 3.12 on
         name = "list of number"
