@@ -21,6 +21,7 @@ import anyio.to_thread
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client._landlock import is_available
 from urlab_client.protocol.enums import CameraMode, PIEState, StepMode, Transport
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.rows import CameraEndpoint
@@ -537,6 +538,9 @@ class _Opened:
         self._endpoint.start()
         if memory is not None:
             memory.start(partial(answer, transport=Transport.SHM, max_reply_bytes=MAX_REPLY_BYTES))
+        if not is_available():
+            tell = logger.info if is_loopback(self.host) else logger.warning
+            tell("this system has no Landlock: files that clients' models name are checked, but not kept from MuJoCo")
         if self.door is None and not is_loopback(self.host):
             logger.warning("open to anyone who reaches %s, without authentication or encryption", self.host)
         logger.info("serving at %s:%d", tcp(self.host), self._endpoint.port)
