@@ -14,10 +14,11 @@ PACKAGE = Path(__file__).resolve().parents[1] / "src" / "urlab_client"
 ALLOWED: dict[str, frozenset[str]] = {
     "protocol": frozenset(),
     "keys": frozenset({"protocol"}),
-    "aio": frozenset({"_confined", "_processors", "keys", "protocol"}),
+    "aio": frozenset({"_children", "_confined", "_processors", "keys", "protocol"}),
     "sync": frozenset({"aio", "protocol"}),
-    "server": frozenset({"_confined", "_processors", "keys", "protocol"}),
+    "server": frozenset({"_children", "_confined", "_processors", "keys", "protocol"}),
     "enums": frozenset({"protocol"}),
+    "_children": frozenset(),
     "_confined": frozenset(),
     "_installation": frozenset(),
     "_processors": frozenset(),

@@ -9,6 +9,7 @@ from threading import Event
 from typing import Any
 
 import pytest
+from bare_loop import run_bare
 
 from urlab_client import ServerUnreachable, URLabTimeoutError
 from urlab_client.aio import URLabClient
@@ -23,19 +24,23 @@ def compute(seconds: float) -> None:
     Event().wait(seconds)
 
 
-@pytest.fixture(params=["asyncio", "uvloop"])
+LOOPS = ["selector", "bare", *(["uvloop"] if sys.platform != "win32" else [])]
+
+
+@pytest.fixture(params=LOOPS)
 def run(request: pytest.FixtureRequest, scripted: Any) -> Callable[[Main], None]:
-    """Run something with a client of the scripted server, on a loop of either kind."""
-    if request.param == "uvloop" and sys.platform == "win32":
-        pytest.skip("uvloop is not for Windows")
+    """Run something with a client of the scripted server, on a loop of each kind."""
 
     async def with_client(main: Main) -> None:
         async with URLabClient("tcp://127.0.0.1", step_port=scripted.port, local_model=False) as client:
             await main(client)
 
     def runner(main: Main) -> None:
-        if request.param == "asyncio":
-            asyncio.run(with_client(main))
+        if request.param == "bare":
+            run_bare(with_client(main))
+        elif request.param == "selector":
+            with asyncio.Runner(loop_factory=asyncio.SelectorEventLoop) as runner:
+                runner.run(with_client(main))
         else:
             import uvloop
 

@@ -43,6 +43,19 @@ def test_serves_until_told_to_stop_and_leaves_nothing_behind(tmp_path: Path, end
         pass
 
 
+def test_leaves_ctrl_c_to_the_program_that_holds_its_input(tmp_path: Path) -> None:
+    with (
+        served("ball", "--play", "--until-eof", cwd=tmp_path) as server,
+        URLabClient(**server.client_options, step_mode="direct") as client,
+    ):
+        client.discover()
+        server.process.send_signal(signal.SIGINT)
+        for _ in range(20):
+            client.step(1000)
+        assert client.sim_time == pytest.approx(40)
+        assert server.end(None) == (0, "", "")
+
+
 def test_ends_while_a_client_is_connected_and_physics_runs(tmp_path: Path) -> None:
     with served("ball", "--play", "--unpaused", cwd=tmp_path) as server, URLabClient(**server.client_options) as client:
         client.discover()

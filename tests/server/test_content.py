@@ -436,6 +436,9 @@ def test_warnings_that_other_threads_cause_reach_the_handler_that_was_there() ->
         ("/Game/Levels/lab", "/Game/Levels/lab"),
         ("/game/Tests/My Level-2", "/Game/Tests/My Level-2"),
         ("sub/lab", "/Game/Levels/sub/lab"),
+        ("/Game/Levels/lab.lab", "/Game/Levels/lab"),
+        ("/Game/Tests/Lab.lab", "/Game/Tests/Lab"),
+        ("sub/lab.lab", "/Game/Levels/sub/lab"),
     ],
 )
 def test_level_names_expand_to_package_paths(name: str, package: str) -> None:
@@ -460,10 +463,15 @@ def test_level_names_expand_to_package_paths(name: str, package: str) -> None:
         ".lab",
         "x" * 300,
         "/Game/MuJoCoImports/robot/blueprint",
+        "/Game/urlab/Replays/recording",
+        "/Game/Levels/lab.other",
+        "/Game/Levels/lab.lab.lab",
+        "/Game/lab.lab/lab",
+        "lab.",
     ],
 )
 def test_names_that_could_leave_the_content_root_are_refused(name: str) -> None:
-    with pytest.raises(ValueError, match="level name"):
+    with pytest.raises(ValueError, match="not a level's name"):
         level_package(name)
 
 

@@ -76,7 +76,7 @@ def test_102_nothing_to_save(bot: Wire) -> None:
     assert (reply["op"], reply["code"]) == ("error", "path_not_writable")
 
 
-@pytest.mark.parametrize("path", ["/etc/ep.json", "../../../ep.json", "a\0b", ".", "..", "inner/"])
+@pytest.mark.parametrize("path", ["/etc/ep.json", "../../../ep.json", "a\0b", ".", "..", "inner/", "../../Levels"])
 def test_files_elsewhere_are_refused(bot: Wire, path: str) -> None:
     bot.ask("recording_start")
     bot.ask("step")
@@ -91,13 +91,25 @@ def test_links_lead_nowhere_else_and_models_stay(bot: Wire, tmp_path: Path, mode
     (replays / "out").symlink_to(tmp_path)
     bot.ask("recording_start")
     bot.ask("step")
-    for path in ("out/ep.json", str(models / "bot.xml")):
+    inside = tmp_path / "saved" / "mine" / "ep.json"
+    for path in ("out/ep.json", "inner/ep.json", str(inside), str(models / "bot.xml"), str(models / "ep.json")):
         reply = bot.raw({"op": "recording_save", "session_id": bot.session_id, "path": path})
         assert reply["code"] == "path_not_writable", path
     assert "<mujoco" in (models / "bot.xml").read_text()
-    inside = tmp_path / "saved" / "mine" / "ep.json"
-    assert bot.ask("recording_save", path=str(inside))["absolute_path"] == str(inside)
-    assert inside.exists()
+    assert not inside.exists()
+    named = replays / "ep.json"
+    assert bot.ask("recording_save", path=str(named))["absolute_path"] == str(named)
+
+
+def test_no_recording_is_in_the_way_of_levels_and_models(bot: Wire, models: Path) -> None:
+    bot.ask("recording_start")
+    bot.ask("step")
+    for path in ("../../Levels", "../../MuJoCoImports", "../../Levels/lab.json", "../../MuJoCoImports/bot"):
+        reply = bot.raw({"op": "recording_save", "session_id": bot.session_id, "path": path})
+        assert reply["code"] == "path_not_writable", path
+    bot.ask("stop_pie")
+    bot.ask("import_xml", path=str(models / "bot.xml"), force_reimport=True)
+    assert bot.ask("create_level", name="lab")["level_path"] == "/Game/Levels/lab"
 
 
 def frames_equal(ours: list[Frame], theirs: list[Frame]) -> bool:

@@ -111,6 +111,23 @@ def test_editor_05_levels_are_loaded_by_path(editor: Wire) -> None:
     assert editor.refused("load_level", level_path="nowhere") == "load_level_failed"
 
 
+def test_levels_are_named_by_object_path_too(editor: Wire) -> None:
+    assert editor.ask("create_level", name="/Game/Levels/G1.G1")["level_path"] == "/Game/Levels/G1"
+    assert editor.refused("create_level", name="G1") == "create_level_failed"
+    editor.ask("ensure_manager")
+    editor.ask("save_level")
+    editor.ask("create_level", name="G2.G2")
+    assert editor.ask("load_level", level_path="/Game/Levels/G1.G1")["level_path"] == "/Game/Levels/G1.G1"
+    assert editor.ask("current_level")["level_path"] == "/Game/Levels/G1"
+    editor.ask("load_level", level_path="G2.g2")
+    assert editor.ask("begin_pie", level_path="/Game/Levels/G1.G1")["state"] == "ready"
+    editor.ask("stop_pie")
+    assert editor.ask("current_level")["level_path"] == "/Game/Levels/G1"
+    assert editor.ask("destroy_asset", asset_path="/Game/Levels/G1.G1")["was_found"] is True
+    for wrong in ("/Game/Levels/G2.G1", "/Game/Levels/G2.", "/Game/Levels/.G2", "G2.G2.G2"):
+        assert editor.refused("load_level", level_path=wrong) == "load_level_failed"
+
+
 def test_editor_06_a_saved_level_comes_back(editor: Wire, models: Path) -> None:
     spawn(editor, models / "bot.xml", "a", location=[1, 2, 3], rotation_euler=[0, 0, 90])
     editor.ask("save_level")

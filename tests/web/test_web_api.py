@@ -162,6 +162,25 @@ def test_states_are_dropped_and_not_queued_for_a_viewer_that_is_busy(http: TestC
         assert message["seq"] >= ahead
 
 
+@pytest.mark.parametrize("path", ["/api/live", "/api/cameras/arm/wrist/live"])
+def test_a_binary_frame_closes_its_socket_and_no_other(http: TestClient, path: str) -> None:
+    with http.websocket_connect("ws://localhost/api/live") as other:
+        with http.websocket_connect(f"ws://localhost{path}") as socket:
+            socket.send_bytes(b"\x00")
+            while (said := socket.receive())["type"] != "websocket.close":
+                pass
+            assert said["code"] == 1003
+        heard(other, "status")
+
+
+def test_a_message_too_deep_to_read_is_refused(http: TestClient) -> None:
+    deep = '{"type": "name", "more": ' + "[" * 100_000 + "]" * 100_000 + "}"
+    with http.websocket_connect("ws://localhost/api/live") as live:
+        live.send_text(deep)
+        assert heard(live, "refused")["error"]["code"] == "bad_request"
+    assert http.post("/api/step", content=deep).status_code == 400
+
+
 def test_one_drives_and_the_others_wait(http: TestClient) -> None:
     with (
         http.websocket_connect("ws://localhost/api/live") as one,

@@ -45,7 +45,7 @@ from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.protocol.messages.session import Meta as MetaRequest
 from urlab_client.protocol.messages.session import MetaOk, OpInfo, Reset, ResetOk, Step, StepOk
 from urlab_client.protocol.messages.streams import ClientEvent, RowSample, StateSnapshot, StreamPolicy
-from urlab_client.protocol.names import NameMap
+from urlab_client.protocol.names import NameMap, unknown_name
 from urlab_client.protocol.rows import TopicKind
 from urlab_client.protocol.types import ClientConfig, Diagnosis, Resync
 
@@ -678,7 +678,7 @@ class URLabClient:
         for name in include:
             if self._state.camera(name) is None:
                 known = [f"{art.prefix}/{camera}" for art in self.articulations.values() for camera in art.cameras]
-                raise KeyError(f"no camera {name!r}; there are: {', '.join(known) or 'none'}")
+                raise unknown_name("camera", name, [*known, *self.global_cameras])
         return {name: str(CameraTiming(timing)) for name, timing in include.items()}
 
     def _joint_values(self, key: str, values: Mapping[str, float]) -> dict[str, float]:

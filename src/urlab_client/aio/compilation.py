@@ -17,6 +17,7 @@ from typing import Final
 
 import msgspec
 
+from urlab_client._children import APART
 from urlab_client._confined import limit_process, named_files
 
 __all__ = ["compile_confined"]
@@ -54,7 +55,9 @@ def compile_confined(xml: str, assets: Mapping[str, bytes]) -> bytes:
     try:
         with tempfile.TemporaryDirectory(prefix="urlab-", ignore_cleanup_errors=True) as folder:
             command = [sys.executable, "-m", __name__, folder]
-            done = subprocess.run(command, input=order, capture_output=True, timeout=_WALL_S, check=False)  # noqa: S603
+            done = subprocess.run(  # noqa: S603
+                command, input=order, capture_output=True, timeout=_WALL_S, check=False, **APART
+            )
     except subprocess.TimeoutExpired:
         raise ValueError(f"compiling it took more than {_WALL_S} s") from None
     except OSError as error:

@@ -129,6 +129,7 @@ async def _resync(state: SimState, doubts: Doubts, left: Callable[[], Timeout]) 
         reply, held, renewed = None, False, True
     if before is not None:
         applied, was_reset = _compare(doubts, before)
+    if before is not None and doubts:
         # What broke off with a connection may still travel, and then meets a server that has moved on. In puppet mode
         # the next push overrides it anyway; elsewhere it is shut out with the session it belongs to.
         late = doubts.connects != state.session.transport.stats.connects and state.mode is not StepMode.PUPPET
@@ -172,6 +173,8 @@ async def _look(state: SimState, timeout: Timeout) -> ForwardOk | None:
 
 def _compare(doubts: Doubts, reply: ForwardOk) -> tuple[int | None, bool | None]:
     """Return how many of the steps in doubt were executed, and whether the reset was, as far as that shows."""
+    if not doubts:
+        return 0, None
     if not doubts.reset:
         applied = reply.step - doubts.since
         return (applied if 0 <= applied <= doubts.steps else None), None

@@ -202,7 +202,8 @@ def add_parser(commands: Commands) -> None:
     life.add_argument(
         "--until-eof",
         action="store_true",
-        help="also end when standard input closes, so that the server cannot outlive whoever holds the other end",
+        help="also end when standard input closes, so that the server cannot outlive whoever holds the other end; "
+        "SIGINT is ignored then, unless standard input is a terminal",
     )
     parser.set_defaults(run=run)
 
@@ -216,7 +217,7 @@ def run(arguments: ServeArguments) -> int:
     """
     _check_ports(arguments)
     events: _Events = queue.SimpleQueue()
-    _stop_on_signals(events)
+    _stop_on_signals(events, ignore_interrupt=arguments.until_eof and not os.isatty(0))
     if arguments.until_eof:
         threading.Thread(target=_watch_input, args=[events], name="urlab-stdin", daemon=True).start()
     import_mujoco()
@@ -289,11 +290,12 @@ def _next(events: _Events) -> _Event:
             return events.get(timeout=_WAIT_S)
 
 
-def _stop_on_signals(events: _Events) -> None:
+def _stop_on_signals(events: _Events, *, ignore_interrupt: bool) -> None:
     def stop(number: int, frame: FrameType | None) -> None:
         events.put(_Event.STOP)
 
-    signal.signal(signal.SIGINT, stop)
+    # Ctrl-C reaches all processes of a terminal, but is meant for the one that a user runs and that holds our input.
+    signal.signal(signal.SIGINT, signal.SIG_IGN if ignore_interrupt else stop)
     signal.signal(signal.SIGTERM, stop)
     hangup = getattr(signal, "SIGHUP", None)
     if hangup is not None and signal.getsignal(hangup) != signal.SIG_IGN:  # nohup wants it ignored

@@ -36,6 +36,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client._children import APART
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import CameraFrame
@@ -221,6 +222,7 @@ def _probe(name: str) -> Backend | str:
             capture_output=True,
             timeout=_PROBE_DEADLINE_S,
             check=False,
+            **APART,
         )
     except (OSError, subprocess.TimeoutExpired) as error:
         return str(error)

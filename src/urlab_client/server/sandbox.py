@@ -23,6 +23,7 @@ from typing import Final
 
 import msgspec
 
+from urlab_client._children import APART
 from urlab_client._confined import limit_process
 from urlab_client.server.confinement import Outside, check_references
 from urlab_client.server.content import Compiled, build_snapshot, one_line
@@ -87,7 +88,10 @@ class _Child:
 
     def _start(self) -> subprocess.Popen[bytes]:
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "urlab_client.server.sandbox"], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+            [sys.executable, "-m", "urlab_client.server.sandbox"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            **APART,
         )
         return self._process
 
@@ -145,7 +149,7 @@ def _serve() -> None:
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what libraries print is no answer
     for signum in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(signum, signal.SIG_IGN)  # Ctrl-C is for the server, which ends this process
+        signal.signal(signum, signal.SIG_IGN)  # they are for the server, which ends this process
     for line in sys.stdin.buffer:
         order = _ORDER.decode(line)
         outcome = _fork(order) if hasattr(os, "fork") else _work(order)

@@ -276,7 +276,7 @@ class _Site:
 
     async def _listen(self, socket: WebSocket, one: Audience, flow: _Flow) -> None:
         while True:
-            text = await socket.receive_text()
+            text = await _said(socket)
             try:
                 message = msgspec.json.decode(text, type=_Message)
                 match message.type:
@@ -292,7 +292,7 @@ class _Site:
                         self.desk.set_points(one.viewer, message.values)
                     case _:
                         raise ValueError(f"there is no message of type {message.type!r}")  # noqa: TRY301 - answered
-            except (NotDriving, ValueError, KeyError, msgspec.MsgspecError) as error:
+            except (NotDriving, ValueError, KeyError, RecursionError, msgspec.MsgspecError) as error:
                 await socket.send_text(encode({"type": "refused", "error": _explain(error)[1]}).decode())
 
     async def _pictures(self, socket: WebSocket) -> None:
@@ -319,7 +319,7 @@ class _Site:
             tasks.start_soon(send)
             with contextlib.suppress(WebSocketDisconnect):
                 while True:
-                    await socket.receive_text()
+                    await _said(socket)
                     flow.acknowledged += 1
                     flow.changed.set()
             tasks.cancel_scope.cancel()
@@ -394,6 +394,22 @@ class _Checked(StaticFiles):
         return response
 
 
+async def _said(socket: WebSocket) -> str:
+    """Return the next text that a browser sends.
+
+    Raises:
+        WebSocketDisconnect: It is gone, or it sent a binary frame, and the socket is closed for that.
+    """
+    message = await socket.receive()
+    if message["type"] == "websocket.disconnect":
+        raise WebSocketDisconnect(message["code"], message.get("reason"))
+    text: str | None = message.get("text")
+    if text is None:
+        await socket.close(1003, "this socket takes text")
+        raise WebSocketDisconnect(1003)
+    return text
+
+
 class _Flow:
     """How much is on its way to a browser."""
 
@@ -412,7 +428,7 @@ def _answering(handler: _Handler) -> _Handler:
     async def answer(request: Request) -> Response:
         try:
             return await handler(request)
-        except (NotDriving, URLabError, ValueError, TypeError, KeyError) as error:
+        except (NotDriving, URLabError, ValueError, TypeError, KeyError, RecursionError) as error:
             status, said = _explain(error)
             return _json(encode({"error": said}), status)
 

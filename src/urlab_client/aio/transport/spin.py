@@ -8,6 +8,7 @@ two looks.
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -41,7 +42,7 @@ class Spin:
     async def look(self, op: str, reply: asyncio.Future[Any], look: Callable[[], object]) -> None:
         """Call `look` until it completes `reply` or that has taken too long."""
         global _looking  # noqa: PLW0603  # about all loops of the process, as they share its interpreter
-        now = asyncio.get_running_loop().time
+        now = time.perf_counter  # the loop's clock may tick 64 times a second
         give_up = now() + min(max(2 * self._latency.get(op, 0.0), self._shortest), self._longest)
         _looking = True
         try:

@@ -1,4 +1,4 @@
-"""Receiving from the server's PUB sockets on the caller's asyncio loop, without a thread of our own.
+"""Receiving from the server's PUB sockets on the caller's asyncio loop.
 
 One SUB socket per publisher serves all subscriptions of a client. A second reader of the state stream thus costs no
 second copy on the wire and no second wake-up of the loop (at 1 kHz about 40 µs of processor time per snapshot, against
@@ -23,6 +23,7 @@ from zmq.utils.monitor import recv_monitor_message
 
 from urlab_client.aio.transport import line
 from urlab_client.aio.transport.curve import SERVER_KEY_HINT, ClientKeys
+from urlab_client.aio.transport.readiness import Readiness, watch_socket
 from urlab_client.protocol.errors import ClientClosed, ProtocolError, URLabError
 from urlab_client.protocol.rows import BytesLike
 
@@ -143,18 +144,13 @@ class _Subscriber:
         if keys is not None:
             keys.protect(socket)
         self._monitor = socket.get_monitor_socket(line.WATCHED)
+        self._watched: tuple[Readiness, ...] = ()
         try:
             socket.connect(endpoint)
-            loop.add_reader(self._monitor, self._on_event)
-        except (NotImplementedError, zmq.ZMQError) as error:
-            self._release()
-            if isinstance(error, NotImplementedError):
-                raise URLabError(
-                    f"{type(loop).__name__} cannot watch sockets.",
-                    hint="Run the client on a selector event loop, or use the blocking client, which brings its own.",
-                ) from error
+        except zmq.ZMQError as error:
+            self.close()
             raise ValueError(f"{endpoint!r} is not an address ZeroMQ can connect to: {error}") from error
-        loop.add_reader(socket, self._on_readable)
+        self._watched = watch_socket(loop, self._monitor, self._on_event), watch_socket(loop, socket, self._on_readable)
         loop.call_soon(self._on_event)
 
     @property
@@ -177,13 +173,9 @@ class _Subscriber:
         self._loop.call_soon(self._on_readable)
 
     def close(self) -> None:
-        if not self._loop.is_closed():  # an abandoned client may outlive its loop
-            self._loop.remove_reader(self._socket)
-            self._loop.remove_reader(self._monitor)
-        self._release()
-
-    def _release(self) -> None:
         self._closed = True
+        for readiness in self._watched:
+            readiness.close()
         self._socket.disable_monitor()
         self._monitor.close(linger=0)
         self._socket.close(linger=0)

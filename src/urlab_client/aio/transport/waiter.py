@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from urlab_client.aio.transport.readiness import watch_socket
 from urlab_client.protocol import doorbell
 
 __all__ = ["Doorbell", "Reply", "Stream", "Waiter", "Watch"]
@@ -168,7 +169,6 @@ class Doorbell:
         on_ring: dict[bytes, Callable[[], None]],
         on_lost: Callable[[], None],
     ) -> None:
-        self._loop = loop
         self._on_ring = on_ring
         self._on_lost = on_lost
         if len(str(path).encode()) > doorbell.MAX_PATH_BYTES:
@@ -179,7 +179,7 @@ class Doorbell:
         self._socket.setblocking(False)
         try:
             self._socket.connect(str(path))
-            loop.add_reader(self._socket, self._on_readable)
+            self._readiness = watch_socket(loop, self._socket, self._on_readable)
         except BaseException:
             self._socket.close()
             raise
@@ -196,7 +196,7 @@ class Doorbell:
     def close(self) -> None:
         """Hang up. Idempotent."""
         if self._socket.fileno() >= 0:
-            self._loop.remove_reader(self._socket)
+            self._readiness.close()
             self._socket.close()
 
     def _on_readable(self) -> None:

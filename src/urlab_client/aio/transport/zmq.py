@@ -1,4 +1,4 @@
-"""Requests over a ZeroMQ DEALER socket, driven by the caller's asyncio loop without a thread of our own.
+"""Requests over a ZeroMQ DEALER socket, driven by the caller's asyncio loop.
 
 The server's REP socket echoes the envelope, so each request carries an id: a reply that comes after its request gave
 up is recognised and dropped, and the next request works. Replies complete futures from the reader callback; nothing
@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import logging
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, cast
@@ -21,6 +22,7 @@ from urlab_client.aio.transport import context as shared_context
 from urlab_client.aio.transport import line
 from urlab_client.aio.transport.base import TransportStats
 from urlab_client.aio.transport.curve import ClientKeys
+from urlab_client.aio.transport.readiness import Readiness, watch_socket
 from urlab_client.aio.transport.spin import Spin
 from urlab_client.protocol.base import Op, Timing
 from urlab_client.protocol.codec import MAX_REPLY_BYTES
@@ -91,6 +93,8 @@ class ZmqTransport:
         self._context: zmq.Context[zmq.Socket[bytes]] | None = None
         self._socket: zmq.Socket[bytes] | None = None
         self._monitor: zmq.Socket[bytes] | None = None
+        self._replies: Readiness | None = None
+        self._events: Readiness | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._due = 0.0
         self._spin = Spin(_SPIN_S, _LONGEST_SPIN_S)
@@ -123,7 +127,7 @@ class ZmqTransport:
 
     async def request(self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None) -> bytes:
         """See `Transport.request`."""
-        loop, socket = self._open()
+        loop, socket, replies = self._open()
         send = socket.send
         while True:
             if not self._connected:
@@ -146,6 +150,7 @@ class ZmqTransport:
             break
         entry = self._sent[key] = _Sent(op, loop.create_future(), started, deadline)
         self.stats.sent += 1
+        sent = time.perf_counter()
         if deadline is not None:
             self._expire_at(loop, deadline)
         try:
@@ -154,10 +159,12 @@ class ZmqTransport:
                 await self._spin.look(op.name, entry.reply, self._on_readable)
             elif cast("int", socket.get(_EVENTS)) & _POLLIN:
                 loop.call_soon(self._on_readable)
+            if not entry.reply.done():
+                replies.expect()
             answer = await entry.reply
         finally:
             self._sent.pop(key, None)
-        self._spin.note(op.name, loop.time() - started)
+        self._spin.note(op.name, time.perf_counter() - sent)
         return answer
 
     async def follow(self, hello: HelloOk) -> None:
@@ -178,24 +185,24 @@ class ZmqTransport:
             return
         if self._timer is not None:
             self._timer.cancel()
-        if not self._loop.is_closed():  # an abandoned client may outlive its loop
-            self._loop.remove_reader(self._socket)
-            self._loop.remove_reader(self._monitor)
+        for readiness in (self._replies, self._events):
+            if readiness is not None:
+                readiness.close()
         self._socket.disable_monitor()
         self._monitor.close(linger=0)
         self._socket.close(linger=0)
         shared_context.give_back(self._context)
 
-    def _open(self) -> tuple[asyncio.AbstractEventLoop, zmq.Socket[bytes]]:
+    def _open(self) -> tuple[asyncio.AbstractEventLoop, zmq.Socket[bytes], Readiness]:
         if self._closed:
             raise ClientClosed(f"The client of {self._endpoint} is closed.", hint="Make a new client.")
         loop = asyncio.get_running_loop()
-        if self._socket is not None:
+        if self._socket is not None and self._replies is not None:
             if loop is not self._loop:
                 raise URLabError(
                     "This client belongs to another event loop.", hint="Make one client per loop, or use the façade."
                 )
-            return loop, self._socket
+            return loop, self._socket, self._replies
         context = shared_context.borrow()
         socket = context.socket(zmq.DEALER)
         line.configure(socket)
@@ -205,25 +212,24 @@ class ZmqTransport:
         if self._keys is not None:
             self._keys.protect(socket)
         monitor = socket.get_monitor_socket(line.WATCHED)
+        self._attempts = line.Attempts(loop.time())
         try:
-            loop.add_reader(monitor, self._on_event)
-            loop.add_reader(socket, self._on_readable)
-            self._attempts = line.Attempts(loop.time())
             socket.connect(self._endpoint)
-        except (NotImplementedError, zmq.ZMQError) as error:
+        except zmq.ZMQError as error:
             socket.disable_monitor()
             monitor.close(linger=0)
             socket.close(linger=0)
             shared_context.give_back(context)
-            if isinstance(error, NotImplementedError):
-                raise URLabError(
-                    f"{type(loop).__name__} cannot watch sockets.",
-                    hint="Run the client on a selector event loop, or use the blocking client, which brings its own.",
-                ) from error
             raise ValueError(f"{self._endpoint!r} is not an address ZeroMQ can connect to: {error}") from error
         self._loop, self._context, self._socket, self._monitor = loop, context, socket, monitor
+        self._events = watch_socket(loop, monitor, self._on_event)
+        self._replies = watch_socket(loop, socket, self._on_readable, awaited=self._awaited)
         loop.call_soon(self._on_event)
-        return loop, socket
+        return loop, socket, self._replies
+
+    def _awaited(self) -> bool:
+        """Whether a reply is to come, perhaps to a request that has given up."""
+        return self._silent_since is not None or any(not entry.reply.done() for entry in self._sent.values())
 
     async def _wait_connected(self, loop: asyncio.AbstractEventLoop, op: Op, connect_by: float | None) -> None:
         waiter: asyncio.Future[None] = loop.create_future()

@@ -75,9 +75,10 @@ class LoadLevelByName(LoadLevel, tag="load_level", kw_only=True):
 @handles(LoadLevelByName)
 def load_level(server: ServerCore, request: LoadLevelByName) -> LoadLevelOk:
     level = need(request, usable(request.name_or_path, "") or request.name, "level_path")
-    loaded = server.world.load_level(level)
+    server.world.load_level(level)
     server.drawings.clear(in_play=False)
-    return LoadLevelOk(level_path=loaded)
+    # As the plugin: expanded, but otherwise as it was asked for, so an object path stays one.
+    return LoadLevelOk(level_path=level if level.startswith("/") else f"/Game/Levels/{level}")
 
 
 @handles(SaveLevel)

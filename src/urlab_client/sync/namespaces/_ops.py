@@ -168,7 +168,7 @@ class SceneOps(Facade, twin=aio.SceneOps):
             The level has no manager actor yet; `ensure_manager` adds the one that a play session needs.
 
         Args:
-            name: Short name, or a path beginning with `/Game/`.
+            name: Short name, or a package or object path beginning with `/Game/`.
             force_overwrite: Replace an existing level of that name.
             timeout: Seconds to wait; None waits without limit.
 
@@ -182,7 +182,7 @@ class SceneOps(Facade, twin=aio.SceneOps):
         """Open an existing level; unsaved edits of the open one are lost.
 
         Args:
-            name_or_path: Short name, or a path beginning with `/Game/`.
+            name_or_path: Short name, or a package or object path beginning with `/Game/`.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
