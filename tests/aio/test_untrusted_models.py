@@ -72,6 +72,23 @@ async def test_it_reads_no_file_of_this_machine(told: Callable[..., URLabClient]
         assert client.model is None
 
 
+INCLUDING = '<mujoco><include file="sub/part.xml"/></mujoco>'
+ATTACHING = '<mujoco><asset><model name="a" file="part.xml"/></asset></mujoco>'
+
+
+async def test_documents_that_came_with_it_read_none_either(told: Callable[..., URLabClient], tmp_path: Path) -> None:
+    secret = tmp_path / "secret.obj"
+    secret.write_text(MESH)
+    part = f'<mujoco><asset><mesh name="m" file="{secret}"/></asset></mujoco>'
+    async with told(INCLUDING, {"part.xml": part.encode()}) as client:
+        with pytest.raises(ProtocolError, match=r"a file of this machine.*local_model=False"):
+            await client.discover()
+    for disguise in ("", " " * 256, "\v", "\ufeff\ufeff", "A poem. ", '<!-- file=" -->'):
+        for xml in (INCLUDING, ATTACHING):
+            with pytest.raises(ValueError, match=r"secret\.obj, a file of this machine"):
+                compilation._refuse_local_files(xml, {"part.xml": (disguise + part).encode()})
+
+
 async def test_it_may_not_hide_names_in_entities(told: Callable[..., URLabClient]) -> None:
     async with told('<!DOCTYPE mujoco [<!ENTITY f "/etc/passwd">]><mujoco/>') as client:
         with pytest.raises(ProtocolError, match="document type"):

@@ -283,19 +283,32 @@ def test_a_driver_that_kills_its_process_kills_no_server(monkeypatch: pytest.Mon
     assert "ended with code" in str(rendering._probe("egl"))
 
 
-def test_drawing_that_fails_later_leaves_frames_out(
+def fail(*arguments: object) -> None:
+    raise RuntimeError("the driver is gone")
+
+
+def test_a_frame_that_cannot_be_drawn_is_left_out_alone(play: Play, monkeypatch: pytest.MonkeyPatch) -> None:
+    wire = play("drop")
+    for _ in range(rendering.MAX_FAILED):
+        with monkeypatch.context() as patch:
+            patch.setattr(rendering._Stage, "draw", fail)
+            assert "cameras" not in wire.ask("step", include_cameras={"above": "sync"})
+        assert "cameras" in wire.ask("step", include_cameras={"above": "sync"})
+
+
+def test_drawing_that_fails_again_and_again_is_given_up(
     play: Play, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def fail(*arguments: object) -> None:
-        raise RuntimeError("the driver is gone")
-
     wire = play("drop")
-    monkeypatch.setattr(rendering._Stage, "draw", fail)
-    with caplog.at_level(logging.ERROR, logger="urlab_client.server"):
-        assert "cameras" not in wire.ask("step", include_cameras={"above": "sync"})
-        assert "cameras" not in wire.ask("step", include_cameras={"above": "sync"})
+    with monkeypatch.context() as patch, caplog.at_level(logging.ERROR, logger="urlab_client.server"):
+        patch.setattr(rendering._Stage, "draw", fail)
+        for _ in range(rendering.MAX_FAILED + 1):
+            assert "cameras" not in wire.ask("step", include_cameras={"above": "sync"})
     assert caplog.text.count("drawing failed") == 1
+    assert "cameras" not in wire.ask("step", include_cameras={"above": "sync"})
     wire.ask("stop_pie")
+    wire.ask("begin_pie")
+    assert "cameras" in wire.ask("step", include_cameras={"above": "sync"})
 
 
 def test_the_backend_is_looked_for_once() -> None:

@@ -25,6 +25,7 @@ from raw_shm import HEADER, RawRegion, RawShm
 from waiting import eventually
 
 from urlab_client.server import SimulatedServer
+from urlab_client.server.health import Health
 from urlab_client.server.region_files import InstanceDirectory, RegionFile
 from urlab_client.server.shared_memory import MAX_LISTENERS, SharedMemory
 
@@ -361,7 +362,7 @@ def test_a_server_for_which_there_is_no_room_keeps_nothing(base: Path, monkeypat
     monkeypatch.setattr(os, "posix_fallocate", allocate, raising=False)
     before = os.listdir("/dev/fd")
     with pytest.raises(OSError, match="No space left"):
-        SharedMemory(base)
+        SharedMemory(base, Health())
     assert set(os.listdir("/dev/fd")) <= set(before)  # what was garbage before may have been collected meanwhile
     assert list(base.iterdir()) == []
 

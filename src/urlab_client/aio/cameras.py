@@ -80,8 +80,9 @@ class URLabCameraView:
             policy: `latest`, or `all` within the buffer.
             buffer: Pictures that may wait, with `all`.
             buffer_bytes: Bytes that may wait, with `all`.
-            timeout: Seconds that iterating waits for each picture; by default the client's for the first one and then
-                without limit; None waits.
+            timeout: Seconds that iterating waits for each picture; by default the client's for the first one, or 30
+                where that is less and the server is there and in live mode (it may still be looking for OpenGL), and
+                then without limit; None waits.
 
         Raises:
             ValueError: Unknown policy, or an empty buffer.

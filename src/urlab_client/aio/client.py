@@ -166,6 +166,7 @@ class URLabClient:
             lambda: self._transport.endpoint,
             lambda: self._transport.state_port or state_port,
             default_timeout=rcv_timeout_ms / 1000,
+            live=lambda: self._state.mode is StepMode.LIVE,
             keys=keys,
             memory=memory,
         )

@@ -13,12 +13,15 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Final
 
 import msgspec
 
 from urlab_client._children import APART
-from urlab_client._confined import limit_process, named_files
+from urlab_client._confined import limit_process
+from urlab_client._landlock import confine_files
+from urlab_client._mjcf_files import NamedFiles, named_files
 
 __all__ = ["compile_confined"]
 
@@ -95,7 +98,8 @@ def _compile(order: _Order, folder: str) -> bytes:
 
     os.chdir(folder)  # where there is nothing to find, and MuJoCo's log goes with it
     limit_process(order.memory_bytes, order.cpu_s)
-    _refuse_local_files(order.xml)
+    confine_files(readable=(), writable=(Path(folder),))
+    _refuse_local_files(order.xml, order.assets)
     compiled = mujoco.MjModel.from_xml_string(order.xml, dict(order.assets))
     mujoco.mj_forward(compiled, mujoco.MjData(compiled))  # which the client does first, and could go on for ever
     buffer = np.zeros(mujoco.mj_sizeModel(compiled), dtype=np.uint8)
@@ -103,15 +107,33 @@ def _compile(order: _Order, folder: str) -> bytes:
     return buffer.tobytes()
 
 
-def _refuse_local_files(xml: str) -> None:
+def _refuse_local_files(xml: str, assets: Mapping[str, bytes]) -> None:
     """Refuse a model that names what is on this machine: MuJoCo looks there, too."""
-    names, folders = named_files(xml)
-    names |= {name.rpartition("/")[2] for name in names}
-    if len(names) * (len(folders) + 1) > _MAX_COMBINATIONS:
+    named = _named_by_all(xml, assets)
+    names = named.documents | named.data
+    names |= {_last_part(name) for name in names}
+    if len(names) * (len(named.folders) + 1) > _MAX_COMBINATIONS:
         raise ValueError("it names too many files")
-    for path in {os.path.join(folder, name) for folder in ("", *folders) for name in names}:
-        if "\0" not in path and os.path.lexists(path) and not os.path.isdir(path):
+    for path in {os.path.join(folder, name) for folder in ("", *named.folders) for name in names}:
+        if os.path.lexists(path) and not os.path.isdir(path):
             raise ValueError(f"it names {path}, a file of this machine")
+
+
+def _named_by_all(xml: str, assets: Mapping[str, bytes]) -> NamedFiles:
+    """Return what the model names, and what those of its files name that MuJoCo may take for documents."""
+    named = named_files(xml.encode())
+    unread = dict(assets)
+    while found := [name for name in unread if _last_part(name) in set(map(_last_part, named.documents))]:
+        for name in found:
+            try:
+                named |= named_files(unread.pop(name))
+            except ValueError as error:
+                raise ValueError(f"it names {name}; {error}") from None
+    return named
+
+
+def _last_part(name: str) -> str:
+    return name.rpartition("/")[2]
 
 
 if __name__ == "__main__":

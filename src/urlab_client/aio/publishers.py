@@ -56,6 +56,7 @@ class Publishers:
         rpc_endpoint: Tells where requests go: the other ports are on the same host.
         state_port: Tells the port of the state stream.
         default_timeout: Seconds that a stream waits for its first item unless told otherwise; None waits.
+        live: Tells whether the server is in live mode, as far as is known.
         keys: What the publishers demand; None for nothing.
         memory: Where the regions are, for a client that receives from shared memory.
 
@@ -72,6 +73,7 @@ class Publishers:
         state_port: Callable[[], int],
         *,
         default_timeout: float | None,
+        live: Callable[[], bool] = lambda: True,
         keys: ClientKeys | None = None,
         memory: SharedMemory | None = None,
     ) -> None:
@@ -81,6 +83,7 @@ class Publishers:
         self.regions = None if memory is None else Regions(memory, self.subscriptions)
         self._rpc_endpoint = rpc_endpoint
         self._state_port = state_port
+        self._live = live
 
     def state(self, policy: str = StreamPolicy.LATEST) -> StateSource:
         """Return what brings snapshots to a stream of that policy."""
@@ -103,14 +106,14 @@ class Publishers:
     def camera(self, view: HasCamera, policy: str = StreamPolicy.LATEST) -> CameraSource:
         """Return what brings a camera's pictures to a stream of that policy."""
         if self.regions is None or policy == StreamPolicy.ALL:
-            return CameraSource(self.subscriptions, view, self._host)
-        return SharedCameraSource(self.regions, self.subscriptions, view, self._host)
+            return CameraSource(self.subscriptions, view, self._host, self._live)
+        return SharedCameraSource(self.regions, self.subscriptions, view, self._host, self._live)
 
     def shared_frame(self, view: HasCamera) -> SharedFrame | None:
         """Return a camera's newest picture in shared memory, None where there is none. From any thread."""
         if self.regions is None:
             return None
-        found = self.regions.view(SharedCameraSource(self.regions, self.subscriptions, view, self._host))
+        found = self.regions.view(SharedCameraSource(self.regions, self.subscriptions, view, self._host, self._live))
         width, height = view.info.resolution
         if found is None or len(found[0].payload) < width * height * 4:
             return None

@@ -57,6 +57,9 @@ __all__ = [
     "StateSource",
 ]
 
+FIRST_PICTURE_S = 30.0
+"""How long a server may take for its first picture: it looks for OpenGL before."""
+
 _OF_COMPONENT = frozenset({TopicKind.JOINT, TopicKind.BASE_STATE, TopicKind.SENSOR})
 _OF_ARTICULATION = _OF_COMPONENT | {TopicKind.TWIST, TopicKind.ACTIONS}
 _OF_SCENE = frozenset({TopicKind.XPOS, TopicKind.XQUAT, TopicKind.QPOS, TopicKind.QVEL})
@@ -106,6 +109,10 @@ class _SocketSource(ABC):
     def wants(self, topic: bytes, payload: BytesLike) -> bool:
         """Return whether a message is anything to the reader at all."""
         return True
+
+    def first_after(self, sink: Sink) -> float:
+        """Return 0: what is published comes at once."""
+        return 0.0
 
     def silence(self, sink: Sink, seconds: float) -> tuple[str, str]:
         """Return why nothing came for so long, and what to do about it."""
@@ -261,6 +268,7 @@ class CameraSource(_SocketSource):
         subscriptions: The client's.
         view: The camera.
         host: Tells under which name or address the server was reached.
+        live: Tells whether the server is in live mode, as far as is known.
     """
 
     name = "frames"
@@ -270,13 +278,26 @@ class CameraSource(_SocketSource):
     )
     silent = (
         "Pictures are published in live mode only, and while the camera is switched on in the editor; in the other "
-        "modes ask for them with client.step(include_cameras=…)."
+        "modes ask for them with client.step(include_cameras=…). A server that cannot draw publishes none; before its "
+        "first picture it looks for OpenGL, which takes seconds, and its log says what it found."
     )
 
-    def __init__(self, subscriptions: Subscriptions, view: HasCamera, host: Callable[[], str]) -> None:
+    def __init__(
+        self,
+        subscriptions: Subscriptions,
+        view: HasCamera,
+        host: Callable[[], str],
+        live: Callable[[], bool] = lambda: True,
+    ) -> None:
         super().__init__(subscriptions)
         self.view = view
         self._host = host
+        self._live = live
+
+    def first_after(self, sink: Sink) -> float:
+        """Return how long a server may take until it can draw, where it is there and in live mode; else 0."""
+        line = self._subscriptions.line(sink)
+        return FIRST_PICTURE_S if line is not None and line.connected and self._live() else 0.0
 
     def subscription(self) -> Subscription:
         """See the base class."""
@@ -361,14 +382,24 @@ class SharedCameraSource(_Shared, CameraSource):
         subscriptions: The client's.
         view: The camera.
         host: Tells under which name or address the server was reached.
+        live: Tells whether the server is in live mode, as far as is known.
     """
 
     def __init__(
-        self, regions: Regions, subscriptions: Subscriptions, view: HasCamera, host: Callable[[], str]
+        self,
+        regions: Regions,
+        subscriptions: Subscriptions,
+        view: HasCamera,
+        host: Callable[[], str],
+        live: Callable[[], bool] = lambda: True,
     ) -> None:
-        super().__init__(subscriptions, view, host)
+        super().__init__(subscriptions, view, host, live)
         self.regions = regions
         self._taken: SharedPicture | None = None
+
+    def first_after(self, sink: Sink) -> float:
+        """See the base class; regions get pictures in every mode."""
+        return super().first_after(sink) if self.regions.path(sink) is None else FIRST_PICTURE_S
 
     def place(self) -> Place:
         """See the base class."""
@@ -465,6 +496,10 @@ class EventBus:
     def decode(self, topic: bytes, payload: BytesLike) -> ClientEvent:
         """Read an event."""
         return _EVENTS.decode(payload)
+
+    def first_after(self, sink: Sink) -> float:
+        """Return 0."""
+        return 0.0
 
     def silence(self, sink: Sink, seconds: float) -> tuple[str, str]:
         """Return that nothing happened."""

@@ -59,6 +59,10 @@ class _Source(Protocol[T_co]):
         """Make an item of a message. Raises `ProtocolError`."""
         ...
 
+    def first_after(self, sink: Sink) -> float:
+        """Return how many seconds the first item may be in coming; 0 where nothing says that it takes long."""
+        ...
+
     def silence(self, sink: Sink, seconds: float) -> tuple[str, str]:
         """Return why nothing came for so long, and what to do about it."""
         ...
@@ -142,10 +146,7 @@ class _Channel(Sink, Generic[T]):
 
     async def next(self) -> T:
         """Return the next item, within the stream's own limit."""
-        limit = self._timeout
-        if limit is DEFAULT:
-            limit = None if self._delivered else self._default_timeout
-        return await self.receive(limit)
+        return await self.receive(None if self._timeout is DEFAULT and self._delivered else self._timeout)
 
     async def receive(self, timeout: Timeout) -> T:
         """Return the next item within `timeout` seconds."""
@@ -278,6 +279,12 @@ class _Channel(Sink, Generic[T]):
                 if item is not None:
                     return item
                 if self._expired and seconds is not None:
+                    more = self._source.first_after(self) - seconds
+                    if timeout is DEFAULT and self._arrived is None and more > 0.0:
+                        self._expired = False
+                        seconds += more
+                        timer = loop.call_later(more, self._expire)
+                        continue
                     problem, advice = self._source.silence(self, seconds)
                     raise URLabTimeoutError(f"{self._source.name}: {problem}", hint=advice)
         finally:
@@ -383,7 +390,8 @@ class Stream(Generic[T]):
         """Return the next item.
 
         Args:
-            timeout: Seconds to wait; None waits without limit.
+            timeout: Seconds to wait; None waits without limit. By default the client's `rcv_timeout_ms`, or 30 s where
+                that is less and a server in live mode may still be preparing its first picture.
 
         Raises:
             URLabTimeoutError: Nothing came in time; says at which stage, and what to look at.

@@ -85,7 +85,7 @@ def add_parser(commands: Commands) -> None:
         "serve",
         help="run a simulated server",
         description="Run a simulated server that any URLab client can talk to. It ends with exit code 0 on SIGINT "
-        "(Ctrl-C) and SIGTERM.",
+        "(Ctrl-C) and SIGTERM, and with 2 when it fails.",
     )
     parser.add_argument(
         "models",
@@ -212,7 +212,7 @@ def run(arguments: ServeArguments) -> int:
     """Serve until told to stop.
 
     Raises:
-        CommandError: An option cannot be honoured, or a model cannot be used.
+        CommandError: An option cannot be honoured, a model cannot be used, or a thread of the server died.
         OSError: A port is in use, or a folder cannot be used.
     """
     _check_ports(arguments)
@@ -235,9 +235,12 @@ def run(arguments: ServeArguments) -> int:
             if starter.error is not None:
                 raise starter.error
             with server:
+                server.add_failure_callback(lambda _: events.put(_Event.FAILED))
                 _announce(server, arguments)
-                while _next(events) is not _Event.STOP:
+                while (event := _next(events)) is _Event.STARTED:
                     pass
+                if event is _Event.FAILED:
+                    raise CommandError(str(server.failure))
             return 0
         starter.join(_PATIENCE_S)
         stuck = starter.is_alive()
@@ -254,6 +257,7 @@ class _Event(Enum):
 
     STARTED = "started"
     STOP = "stop"
+    FAILED = "failed"
 
 
 _Events: TypeAlias = "queue.SimpleQueue[_Event]"  # unlike a threading.Event, it may be used in signal handlers

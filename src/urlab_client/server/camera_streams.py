@@ -20,6 +20,7 @@ from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.rows import camera_filter
 from urlab_client.server.endpoint import PortInUse, bind_tcp, bound_peers, tcp
 from urlab_client.server.guard import Door, Guard
+from urlab_client.server.health import Health
 from urlab_client.server.patience import ended
 from urlab_client.server.play import Running
 from urlab_client.server.refusal import Refusal
@@ -80,14 +81,23 @@ class CameraStreams:
     """Publishes the cameras of the play session. The first port is held for as long as the server is open.
 
     Attributes:
-        filter: What becomes of an image, from its topic and pixels: its pixels, or None for nothing. Set it before
-            `start`; called on the thread that sends.
+        filter: What becomes of an image to subscribers, from its topic and pixels: its pixels, or None for nothing.
+            Set it before `start`; called on the thread that sends.
     """
 
-    def __init__(self, *, host: str, port: int, door: Door | None = None, memory: SharedMemory | None = None) -> None:
+    def __init__(
+        self,
+        *,
+        health: Health,
+        host: str,
+        port: int,
+        door: Door | None = None,
+        memory: SharedMemory | None = None,
+    ) -> None:
         """Bind the first port.
 
         Args:
+            health: Told when images cannot be published any more.
             host: Address of the interface.
             port: Port of the first camera; the others get the free ones after it. 0 picks any.
             door: Who may connect; None for anybody who reaches the interface.
@@ -101,7 +111,9 @@ class CameraStreams:
         self._host = host
         self._memory = memory
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._guard = Guard(self._context, door)
+        self._guard = Guard(self._context, door, health)
+        self._health = health
+        self._failed = 0
         self._lock = threading.Lock()
         self._stopping = threading.Event()
         self._running: Running | None = None
@@ -178,14 +190,20 @@ class CameraStreams:
 
     def _run(self) -> None:
         pause = 0.0
-        while not self._stopping.wait(pause):
-            began = time.monotonic()
-            try:
-                self._publish()
-            except Exception:
-                logger.exception("camera images are not published any more")
-                return
-            pause = max(0.0, began + PERIOD_S - time.monotonic())
+        with self._health.watch():
+            while not self._stopping.wait(pause):
+                began = time.monotonic()
+                try:
+                    self._publish()
+                except Exception as error:  # noqa: BLE001 - the next images may do better
+                    self._skip("the camera images of a moment are not published", error)
+                pause = max(0.0, began + PERIOD_S - time.monotonic())
+
+    def _skip(self, what: str, error: Exception) -> None:
+        """Log what went wrong, unless the sockets were closed because the server closes."""
+        self._failed += 1
+        if not self._stopping.is_set() and self._failed & (self._failed - 1) == 0:  # what fails once often fails again
+            logger.error("%s (%d so far)", what, self._failed, exc_info=error)
 
     def _publish(self) -> None:
         with self._lock:
@@ -204,18 +222,25 @@ class CameraStreams:
                 exposure = running.cameras.capture(shots)
         except Refusal:  # physics is busy; the next time, then
             return
+        frames = running.cameras.frames(shots, exposure) or {}
+        if self._memory is not None:
+            with self._lock:
+                for key, frame in frames.items() if self._running is running else ():
+                    self._memory.publish_picture(key, frame.data)
         images: dict[str, bytes] = {}
-        for key, frame in (running.cameras.frames(shots, exposure) or {}).items():
-            topic = camera_filter(key.replace("/", "/camera/", 1))
-            image = frame.data if self.filter is None else self.filter(topic, frame.data)
+        for key in filter(frames.__contains__, topics):
+            try:
+                image = self._filtered(topics[key], frames[key].data)
+            except Exception as error:  # noqa: BLE001 - the other cameras are none the worse
+                self._skip(f"an image of '{key}' is not published", error)
+                continue
             if image is not None:
                 images[key] = image
         with self._lock:
-            if self._running is not running:
-                return
-            if self._memory is not None:
-                for key, image in images.items():
-                    self._memory.publish_picture(key, image)
-            for stream in self._streams:
-                if stream.key in topics and stream.key in images:
-                    stream.socket.send_multipart([stream.topic, images[stream.key]], zmq.DONTWAIT)
+            if self._running is running:
+                for stream in self._streams:
+                    if stream.key in images:
+                        stream.socket.send_multipart([stream.topic, images[stream.key]], zmq.DONTWAIT)
+
+    def _filtered(self, topic: bytes, image: bytes) -> bytes | None:
+        return image if self.filter is None else self.filter(topic, image)

@@ -22,6 +22,7 @@ from urlab_client.protocol.messages.session import ErrorReply, Hello, Step
 from urlab_client.server.actors import Actor
 from urlab_client.server.controllers import ControllerConfig
 from urlab_client.server.engine import Engine
+from urlab_client.server.health import Health
 from urlab_client.server.heap import give_back
 from urlab_client.server.limits import Limits
 from urlab_client.server.markers import Drawings
@@ -91,6 +92,7 @@ class ServerCore:
         play: The play session.
         viewport: The viewport's camera.
         drawings: Debug drawing.
+        health: Whether the server's threads run.
         compiled: What the last play session was started with.
     """
 
@@ -103,6 +105,7 @@ class ServerCore:
     play: Play = field(default_factory=Play)
     viewport: Viewport = field(default_factory=Viewport)
     drawings: Drawings = field(init=False)
+    health: Health = field(default_factory=Health)
     compiled: _Compiled | None = None
 
     def refuse(self, code: str, message: str) -> bytes:
@@ -174,7 +177,13 @@ class ServerCore:
         controllers = {index.key: config for index in scene.articulations if (config := physics.controller(index))}
         for problem in strangers(scene, physics):
             logger.warning("%s", problem)
-        engine = Engine(scene, pinned_mode=physics.step_mode, paused=not physics.unpaused, controllers=controllers)
+        engine = Engine(
+            scene,
+            pinned_mode=physics.step_mode,
+            paused=not physics.unpaused,
+            controllers=controllers,
+            health=self.health,
+        )
         modes = {
             (index.key, camera.name): physics.camera_mode(index, camera.name)
             for index in scene.articulations
@@ -201,7 +210,8 @@ class ServerCore:
     def _studio(
         self, scene: Scene, actors: Sequence[Actor], modes: Mapping[tuple[str, str], CameraMode]
     ) -> CameraStudio:
-        return CameraStudio(scene, modes, {actor.name: _kind(actor) for actor in actors}, self.physics.render_quality)
+        classes = {actor.name: _kind(actor) for actor in actors}
+        return CameraStudio(scene, modes, classes, self.physics.render_quality, self.health)
 
     def stop_play(self) -> None:
         """End play, if it runs."""

@@ -137,6 +137,8 @@ class Dispatcher:
 
     def _serve(self, incoming: Incoming, transport: Transport, max_reply_bytes: int | None) -> Reply | bytes:
         op, name = incoming.op, incoming.name
+        if self._core.health.failure is not None:
+            raise Refusal("internal_error", f"{self._core.health.failure}; start the server again")
         if transport is Transport.SHM and op is not None and op.needs is Needs.EDITOR:
             raise Refusal("wrong_transport", f"op '{name}' is not served over shared memory: send it over ZMQ")
         if name is None:

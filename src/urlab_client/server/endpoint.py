@@ -17,6 +17,7 @@ from typing import ClassVar, Final
 import zmq
 
 from urlab_client.server.guard import Door, Guard
+from urlab_client.server.health import Health
 from urlab_client.server.limits import Limits
 from urlab_client.server.patience import ended
 
@@ -154,6 +155,8 @@ class RpcEndpoint:
         self,
         answer: Callable[[bytes], bytes],
         *,
+        refuse: Callable[[str, str], bytes],
+        health: Health,
         host: str = "127.0.0.1",
         port: int = 0,
         door: Door | None = None,
@@ -163,6 +166,8 @@ class RpcEndpoint:
 
         Args:
             answer: Turns the frame of a request into the frame of its reply; must not raise.
+            refuse: Makes the frame of an error from its code and message, for when it raises all the same.
+            health: Told when requests cannot be served any more.
             host: IP address of the interface.
             port: TCP port; 0 picks a free one.
             door: Who may connect; None for anybody who reaches the interface.
@@ -173,9 +178,11 @@ class RpcEndpoint:
             OSError: The address is not one of this machine.
         """
         self._answer = answer
+        self._refuse = refuse
+        self._health = health
         self._context = zmq.Context()
         self._context.linger = LINGER_MS
-        self._guard = Guard(self._context, door)
+        self._guard = Guard(self._context, door, health)
         self._socket = self._context.socket(self.kind)
         self._guard.protect(self._socket)
         bound_peers(self._socket)
@@ -227,12 +234,28 @@ class RpcEndpoint:
 
     def _run(self) -> None:
         try:
-            while self._exchange():
+            while self._serve():
                 pass
-        except zmq.ZMQError:
-            logger.exception("the request socket failed; the server answers no longer")
+        except zmq.ZMQError as error:
+            self._health.report(error)
         finally:
             self._close()
+
+    def _serve(self) -> bool:
+        """Answer one request, with the reason where that fails; return False when it is time to end."""
+        try:
+            return self._exchange()
+        except zmq.ZMQError:
+            raise
+        except BaseException as error:  # noqa: BLE001 - clients wait; from now on the answer says what happened
+            reason = self._health.report(error)
+            with contextlib.suppress(zmq.ZMQError):  # nobody has asked
+                self._send_owed(self._refuse("internal_error", reason))
+            return True
+
+    def _send_owed(self, reply: bytes) -> None:
+        """Answer the request that was received last, if it is unanswered."""
+        self._socket.send(reply, zmq.NOBLOCK)
 
     def _exchange(self) -> bool:
         """Answer one request; return False when it is time to end."""

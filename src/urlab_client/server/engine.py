@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.messages.session import ArticulationCommand, Step
 from urlab_client.server.controllers import ArticulationControl, ControllerConfig, ControlSource, Twist, float32
+from urlab_client.server.health import Health
 from urlab_client.server.patience import ended, within
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.replay import Player
@@ -116,6 +117,7 @@ class Engine:
         paused: bool = True,
         controllers: Mapping[str, ControllerConfig] = MappingProxyType({}),
         step_timeout_s: float = 5.0,
+        health: Health | None = None,
     ) -> None:
         """Prepare a scene for stepping; `start` sets it going.
 
@@ -125,6 +127,7 @@ class Engine:
             paused: Whether physics starts paused.
             controllers: Controller to attach by articulation key; `*` stands for all keys not listed.
             step_timeout_s: Seconds a direct step may take before its caller is told `step_timeout`.
+            health: Told when the physics thread dies.
         """
         self.scene = scene
         self.lock = DataLock(step_timeout_s)
@@ -152,6 +155,8 @@ class Engine:
         self._speed = 100.0
         self._step_count = 0
         self._fault: str | None = None
+        self._death: str | None = None
+        self._health = Health() if health is None else health
         self._player: Player | None = None
         self._step_timeout_s = step_timeout_s
         self._inline_budget_s = INLINE_SHARE * step_timeout_s
@@ -316,6 +321,8 @@ class Engine:
             mode = self._mode
             if self._stopping:
                 raise _shutting_down()
+            if self._death is not None:
+                raise Refusal("internal_error", self._death)
             if mode is StepMode.PUPPET:
                 self._push(request)
                 return observe(mode)
@@ -637,12 +644,16 @@ class Engine:
 
     def _run(self) -> None:
         with self.lock.inner:
-            while not self._stopping:
-                try:
-                    self._iterate()
-                except Exception as error:  # noqa: BLE001 - the thread must outlive any error of a step
-                    self._fail(error)
-            self._drop_queue(_shutting_down())
+            try:
+                while not self._stopping:
+                    try:
+                        self._iterate()
+                    except Exception as error:  # noqa: BLE001 - the thread must outlive any error of a step
+                        self._fail(error)
+                self._drop_queue(_shutting_down())
+            except BaseException as error:  # noqa: BLE001 - who waits for a step must not wait for ever
+                self._death = self._health.report(error)
+                self._drop_queue(Refusal("internal_error", self._death))
 
     def _iterate(self) -> None:
         if self._mode in (StepMode.LIVE, StepMode.AUTO):

@@ -6,6 +6,7 @@ the peer is read.
 
 from __future__ import annotations
 
+import contextlib
 import ipaddress
 import logging
 import os
@@ -19,6 +20,7 @@ import zmq.utils.z85
 
 from urlab_client.keys import KeyFileError, KeyPair, public_keys, read_pair
 from urlab_client.protocol.errors import URLabError
+from urlab_client.server.health import Health
 
 __all__ = ["CurveServer", "Door", "Guard", "UnprotectedServer", "is_loopback"]
 
@@ -94,7 +96,7 @@ class Door:
 class Guard:
     """Guards the sockets of one ZeroMQ context. Without a door it has nothing to do, and no thread."""
 
-    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], door: Door | None) -> None:
+    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], door: Door | None, health: Health) -> None:
         self._door = door
         self._thread: threading.Thread | None = None
         if door is None:
@@ -107,7 +109,8 @@ class Guard:
         self._stopper = context.socket(zmq.PAIR)
         self._stopper.linger = 0
         self._stopper.connect(_STOP)
-        self._thread = threading.Thread(target=_answer, args=(door, questions, stop), name="urlab-auth", daemon=True)
+        arguments = (door, questions, stop, health)
+        self._thread = threading.Thread(target=_answer, args=arguments, name="urlab-auth", daemon=True)
         self._thread.start()
 
     def protect(self, socket: zmq.Socket[bytes]) -> None:
@@ -119,18 +122,19 @@ class Guard:
         """End the thread and its sockets, before the context is terminated. Idempotent."""
         thread, self._thread = self._thread, None
         if thread is not None:
-            self._stopper.send(b"")
+            with contextlib.suppress(zmq.ZMQError):  # it died
+                self._stopper.send(b"", zmq.NOBLOCK)
             thread.join()
             self._stopper.close()
 
 
-def _answer(door: Door, questions: zmq.Socket[bytes], stop: zmq.Socket[bytes]) -> None:
+def _answer(door: Door, questions: zmq.Socket[bytes], stop: zmq.Socket[bytes], health: Health) -> None:
     """Answer ZAP requests (ZeroMQ RFC 27) until told to stop."""
     poller = zmq.Poller()
     poller.register(questions, zmq.POLLIN)
     poller.register(stop, zmq.POLLIN)
     refused = 0
-    try:
+    with health.watch(), questions, stop:
         while stop not in dict(poller.poll()):
             version, number, _, address, _, mechanism, *credentials = questions.recv_multipart()
             welcome = (
@@ -141,9 +145,6 @@ def _answer(door: Door, questions: zmq.Socket[bytes], stop: zmq.Socket[bytes]) -
             refused += not welcome
             if not welcome and refused & (refused - 1) == 0:  # whoever is refused tries again
                 logger.warning("a client at %s was refused: unknown key (%d so far)", address.decode(), refused)
-    finally:
-        questions.close()
-        stop.close()
 
 
 def is_loopback(address: str) -> bool:

@@ -205,15 +205,20 @@ class Play:
             running = build()
         except CompileFailed as failure:
             error = failure.message
-        except Exception as failure:
-            logger.exception("play could not be started")
-            error = f"the server failed with {type(failure).__name__}: {failure}; its log has the details"
+        except BaseException as failure:  # noqa: BLE001 - who waits for the start must not wait for ever
+            error = _unexpected(failure)
         with self._changed:
             if not attempt.abandoned:
-                attempt.running = running
-                attempt.error = None if running is not None else error
-                self._announce(running)
-                running = None
+                if running is not None:
+                    try:
+                        self._announce(running)
+                    except Exception as failure:  # noqa: BLE001 - likewise
+                        error = _unexpected(failure)
+                        self._announce(None)
+                    else:
+                        attempt.running, running = running, None
+                if attempt.running is None:
+                    attempt.error = error
             self._changed.notify_all()
         if running is not None:
             running.close()
@@ -221,3 +226,9 @@ class Play:
     def _announce(self, running: Running | None) -> None:
         for listener in self.listeners:
             listener(running)
+
+
+def _unexpected(failure: BaseException) -> str:
+    """Log why play could not be started, and return how that reads."""
+    logger.error("play could not be started", exc_info=failure)
+    return f"the server failed with {type(failure).__name__}: {failure}; its log has the details"

@@ -46,6 +46,7 @@ from urlab_client.protocol.rows import (
 from urlab_client.server.controllers import ArticulationControl, Twist
 from urlab_client.server.endpoint import bind_tcp, bound_peers
 from urlab_client.server.guard import Door, Guard
+from urlab_client.server.health import Health
 from urlab_client.server.observe import Observer, sim_clock, wall_clock
 from urlab_client.server.patience import ended
 from urlab_client.server.play import Running
@@ -137,7 +138,12 @@ class _Row:
 
 
 class _Broadcast:
-    """One play session on the air: takes ticks from its physics and makes messages of them."""
+    """One play session on the air: takes ticks from its physics and makes messages of them.
+
+    Attributes:
+        running: The simulation.
+        full_wanted: Whether the snapshot is subscribed to.
+    """
 
     def __init__(
         self,
@@ -168,7 +174,7 @@ class _Broadcast:
         self._rows = list(_rows(scene, self._mirror, mirrored.values()))
         self._actuators = _Actuators(scene.model, self._controls)
         self._wanted_rows: list[_Row] = []
-        self._full_wanted = False
+        self.full_wanted = False
         self._info_wanted = False
         self._live_ticks = 0
         self._info_due = next_info(0)
@@ -179,10 +185,10 @@ class _Broadcast:
         """Take over what is subscribed to on the two sockets; listen to physics only if that is anything."""
         prefixes = tuple(state)
         self._wanted_rows = [row for row in self._rows if row.topic.startswith(prefixes)] if prefixes else []
-        self._full_wanted = STATE_FULL.startswith(prefixes) if prefixes else False
+        self.full_wanted = STATE_FULL.startswith(prefixes) if prefixes else False
         self._info_wanted = any(True for _ in info)
         hooks = self._engine.on_tick
-        if not (self._wanted_rows or self._full_wanted or self._info_wanted or self._memory is not None):
+        if not (self._wanted_rows or self.full_wanted or self._info_wanted or self._memory is not None):
             self.leave()
         elif self._capture not in hooks:
             hooks.append(self._capture)
@@ -274,7 +280,7 @@ class _Broadcast:
         engine = self._engine
         live = engine.mode in _LIVE
         self._live_ticks += live
-        full = self._full_wanted or (self._memory is not None and self._memory.wants_state())
+        full = self.full_wanted or (self._memory is not None and self._memory.wants_state())
         shown = full or (live and bool(self._wanted_rows))
         if not shown and not (live and self._info_wanted and self._live_ticks >= self._info_due):
             return
@@ -440,8 +446,8 @@ class StreamServer:
         state_port: Port of the state stream.
         ctrl_port: Port of streamed controls and gains.
         info_port: Port of the info stream.
-        filter: What becomes of a message, from its topic and payload: its payload, or None for nothing. Set it before
-            `start`; called on the thread that sends.
+        filter: What becomes of a message to subscribers, from its topic and payload: its payload, or None for nothing.
+            Set it before `start`; called on the thread that sends.
     """
 
     state_port: int
@@ -452,6 +458,7 @@ class StreamServer:
         self,
         cameras: Callable[[Scene], Iterable[CameraEndpoint]],
         *,
+        health: Health,
         host: str = "127.0.0.1",
         state_port: int = 0,
         ctrl_port: int = 0,
@@ -463,6 +470,7 @@ class StreamServer:
 
         Args:
             cameras: Where the cameras of a scene publish, for the info stream.
+            health: Told when nothing can be streamed any more.
             host: IP address of the interface.
             state_port: TCP port; 0 picks a free one, here and below.
             ctrl_port: TCP port.
@@ -479,7 +487,9 @@ class StreamServer:
         self._memory = memory
         self._context = zmq.Context()
         self._context.linger = 0
-        self._guard = Guard(self._context, door)
+        self._guard = Guard(self._context, door, health)
+        self._health = health
+        self._failed = 0
         # XPUB is PUB that tells what is subscribed to.
         self._state = self._context.socket(zmq.XPUB)
         self._info = self._context.socket(zmq.XPUB)
@@ -575,14 +585,25 @@ class StreamServer:
                     self._awake = False  # before looking, so that what comes later rouses again
                 try:
                     self._turn(ready)
-                except Exception:
-                    logger.exception("the streams failed and are silent until the next play session")
-                    self._leave()
-        except zmq.ZMQError:
-            logger.exception("the stream sockets failed; the server streams no longer")
+                except zmq.ZMQError:
+                    raise
+                except Exception as error:
+                    if self._broadcast is None and self._shown is not None:
+                        raise  # a play session that cannot be streamed: subscribers would wait for nothing
+                    self._skip(error)
+        except BaseException as error:  # noqa: BLE001 - subscribers hear of it by the next request
+            self._health.report(error)
         finally:
             self._leave()
             self._close()
+
+    def _skip(self, error: Exception) -> None:
+        """Go on without the ticks and commands that were under way, and log what went wrong."""
+        self._ticks.clear()
+        self._commands.clear()
+        self._failed += 1
+        if self._failed & (self._failed - 1) == 0:  # what fails once often fails again
+            logger.error("messages were not streamed (%d times so far)", self._failed, exc_info=error)
 
     def _turn(self, ready: dict[Any, int]) -> None:
         changed = [self._read_subscriptions(socket) for socket in self._subscribed if socket in ready]
@@ -640,10 +661,13 @@ class StreamServer:
             if broadcast is not self._broadcast:
                 continue
             for topic, payload in broadcast.state_messages(tick):
+                if topic == STATE_FULL:
+                    if self._memory is not None:
+                        self._memory.publish_state(payload)
+                    if not broadcast.full_wanted:
+                        continue
                 sent = payload if self.filter is None else self.filter(topic, payload)
                 if sent is not None:
-                    if self._memory is not None and topic == STATE_FULL:
-                        self._memory.publish_state(sent)
                     self._state.send(topic, zmq.SNDMORE | zmq.NOBLOCK)
                     self._state.send(sent, zmq.NOBLOCK)
             for frame in broadcast.info_messages(tick, self._cameras):

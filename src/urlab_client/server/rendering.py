@@ -40,6 +40,7 @@ from urlab_client._children import APART
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import CameraChoice, CameraFrame
+from urlab_client.server.health import Health
 from urlab_client.server.patience import ended
 from urlab_client.server.picture import (
     Picture,
@@ -87,6 +88,9 @@ LATEST_S: Final = 1.0 / 30.0
 
 FRAMES_DEADLINE_S: Final = 30.0
 """Longest wait for the frames of a step; the first ones include the search for OpenGL."""
+
+MAX_FAILED: Final = 3
+"""After so many failures in a row drawing is given up until the next play session."""
 
 _PROBE_DEADLINE_S: Final = 60.0
 
@@ -300,6 +304,7 @@ class CameraStudio:
         modes: Mapping[tuple[str, str], CameraMode],
         classes: Mapping[str, str],
         quality: RenderQuality = "auto",
+        health: Health | None = None,
     ) -> None:
         """Prepare for a scene; nothing is drawn, and no OpenGL looked for, before a frame is wanted.
 
@@ -308,8 +313,10 @@ class CameraStudio:
             modes: What the pixels mean by articulation key and camera name; the others are `real`.
             classes: By actor name, the class or mesh that the colours of `semantic` and `instance` go by.
             quality: How well to draw.
+            health: Told when the thread that draws dies.
         """
         self._scene = scene
+        self._health = Health() if health is None else health
         self._quality: RenderQuality = quality
         self._tints = _Tints(scene, classes)
         self._by_name: dict[str, _Camera] = {}
@@ -470,26 +477,41 @@ class CameraStudio:
                     self._draw(stage)
         except Exception:
             logger.exception("camera images are left out from now on: drawing failed")
+        except BaseException as error:  # noqa: BLE001 - who asks for images hears of it by the next request
+            self._health.report(error)
         finally:
             with self._lock:
                 self._broken = True
                 self._release()
 
     def _draw(self, stage: _Stage) -> None:
+        failed = 0
         while (job := self._queue.get()) is not None:
-            stage.prepare(job.data)
-            if isinstance(job, Painting):
-                job.pixels = stage.paint(job.data, job.picture)
-            else:
-                for camera in job.cameras:
-                    if self._closed:
-                        return
-                    camera.frame = stage.draw(job.data, camera.info, camera.mode)
-                    camera.drawn_at = job.taken_at
+            try:
+                stage.prepare(job.data)
+                self._draw_job(stage, job)
+                failed = 0
+            except Exception:
+                failed += 1
+                if failed == MAX_FAILED:
+                    raise
+                logger.exception("an image is left out: it could not be drawn")
+            if self._closed:
+                return
             self._spare.append(job.data)
             with self._lock:
                 self._pending.discard(job)
             job.done.set()
+
+    def _draw_job(self, stage: _Stage, job: Exposure | Painting) -> None:
+        if isinstance(job, Painting):
+            job.pixels = stage.paint(job.data, job.picture)
+            return
+        for camera in job.cameras:
+            if self._closed:
+                return
+            camera.frame = stage.draw(job.data, camera.info, camera.mode)
+            camera.drawn_at = job.taken_at
 
 
 class _Stage:

@@ -25,6 +25,7 @@ import msgspec
 
 from urlab_client._children import APART
 from urlab_client._confined import limit_process
+from urlab_client._landlock import confine_files
 from urlab_client.server.confinement import Outside, check_references
 from urlab_client.server.content import Compiled, build_snapshot, one_line
 from urlab_client.server.limits import Limits
@@ -164,6 +165,7 @@ def _fork(order: _Order) -> _Outcome:
         os.close(reading)
         try:
             limit_process(order.limits.model_memory_bytes, order.limits.model_cpu_s)
+            confine_files(map(Path, order.roots), (Path(order.snapshot).parent,))
             with os.fdopen(writing, "wb") as stream:
                 stream.write(msgspec.json.encode(_work(order)))
         finally:
@@ -204,7 +206,9 @@ def _work(order: _Order) -> _Outcome:
     limits = order.limits
     try:
         check_references(Path(order.file), tuple(map(Path, order.roots)), limits)
-        compiled = build_snapshot(Path(order.file), Path(order.snapshot))
+        snapshot = Path(order.snapshot)
+        compiled = build_snapshot(Path(order.file), snapshot)
+        check_references(snapshot / "model.xml", (snapshot,), limits)  # the server reads it with nothing in its way
     except (Outside, Refusal) as refusal:
         return _Outcome(refused=refusal.message)
     except MemoryError:

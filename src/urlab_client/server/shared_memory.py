@@ -30,6 +30,7 @@ from urlab_client.protocol.shm import (
     camera_stride,
     state_stride,
 )
+from urlab_client.server.health import Health
 from urlab_client.server.patience import ended
 from urlab_client.server.region_files import InstanceDirectory, RegionFile, RequestFile
 
@@ -82,15 +83,17 @@ class SharedMemory:
         directory: Where the regions are, absolute.
     """
 
-    def __init__(self, base: Path) -> None:
+    def __init__(self, base: Path, health: Health) -> None:
         """Lay out the regions of requests and replies; `start` begins to serve.
 
         Args:
             base: Directory below which this server makes one of its own.
+            health: Told when requests cannot be served any more.
 
         Raises:
             OSError: There is no room, or the base cannot be used.
         """
+        self._health = health
         with contextlib.ExitStack() as made:
             self._instance = InstanceDirectory(base)
             made.callback(self._instance.remove)
@@ -242,13 +245,19 @@ class SharedMemory:
                 self._served_at = time.monotonic()
         except (OSError, ValueError):
             logger.exception("shared memory failed; the server answers over ZMQ alone")
-            self._stopping = True
-            self._release()  # so that clients see it, too
+            self._give_up()
+        except BaseException as error:  # noqa: BLE001 - clients over ZMQ hear of it by the next request
+            self._health.report(error)
+            self._give_up()
         finally:
             with self._lock:
                 given_up = self._given_up
             if given_up:  # nobody waits for this thread any more
                 self._release()
+
+    def _give_up(self) -> None:
+        self._stopping = True
+        self._release()  # so that clients see it, too
 
     def _follows(self, seen: int) -> bool:
         """Look for a while without sleep; return whether a request came."""

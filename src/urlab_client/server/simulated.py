@@ -9,7 +9,7 @@ import threading
 import time
 import warnings
 import weakref
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,6 +21,7 @@ import anyio.to_thread
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client._landlock import is_available
 from urlab_client.protocol.enums import CameraMode, PIEState, StepMode, Transport
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.rows import CameraEndpoint
@@ -34,6 +35,7 @@ from urlab_client.server.endpoint import RpcEndpoint, connect_host, numeric_host
 from urlab_client.server.faults import Faults, FaultyEndpoint, Injector
 from urlab_client.server.guard import CurveServer, Door, UnprotectedServer, is_loopback
 from urlab_client.server.handlers import HANDLERS
+from urlab_client.server.health import Health
 from urlab_client.server.limits import Limits
 from urlab_client.server.markers import Drawings
 from urlab_client.server.publishing import StreamServer
@@ -222,6 +224,8 @@ class SimulatedServer:
     def __repr__(self) -> str:
         opened = self._opened
         where = "closed" if opened is None else f"{self.address}:{opened.endpoint.port}"
+        if self.failure is not None:
+            where += f", failed: {self.failure}"
         return f"<{type(self).__name__} {' '.join(self._config.models) or 'empty'} at {where}>"
 
     # Life
@@ -261,8 +265,8 @@ class SimulatedServer:
 
         The session is ended, play starts afresh from the level's initial state or is stopped, and nothing is left of
         modes, options, controllers, recordings, drawings and faults. That takes milliseconds. Where a level was
-        edited or a file written, or where the server hangs, it is closed and started again instead, after which free
-        ports have other numbers. Files in a `saved_dir` of the caller's own stay.
+        edited or a file written, or where the server hangs or has failed, it is closed and started again instead,
+        after which free ports have other numbers. Files in a `saved_dir` of the caller's own stay.
 
         Raises:
             OSError, ModelError: It could not be started again; see `start`.
@@ -296,6 +300,26 @@ class SimulatedServer:
         if len(size) != 2 or not all(1 <= side <= LARGEST_PIXELS for side in size):
             raise ValueError(f"size is a width and a height from 1 to {LARGEST_PIXELS} pixels, not {size!r}")
         return self._running.snapshot((int(size[0]), int(size[1])), frame_all=frame_all)
+
+    @property
+    def failure(self) -> str | None:
+        """Which of its threads died, and of what; None while all run, and while the server is closed.
+
+        A server that has failed refuses every request with `internal_error` and this text, until it is closed and
+        started again.
+        """
+        opened = self._opened
+        return None if opened is None else opened.health.failure
+
+    def add_failure_callback(self, callback: Callable[[str], None]) -> None:
+        """Call `callback` with `failure` when a thread of the server dies, on that thread; at once if one has died.
+
+        It counts until the server is closed.
+
+        Raises:
+            RuntimeError: The server is closed.
+        """
+        self._running.health.add_callback(callback)
 
     @property
     def can_render(self) -> bool:
@@ -426,6 +450,7 @@ class _Opened:
                 hint="Protect the server with CURVE keys (--server-key and --allow-client, or curve=…), "
                 "or say --insecure-no-auth (insecure_no_auth=True).",
             )
+        self.health = Health()
         self._cameras: CameraStreams | None = None
         self._streams: StreamServer | None = None
         self._scratch: Scratch | None = None
@@ -486,14 +511,17 @@ class _Opened:
 
     def _start(self, config: _Config) -> None:
         ports = config.ports
-        memory = self._memory = None if config.shm_dir is None else SharedMemory(config.shm_dir)
-        cameras = self._cameras = CameraStreams(host=self.host, port=ports.camera, door=self.door, memory=memory)
+        memory = self._memory = None if config.shm_dir is None else SharedMemory(config.shm_dir, self.health)
+        cameras = self._cameras = CameraStreams(
+            health=self.health, host=self.host, port=ports.camera, door=self.door, memory=memory
+        )
         self._streams = StreamServer(
             lambda scene: [
                 CameraEndpoint(camera.name, cameras.endpoint(index.key, camera.name))
                 for index in scene.articulations
                 for camera in index.cameras
             ],
+            health=self.health,
             host=self.host,
             state_port=ports.state,
             ctrl_port=ports.ctrl,
@@ -506,6 +534,7 @@ class _Opened:
             physics=config.physics,
             camera_endpoint=cameras.endpoint,
             shm_directory=None if memory is None else str(memory.directory),
+            health=self.health,
         )
         self._core = core
         if config.faults is not None:
@@ -518,6 +547,7 @@ class _Opened:
         self._dispatcher = Dispatcher(core, HANDLERS)
         answer = self._dispatcher.answer
         where: dict[str, Any] = {"host": self.host, "port": ports.step, "door": self.door}
+        where |= {"refuse": core.refuse, "health": self.health}
         where["request_bytes"] = config.limits.request_bytes
         self._endpoint = (
             RpcEndpoint(answer, **where) if self._injector is None else FaultyEndpoint(self._injector, answer, **where)
@@ -537,6 +567,9 @@ class _Opened:
         self._endpoint.start()
         if memory is not None:
             memory.start(partial(answer, transport=Transport.SHM, max_reply_bytes=MAX_REPLY_BYTES))
+        if not is_available():
+            tell = logger.info if is_loopback(self.host) else logger.warning
+            tell("this system has no Landlock: files that clients' models name are checked, but not kept from MuJoCo")
         if self.door is None and not is_loopback(self.host):
             logger.warning("open to anyone who reaches %s, without authentication or encryption", self.host)
         logger.info("serving at %s:%d", tcp(self.host), self._endpoint.port)
@@ -559,7 +592,7 @@ class _Opened:
             return False
         if self._faults is not None:
             self._faults.reset()
-        if not all(served.alive for served in self._served()):
+        if self.health.failure is not None or not all(served.alive for served in self._served()):
             return False
         with dispatcher.standstill(CLOSE_S) as idle:
             if not idle or self._mark(core) != self._authored:

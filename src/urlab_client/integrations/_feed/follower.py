@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Sequence
-from typing import Literal
+from collections.abc import Callable, Coroutine, Sequence
+from typing import Any, Literal
 
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
@@ -62,8 +62,8 @@ class Follower:
         self._put: Callable[[State | Picture], None] | None = None
         self._scene: Scene | None = None
         self._described: HelloOk | None = None
-        self._expected = False
-        self._tasks: list[asyncio.Task[None]] = []
+        self._due_at: int | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
         self._camera_tasks: list[asyncio.Task[None]] = []
         self._live = False
 
@@ -108,9 +108,7 @@ class Follower:
 
     async def ended(self) -> None:
         """Wait until nothing of it runs."""
-        for outcome in await asyncio.gather(*self._tasks, return_exceptions=True):
-            if isinstance(outcome, Exception):
-                log.warning("%s: a stream was not followed to its end: %s", self._name, outcome)
+        await asyncio.gather(*self._tasks, return_exceptions=True)
 
     # What the client calls
 
@@ -132,8 +130,9 @@ class Follower:
             return asked
         timestep = 0.0 if state.mirror.model is None else state.mirror.model.opt.timestep
         then = round((state.sim_time + max(n_steps, 1) * timestep) * _NS)
-        self._expected = self._pictures.due(then)
-        if asked is True or not self._expected:
+        # The period counts as used only once the step was taken: it may be refused, or never answered.
+        self._due_at = then if self._pictures.is_due(then) else None
+        if asked is True or self._due_at is None:
             return asked
         chosen = dict(asked or {})
         known = {id(state.camera(name)) for name in chosen}
@@ -186,9 +185,10 @@ class Follower:
         wall_ns = state.recv_wall_time_ns if wall is None else wall.sec * _NS + wall.nsec
         set_points = {key: record.ctrl.tolist() for key, record in state.records.items()}
         put(State(scene, reply, set_points, nanoseconds, isinstance(reply, ResetOk), wall_ns))
-        if isinstance(reply, StepOk) and reply.cameras and self._expected:
-            self._expected = False
-            for name, frame in reply.cameras.items():
+        if isinstance(reply, StepOk) and self._due_at is not None:
+            self._pictures.done(self._due_at)
+            self._due_at = None
+            for name, frame in (reply.cameras or {}).items():
                 camera = scene.cameras.get(id(state.camera(name)))
                 if camera is not None:
                     put(Picture(camera, frame, nanoseconds, wall_ns))
@@ -197,16 +197,25 @@ class Follower:
         """Follow the streams, as live mode brings nothing by replies."""
         scene = self._current()
         self._live = True
-        self._tasks.append(asyncio.create_task(self._follow_states(), name="urlab-feed"))
+        self._begin(self._follow_states())
         self._follow_cameras(scene)
 
     def _follow_cameras(self, scene: Scene) -> None:
         """Follow this scene's cameras instead of those before."""
         for task in self._camera_tasks:
             task.cancel()
-        cameras = scene.cameras.values()
-        self._camera_tasks = [asyncio.create_task(self._follow_camera(camera), name="urlab-feed") for camera in cameras]
-        self._tasks += self._camera_tasks
+        self._camera_tasks = [self._begin(self._follow_camera(camera)) for camera in scene.cameras.values()]
+
+    def _begin(self, following: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        task = asyncio.create_task(following, name="urlab-feed")
+        self._tasks.add(task)
+        task.add_done_callback(self._on_end)
+        return task
+
+    def _on_end(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            log.warning("%s: a stream was not followed to its end: %s", self._name, error)
 
     def _ignore(self) -> None:
         self._live = False

@@ -56,13 +56,21 @@ class Schedule:
         self._slack = period_ns // 100  # times are rounded on their way
         self._next = 0
 
+    def is_due(self, now: int) -> bool:
+        """Return whether it is due at `now`, nanoseconds."""
+        return not self._next - self._period <= now + self._slack < self._next
+
+    def done(self, now: int) -> None:
+        """Wait for the next period: it happened at `now`, nanoseconds."""
+        now += self._slack
+        self._next = now - now % self._period + self._period  # also when time was set back
+
     def due(self, now: int) -> bool:
         """Return whether it is due at `now`, nanoseconds, and wait for the next period if so."""
-        now += self._slack
-        if self._next - self._period <= now < self._next:
-            return False
-        self._next = now - now % self._period + self._period  # also when time was set back
-        return True
+        due = self.is_due(now)
+        if due:
+            self.done(now)
+        return due
 
 
 @dataclass(slots=True)
