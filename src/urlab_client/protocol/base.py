@@ -22,6 +22,7 @@ __all__ = [
     "Color",
     "ControlRequest",
     "DialectName",
+    "Effect",
     "EulerDeg",
     "Floats",
     "Needs",
@@ -33,7 +34,6 @@ __all__ = [
     "Request",
     "RequiresPieRestart",
     "TargetBy",
-    "Timing",
     "Vec3",
     "doc",
 ]
@@ -98,7 +98,7 @@ class Needs(StrEnum):
     MANAGER = "manager_required"
 
 
-class Timing(StrEnum):
+class Effect(StrEnum):
     """What the caller may assume when the reply to an op is lost."""
 
     READ = "read"
@@ -135,7 +135,7 @@ class Op:
     ns: str = ""
     method: str = ""
     needs: Needs = Needs.EDITOR
-    effect: Timing = Timing.WRITE
+    effect: Effect = Effect.WRITE
     timeout: float | None = None
     hot: bool = False
     errors: tuple[str, ...] = ()
