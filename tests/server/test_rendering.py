@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from wire import Wire
 
-from urlab_client.server import SimulatedServer, rendering
-from urlab_client.server.rendering import NO_HIT_CM, find_backend, tint
+from urlab_client.server import SimulatedServer
+from urlab_client.server.render import camera_renderer
+from urlab_client.server.render.camera_renderer import NO_HIT_CM, find_backend, tint
 
 # Looks along +x at a wall 2 m away, whose upper half is red and whose lower half is blue.
 WALL = """
@@ -266,9 +267,9 @@ def test_without_opengl_frames_are_left_out(
 def test_a_machine_without_opengl_is_told_what_to_install(
     play: Play, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(rendering.sys, "platform", "linux")
-    monkeypatch.setattr(rendering, "_PROBE", "raise SystemExit('no {name} today')")
-    monkeypatch.setattr(rendering, "_find", rendering._find.__wrapped__)
+    monkeypatch.setattr(camera_renderer.sys, "platform", "linux")
+    monkeypatch.setattr(camera_renderer, "_PROBE", "raise SystemExit('no {name} today')")
+    monkeypatch.setattr(camera_renderer, "_find", camera_renderer._find.__wrapped__)
     wire = play("drop")
     with caplog.at_level(logging.WARNING, logger="urlab_client.server"):
         assert "cameras" not in wire.ask("step", include_cameras={"above": "sync"})
@@ -279,8 +280,8 @@ def test_a_machine_without_opengl_is_told_what_to_install(
 
 
 def test_a_driver_that_kills_its_process_kills_no_server(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rendering, "_PROBE", "import os; os.abort()  # {name}")
-    assert "ended with code" in str(rendering._probe("egl"))
+    monkeypatch.setattr(camera_renderer, "_PROBE", "import os; os.abort()  # {name}")
+    assert "ended with code" in str(camera_renderer._probe("egl"))
 
 
 def test_drawing_that_fails_later_leaves_frames_out(
@@ -290,7 +291,7 @@ def test_drawing_that_fails_later_leaves_frames_out(
         raise RuntimeError("the driver is gone")
 
     wire = play("drop")
-    monkeypatch.setattr(rendering._Stage, "draw", fail)
+    monkeypatch.setattr(camera_renderer._Stage, "draw", fail)
     with caplog.at_level(logging.ERROR, logger="urlab_client.server"):
         assert "cameras" not in wire.ask("step", include_cameras={"above": "sync"})
         assert "cameras" not in wire.ask("step", include_cameras={"above": "sync"})
