@@ -519,7 +519,7 @@ class _Opened:
         # Bound before the models are read, which takes longer, and answering after: requests wait in the socket.
         self._dispatcher = Dispatcher(core, HANDLERS)
         answer = self._dispatcher.answer
-        where: dict[str, Any] = {"host": self.host, "port": ports.step, "door": self.curve_keys}
+        where: dict[str, Any] = {"host": self.host, "port": ports.step, "curve_keys": self.curve_keys}
         where["request_bytes"] = config.limits.request_bytes
         self._endpoint = (
             RpcEndpoint(answer, **where) if self._injector is None else FaultyEndpoint(self._injector, answer, **where)
