@@ -22,6 +22,7 @@ __all__ = [
     "ContactsResult",
     "Diagnosis",
     "Finding",
+    "JobStatus",
     "KeyframeInfo",
     "MocapPose",
     "PIEStartResult",
@@ -525,6 +526,22 @@ class Contact(Struct, frozen=True):
     normal: Vec3
     dist: float
     force: tuple[float, float, float, float, float, float]
+
+
+class JobStatus(Struct, frozen=True):
+    """How far an editor's job is.
+
+    Attributes:
+        job_id: Its id.
+        state: `running`, `done` or `failed`; a newer server may say something else, which counts as running.
+        progress: Text for people; None from servers that say nothing.
+        elapsed_s: Seconds since it began, as this client counts.
+    """
+
+    job_id: str
+    state: str
+    progress: str | None
+    elapsed_s: float
 
 
 class ContactsResult(Struct, frozen=True):
