@@ -38,7 +38,7 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
         Raises:
             ImportFailed: The file is missing or was rejected, or the old blueprint could not be removed.
         """
-        return self._portal.call(self._aio.import_xml(xml_path, force_reimport=force_reimport, timeout=timeout))
+        return self._portal.call(self._aio.import_xml, xml_path, force_reimport=force_reimport, timeout=timeout)
 
     def spawn_actor(
         self,
@@ -66,15 +66,14 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
             SpawnFailed: The class cannot be spawned, or the id belongs to an actor of another class.
         """
         return self._portal.call(
-            self._aio.spawn_actor(
-                blueprint,
-                actor_id,
-                location=location,
-                rotation_quat=rotation_quat,
-                rotation_euler=rotation_euler,
-                scale=scale,
-                timeout=timeout,
-            )
+            self._aio.spawn_actor,
+            blueprint,
+            actor_id,
+            location=location,
+            rotation_quat=rotation_quat,
+            rotation_euler=rotation_euler,
+            scale=scale,
+            timeout=timeout,
         )
 
     def spawn_light(
@@ -103,15 +102,14 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
             SpawnFailed: Unknown kind.
         """
         return self._portal.call(
-            self._aio.spawn_light(
-                kind,
-                actor_id,
-                location=location,
-                rotation_euler=rotation_euler,
-                intensity=intensity,
-                color=color,
-                timeout=timeout,
-            )
+            self._aio.spawn_light,
+            kind,
+            actor_id,
+            location=location,
+            rotation_euler=rotation_euler,
+            intensity=intensity,
+            color=color,
+            timeout=timeout,
         )
 
     def snapshot(self, *, timeout: Timeout = DEFAULT) -> SceneSnapshot:
@@ -120,7 +118,7 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
         Raises:
             SnapshotFailed: There is no world to describe.
         """
-        return self._portal.call(self._aio.snapshot(timeout=timeout))
+        return self._portal.call(self._aio.snapshot, timeout=timeout)
 
     def duplicate_actor(
         self,
@@ -146,7 +144,7 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
             DuplicateFailed: No actor matches, or the new id belongs to an actor of another class.
         """
         return self._portal.call(
-            self._aio.duplicate_actor(target, new_actor_id, by_name=by_name, location=location, timeout=timeout)
+            self._aio.duplicate_actor, target, new_actor_id, by_name=by_name, location=location, timeout=timeout
         )
 
     def spawn_grid(
@@ -185,18 +183,17 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
             SpawnFailed: A cell could not be placed; the plugin keeps the cells placed before it.
         """
         return self._portal.call(
-            self._aio.spawn_grid(
-                blueprint,
-                base_actor_id,
-                count_x,
-                count_y,
-                spacing=spacing,
-                origin=origin,
-                rotation_quat=rotation_quat,
-                rotation_euler=rotation_euler,
-                scale=scale,
-                timeout=timeout,
-            )
+            self._aio.spawn_grid,
+            blueprint,
+            base_actor_id,
+            count_x,
+            count_y,
+            spacing=spacing,
+            origin=origin,
+            rotation_quat=rotation_quat,
+            rotation_euler=rotation_euler,
+            scale=scale,
+            timeout=timeout,
         )
 
     def apply_scene(
@@ -219,4 +216,4 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
             ValueError: Two assets share an actor id; nothing was done.
             URLabRPCError: From the op that failed; what was placed before it stays.
         """
-        return self._portal.call(self._aio.apply_scene(level_name, assets, save=save, timeout=timeout))
+        return self._portal.call(self._aio.apply_scene, level_name, assets, save=save, timeout=timeout)
