@@ -20,8 +20,12 @@ MISSING = {
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out what needs such an extra where it is not installed: counted as deselected. CI has steps for them."""
-    left_out = [item for item in items if any(item.get_closest_marker(marker) for marker in MISSING)]
+    """Leave out what needs such an extra where it is not installed, and what takes minutes unless that is asked for.
+
+    Counted as deselected. CI has steps for them.
+    """
+    unwanted = [*MISSING] if "long" in config.option.markexpr else [*MISSING, "long"]
+    left_out = [item for item in items if any(item.get_closest_marker(marker) for marker in unwanted)]
     if left_out:
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if item not in left_out]

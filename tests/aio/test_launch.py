@@ -155,7 +155,7 @@ def test_a_blocking_client_starts_servers_under_uvloops_policy() -> None:
         "    client.discover()\n"
         "    process = client._aio._transport._process\n"
         "    os.kill(process.pid, signal.SIGKILL)\n"
-        "    client._portal.call(process.wait())\n"
+        "    client._portal.call(process.wait)\n"
         "    client.discover()\n"
         "    print(process.returncode, client.step().step)\n"
         "    process = client._aio._transport._process\n"

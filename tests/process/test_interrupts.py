@@ -86,7 +86,7 @@ problems: Counter()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="descriptors are counted in /proc")
-@pytest.mark.parametrize("moments", [100, pytest.param(5000, marks=[pytest.mark.slow, pytest.mark.timeout(1800)])])
+@pytest.mark.parametrize("moments", [60, pytest.param(3000, marks=[pytest.mark.long, pytest.mark.timeout(600)])])
 def test_at_random_moments(moments: int) -> None:
     program = [sys.executable, "-W", "always", "-c", PROGRAM, str(moments)]
     done = subprocess.run(program, capture_output=True, text=True, check=False)
