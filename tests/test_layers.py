@@ -108,8 +108,8 @@ def test_every_layer_with_a_rule_exists() -> None:
         ),
         (
             "aio/client.py",
-            "import urlab_client.server.world as w\n",
-            "aio/client.py:1: aio imports urlab_client.server.world",
+            "import urlab_client.server.editor.world as w\n",
+            "aio/client.py:1: aio imports urlab_client.server.editor.world",
         ),
         ("sync/a.py", "from urlab_client.server import x\n", "sync/a.py:1: sync imports urlab_client.server.x"),
         (

@@ -18,7 +18,7 @@ from matplotlib.image import imread
 
 from urlab_client import URLabClient
 from urlab_client.cli import main
-from urlab_client.cli.pilots import SinePilot
+from urlab_client.cli.demo_controllers import SineController
 from urlab_client.cli.robot_file import read_robot
 from urlab_client.server import SimulatedServer
 
@@ -196,7 +196,7 @@ def test_the_gentle_pilot_stays_inside_the_control_ranges() -> None:
     with SimulatedServer("arm", play=True) as server, URLabClient(**server.client_options()) as client:
         client.discover()
         arm = client.articulations["arm"]
-        pilot = SinePilot(arm, read_robot("arm").home_ctrl)
+        pilot = SineController(arm, read_robot("arm").home_ctrl)
         seen = []
         for time in np.linspace(0, 5, 200):
             pilot.act(time)

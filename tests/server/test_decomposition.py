@@ -10,7 +10,7 @@ import pytest
 
 from urlab_client import AddQuickConvertFailed, URLabClient
 from urlab_client.server import ModelError, SimulatedServer
-from urlab_client.server.decomposition import convex_parts
+from urlab_client.server.assets.decomposition import convex_parts
 
 # A trough along y: two walls and a floor, 0.4 m high, the inside 0.4 m wide and 0.3 m deep.
 PROFILE = ((-0.3, 0.0), (0.3, 0.0), (0.3, 0.4), (0.2, 0.4), (0.2, 0.1), (-0.2, 0.1), (-0.2, 0.4), (-0.3, 0.4))

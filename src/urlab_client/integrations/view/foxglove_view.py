@@ -22,8 +22,8 @@ from urlab_client.integrations._feed.messages import (
     schema_of,
     values,
 )
-from urlab_client.integrations._feed.samples import Picture, State, picture_message
-from urlab_client.integrations._feed.scene import Scene, Simulation, calibration, to_metadata
+from urlab_client.integrations._feed.samples import CameraPicture, State, picture_message
+from urlab_client.integrations._feed.scene_messages import SceneMessages, Simulation, calibration, to_metadata
 from urlab_client.integrations.view.geometry import Kind, Shape, shapes_of
 from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewOptions, make_view
 from urlab_client.protocol.errors import URLabError
@@ -93,7 +93,7 @@ class _Foxglove:
         except RuntimeError as error:
             raise URLabError(f"foxglove_view: port {self._port} of {self._host} cannot be used: {error}") from None
 
-    def use(self, simulation: Simulation, scene: Scene) -> None:
+    def use(self, simulation: Simulation, scene: SceneMessages) -> None:
         """See `Sink`."""
         self._shapes = shapes_of(simulation.model, simulation.bodies)
         del scene
@@ -116,7 +116,7 @@ class _Foxglove:
         if moment.contacts:
             self._send_contacts(moment)
 
-    def show_picture(self, picture: Picture, ns: int) -> None:
+    def show_picture(self, picture: CameraPicture, ns: int) -> None:
         """See `Sink`."""
         stamp, topic = Time.of(ns), f"/camera/{picture.camera.name}"
         self._send(topic, lambda: picture_message(picture, stamp, _JPEG_QUALITY), ns)

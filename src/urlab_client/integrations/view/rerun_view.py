@@ -12,8 +12,8 @@ import numpy as np
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.integrations._extras import need
 from urlab_client.integrations._feed.messages import FrameTransform, Time
-from urlab_client.integrations._feed.samples import Picture, State, compressed
-from urlab_client.integrations._feed.scene import Scene, Simulation, calibration
+from urlab_client.integrations._feed.samples import CameraPicture, State, compressed
+from urlab_client.integrations._feed.scene_messages import SceneMessages, Simulation, calibration
 from urlab_client.integrations.view.geometry import Kind, Shape, shapes_of
 from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewOptions, make_view
 from urlab_client.protocol.enums import CameraMode
@@ -71,7 +71,7 @@ class _Rerun:
             recording.spawn(port=self._grpc_port)
         self._stream = recording
 
-    def use(self, simulation: Simulation, scene: Scene) -> None:
+    def use(self, simulation: Simulation, scene: SceneMessages) -> None:
         """See `Sink`."""
         import rerun as rr  # noqa: PLC0415
 
@@ -109,7 +109,7 @@ class _Rerun:
             recording.log("world/contacts/points", rr.Points3D(origins, radii=0.008, labels=labels, show_labels=False))
             recording.log("world/contacts/forces", rr.Arrows3D(vectors=_NEWTON_M * forces, origins=origins))
 
-    def show_picture(self, picture: Picture, ns: int) -> None:
+    def show_picture(self, picture: CameraPicture, ns: int) -> None:
         """See `Sink`."""
         import rerun as rr  # noqa: PLC0415
 
@@ -148,11 +148,11 @@ class _Rerun:
         recording.set_time("sim_time", duration=np.timedelta64(ns, "ns"))
         recording.set_time("wall_time", timestamp=np.datetime64(wall_ns, "ns"))
 
-    def _entity_of(self, scene: Scene, frame: FrameTransform) -> str:
+    def _entity_of(self, scene: SceneMessages, frame: FrameTransform) -> str:
         name = frame.child_frame_id
         return _camera(name) if any(camera.name == name for camera in scene.cameras.values()) else _body(name)
 
-    def _show_values(self, state: State, scene: Scene) -> None:
+    def _show_values(self, state: State, scene: SceneMessages) -> None:
         import rerun as rr  # noqa: PLC0415
 
         recording = self._recording

@@ -18,8 +18,8 @@ from msgspec import Struct
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.integrations._feed.blocking import BlockingTwin
 from urlab_client.integrations._feed.follower import Follower
-from urlab_client.integrations._feed.samples import Clock, Picture, State
-from urlab_client.integrations._feed.scene import Scene, Simulation
+from urlab_client.integrations._feed.samples import CameraPicture, SampleClock, State
+from urlab_client.integrations._feed.scene_messages import SceneMessages, Simulation
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import EntityState, StepOk
@@ -27,7 +27,7 @@ from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.sync._portal import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
 
-__all__ = ["AsyncView", "Moment", "Sink", "View", "ViewOptions", "ViewStats", "make_view"]
+__all__ = ["AsyncView", "Moment", "View", "ViewBackend", "ViewOptions", "ViewStats", "make_view"]
 
 log = logging.getLogger("urlab_client.view")
 
@@ -78,14 +78,14 @@ class Moment:
     ns: int
     wall_ns: int
     step: int
-    scene: Scene
+    scene: SceneMessages
     simulation: Simulation
     episode: int
     contacts: bool
     state: State | None
 
 
-class Sink(Protocol):
+class ViewBackend(Protocol):
     """Where a view shows things. Used by the view's thread alone, except `open` and `address`."""
 
     @property
@@ -102,7 +102,7 @@ class Sink(Protocol):
         """
         ...
 
-    def use(self, simulation: Simulation, scene: Scene) -> None:
+    def use(self, simulation: Simulation, scene: SceneMessages) -> None:
         """Show this scene from now on instead of the one before."""
         ...
 
@@ -110,7 +110,7 @@ class Sink(Protocol):
         """Show a state."""
         ...
 
-    def show_picture(self, picture: Picture, ns: int) -> None:
+    def show_picture(self, picture: CameraPicture, ns: int) -> None:
         """Show a picture taken at `ns` of the view's clock."""
         ...
 
@@ -127,7 +127,7 @@ class Sink(Protocol):
 class _Start:
     """The state that the client has when the view starts."""
 
-    scene: Scene
+    scene: SceneMessages
     qpos: Floats
     qvel: Floats
     nanoseconds: int
@@ -137,7 +137,7 @@ class _Start:
 class AsyncView:
     """A view that is open between `async with` and its end. Made by `rerun_view` and its siblings."""
 
-    def __init__(self, client: AsyncClient, sink: Sink, options: ViewOptions, name: str) -> None:
+    def __init__(self, client: AsyncClient, sink: ViewBackend, options: ViewOptions, name: str) -> None:
         self._client = client
         self._sink = sink
         self._options = options
@@ -146,11 +146,11 @@ class AsyncView:
             client, name=name, cameras=options.cameras, camera_hz=options.camera_hz, needs_model="", buffer=0
         )
         self._states: deque[State | _Start] = deque(maxlen=1)
-        self._pictures: dict[int, Picture] = {}
+        self._pictures: dict[int, CameraPicture] = {}
         self._counts = {"states": 0, "frames": 0, "dropped_states": 0, "dropped_frames": 0}
-        self._clock = Clock()
+        self._clock = SampleClock()
         self._simulation: Simulation | None = None
-        self._scene: Scene | None = None
+        self._scene: SceneMessages | None = None
         self._shown: int = 0
         self._stop = threading.Event()
         self._gone = threading.Event()
@@ -209,7 +209,7 @@ class AsyncView:
 
     # On the client's loop
 
-    def _put(self, item: State | Picture) -> None:
+    def _put(self, item: State | CameraPicture) -> None:
         if self._gone.is_set():
             return
         if isinstance(item, State):
@@ -308,12 +308,16 @@ class View(BlockingTwin[AsyncView]):
 
 
 @overload
-def make_view(client: AsyncClient, sink: Sink, options: ViewOptions, name: str) -> AsyncView: ...
+def make_view(client: AsyncClient, sink: ViewBackend, options: ViewOptions, name: str) -> AsyncView: ...
 @overload
-def make_view(client: URLabClient, sink: Sink, options: ViewOptions, name: str) -> View: ...
+def make_view(client: URLabClient, sink: ViewBackend, options: ViewOptions, name: str) -> View: ...
 @overload
-def make_view(client: AsyncClient | URLabClient, sink: Sink, options: ViewOptions, name: str) -> AsyncView | View: ...
-def make_view(client: AsyncClient | URLabClient, sink: Sink, options: ViewOptions, name: str) -> AsyncView | View:
+def make_view(
+    client: AsyncClient | URLabClient, sink: ViewBackend, options: ViewOptions, name: str
+) -> AsyncView | View: ...
+def make_view(
+    client: AsyncClient | URLabClient, sink: ViewBackend, options: ViewOptions, name: str
+) -> AsyncView | View:
     """Return a view of the client's own flavour.
 
     Raises:

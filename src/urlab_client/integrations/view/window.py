@@ -8,8 +8,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, overload
 
 from urlab_client.aio.client import URLabClient as AsyncClient
-from urlab_client.integrations._feed.samples import Picture
-from urlab_client.integrations._feed.scene import Scene, Simulation
+from urlab_client.integrations._feed.samples import CameraPicture
+from urlab_client.integrations._feed.scene_messages import SceneMessages, Simulation
 from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewOptions, make_view
 from urlab_client.protocol.errors import URLabError
 from urlab_client.sync.client import URLabClient
@@ -49,7 +49,7 @@ class _Window:
                 f"window_view: {missing}.", hint="Use rerun_view, foxglove_view or `urlab console`, or set a display."
             )
 
-    def use(self, simulation: Simulation, scene: Scene) -> None:
+    def use(self, simulation: Simulation, scene: SceneMessages) -> None:
         """See `Sink`."""
         import mujoco  # noqa: PLC0415
 
@@ -70,7 +70,7 @@ class _Window:
             self._data.time = moment.ns / 1e9
         self._viewer.sync()
 
-    def show_picture(self, picture: Picture, ns: int) -> None:
+    def show_picture(self, picture: CameraPicture, ns: int) -> None:
         """See `Sink`."""
 
     def idle(self) -> bool:
