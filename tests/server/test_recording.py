@@ -222,9 +222,9 @@ import os, random, signal, sys, time
 from pathlib import Path
 import numpy as np
 from urlab_client.server.assets.content import write_atomic
-from urlab_client.server.physics.recording import Frame, Layout, encode_json
+from urlab_client.server.physics.recording import Frame, JointLayout, encode_json
 
-layout = Layout.of([("j", 1, 1)])
+layout = JointLayout.of([("j", 1, 1)])
 file, chance = Path(sys.argv[1]), random.Random(0)
 
 def content(version):

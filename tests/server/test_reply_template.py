@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scenes import BALL, BOT, make_scene
-from test_observe import RICH
+from test_observations import RICH
 
 from urlab_client.protocol.codec import encode_reply
 from urlab_client.protocol.enums import ObservationLevel, StepMode

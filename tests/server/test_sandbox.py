@@ -314,10 +314,10 @@ def test_recordings_stay_where_they_belong(folder: Path) -> None:
         wire.ask("recording_start")
         wire.ask("step", n_steps=3)
         wire.ask("recording_stop")
-        curve_keys = folder / "root" / "door"
-        curve_keys.symlink_to(folder)
+        fence = folder / "root" / "fence"
+        fence.symlink_to(folder)
         outside = sorted(folder.iterdir())
-        for path in (*PATHS, str(curve_keys / "out.json"), str(folder / "out.json")):
+        for path in (*PATHS, str(fence / "out.json"), str(folder / "out.json")):
             text = path.replace("{root}", str(folder / "root")).replace("{folder}", str(folder))
             if text:
                 reply = wire.raw({"op": "recording_save", "session_id": wire.session_id, "path": text})
@@ -326,7 +326,7 @@ def test_recordings_stay_where_they_belong(folder: Path) -> None:
                 reply = wire.raw({"op": "replay_load", "session_id": wire.session_id, "path": text})
                 assert reply["op"] == "replay_load_ok" or reply["code"] == "path_not_readable", text
         assert sorted(folder.iterdir()) == outside
-        assert os.path.lexists(curve_keys)
+        assert os.path.lexists(fence)
 
 
 def test_a_level_that_a_client_opens_names_no_files_elsewhere(folder: Path, tmp_path: Path) -> None:

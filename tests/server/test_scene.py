@@ -506,7 +506,7 @@ def test_converted_meshes_are_entities(workspace: Workspace) -> None:
     )
     model = scene.model
 
-    crate, wall, curve_keys = scene.entities
+    crate, wall, door = scene.entities
     assert [entity.name for entity in scene.entities] == ["crate_MjBody", "wall_MjBody", "door_MjBody"]
     assert [model.body(entity.body).name for entity in scene.entities] == ["crate_MjBody", "wall_MjBody", "door_MjBody"]
     assert crate.free_joint == "crateFreeJoint"
@@ -514,7 +514,7 @@ def test_converted_meshes_are_entities(workspace: Workspace) -> None:
     np.testing.assert_array_equal(scene.data.qpos[crate.qpos_adr : crate.qpos_adr + 7], [0, 0, 1, 1, 0, 0, 0])
     assert crate.qvel_adr == model.joint("crateFreeJoint").dofadr[0]
     assert (wall.free_joint, wall.free_joint_id, wall.qpos_adr) == (None, -1, -1)
-    assert (curve_keys.free_joint, model.body_mocapid[curve_keys.body]) == (None, 0)
+    assert (door.free_joint, model.body_mocapid[door.body]) == (None, 0)
     assert model.body_mocapid[wall.body] == -1
 
     geoms = names(model, model.ngeom, model.geom)

@@ -23,7 +23,10 @@ def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def elsewhere() -> tuple[subprocess.Popen[str], Path]:
     """Make a folder in another process, which then waits."""
-    script = "from urlab_client.server.system.temporary_folder import Scratch; s = Scratch(); print(s.path, flush=True); input()"
+    script = (
+        "from urlab_client.server.system.temporary_folder import TemporaryFolder; f = TemporaryFolder(); "
+        "print(f.path, flush=True); input()"
+    )
     process = subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     return process, Path(process.stdout.readline().strip())

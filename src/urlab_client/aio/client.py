@@ -32,8 +32,7 @@ from urlab_client.aio.state.connection_monitor import ConnectionMonitor
 from urlab_client.aio.state.recovery import resync
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS, Stream
-from urlab_client.aio.transport.base import RequestTransport as TransportProtocol
-from urlab_client.aio.transport.base import TransportStats
+from urlab_client.aio.transport.base import RequestTransport, TransportStats
 from urlab_client.aio.transport.curve import ClientKeys, client_keys, is_local
 from urlab_client.aio.transport.shm import SharedMemoryRegions, ShmTransport
 from urlab_client.aio.transport.zmq import ZmqTransport
@@ -703,7 +702,7 @@ class URLabClient:
         raise UnknownKeyframe("unknown_keyframe", f"{problem}. Nothing was sent.", op="reset")
 
 
-def _transport(address: str, step_port: int, keys: ClientKeys | None, *, shm: bool) -> TransportProtocol:
+def _transport(address: str, step_port: int, keys: ClientKeys | None, *, shm: bool) -> RequestTransport:
     if address.startswith(SCHEME):
         return LaunchedTransport(address, shm=shm)
     scheme, separator, rest = address.partition("://")

@@ -238,6 +238,8 @@ def _configuration(robot: RobotFile, one: DemoRun, two: DemoRun) -> dict[str, An
             "gravity": option.gravity.tolist(),
         },
         "seed": SEED,
-        "pilots": {run.outcome.level: [controller.settings for controller in run.controllers] for run in (one, two)},
+        "controllers": {
+            run.outcome.level: [controller.settings for controller in run.controllers] for run in (one, two)
+        },
         "runs": [one.outcome, two.outcome],
     }

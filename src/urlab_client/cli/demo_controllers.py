@@ -19,7 +19,7 @@ __all__ = ["DemoController", "DemoRobot", "SineController", "TrotController", "m
 
 
 class DemoRobot(Protocol):
-    """What a pilot uses of an articulation of either flavour."""
+    """What a demo controller uses of an articulation of either flavour."""
 
     @property
     def joints(self) -> Mapping[str, Joint]:
@@ -61,7 +61,7 @@ class DemoController(Protocol):
 
 
 def make_demo_controller(robot: RobotFile, articulation: DemoRobot, turn: float = 0.0) -> DemoController:
-    """Return a pilot for a robot: a trot for the bundled quadruped, which `turn` bends, a gentle swing for others."""
+    """Return a controller: a trot that `turn` bends for the bundled quadruped, a gentle swing for other robots."""
     if robot.path == bundled_models()["quadruped"]:
         return TrotController(articulation, turn)
     return SineController(articulation, robot.home_ctrl)

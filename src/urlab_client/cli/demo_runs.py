@@ -62,7 +62,7 @@ class DemoRun:
 
     Attributes:
         outcome: How it went.
-        pilots: What drove the robots.
+        controllers: What drove the robots.
         trace: Joint positions of the first robot.
         model: The model.
         data: The last state.

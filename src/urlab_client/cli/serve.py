@@ -227,8 +227,8 @@ def run(arguments: ServeArguments) -> int:
 
     limit_arenas()
 
-    with TemporaryFolder() as scratch:
-        server = _server(arguments, arguments.saved_dir or scratch.path)
+    with TemporaryFolder() as temporary:
+        server = _server(arguments, arguments.saved_dir or temporary.path)
         starter = _Starter(server, events)
         starter.start()
         if _next(events) is _Event.STARTED:

@@ -546,7 +546,7 @@ class _Opened:
         # Bound before the models are read, which takes longer, and answering after: requests wait in the socket.
         self._dispatcher = Dispatcher(core, HANDLERS)
         answer = self._dispatcher.answer
-        where: dict[str, Any] = {"host": self.host, "port": ports.step, "door": self.curve_keys}
+        where: dict[str, Any] = {"host": self.host, "port": ports.step, "curve_keys": self.curve_keys}
         where |= {"refuse": core.refuse, "health": self.health}
         where["request_bytes"] = config.limits.request_bytes
         self._endpoint = (

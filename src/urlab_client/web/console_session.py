@@ -96,7 +96,7 @@ class ConsoleSession:
     """See the module.
 
     Args:
-        client: The client; the desk opens its session and keeps it.
+        client: The client; the console opens its session and keeps it.
         lease: The controls.
     """
 

@@ -56,7 +56,7 @@ class Files(NamedTuple):
 
 @cache
 def files() -> Files | None:
-    """Return what is shipped, None if this MuJoCo comes without Studio."""
+    """Return what is shipped, None if this MuJoCo comes without its web viewer."""
     payload = _payload()
     if payload is None:
         return None

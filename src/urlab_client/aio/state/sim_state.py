@@ -97,7 +97,7 @@ class SimState:
         step_count: Steps since the last handshake or reset.
         sim_time: Simulation time of the last reply, seconds.
         on_adopted: Told of each handshake taken over, and of the end of play.
-        doubts: Requests whose replies were lost.
+        pending: Requests whose replies were lost.
         stopping: Whether this client is ending play, so that its end is no news.
         observers: Told of each state taken over, such as recorders.
     """

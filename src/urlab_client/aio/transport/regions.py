@@ -1,6 +1,6 @@
 """Streams out of shared memory: state and pictures, with the sockets beside them for while a region is not there.
 
-One reader per region serves all sinks. A region keeps the newest publication alone, so streams that want all of them
+One reader per region serves all handlers. A region keeps the newest publication alone, so streams that want all of them
 receive from the sockets anyway.
 """
 
@@ -51,7 +51,7 @@ class Place(Struct, frozen=True):
 
     Attributes:
         file: Name of the region's file.
-        topic: What the sinks are told as topic.
+        topic: What the handlers are told as topic.
         ring: Which ring of the doorbell tells of them.
     """
 
@@ -128,7 +128,7 @@ class _RegionReader:
         region = self.mapping.region
         if self.place.ring == doorbell.CAMERA:
             self.seen = region.sequence
-            # The sinks measure it and hand it back to their source, which knows what it is.
+            # The handlers measure it and hand it back to their source, which knows what it is.
             return cast("BytesLike", SharedPicture(self, self.seen, region.max_payload)) if self.seen else None
         found = region.read_latest()
         if found is None:
@@ -279,7 +279,7 @@ class Regions:
     def _feed(self, reader: _RegionReader, handler: MessageHandler) -> None:
         reader.handlers[handler] = None
         if self._loop is not None:
-            # What is there already counts, too; a sink that attaches is not ready for it at this very moment.
+            # What is there already counts, too; a handler that attaches is not ready for it at this very moment.
             self._loop.call_soon(self._welcome, reader, handler)
 
     def _welcome(self, reader: _RegionReader, handler: MessageHandler) -> None:
@@ -360,7 +360,7 @@ class Regions:
                 self._subscriptions.attach(handler, source.subscription)
 
     def _resume(self, reader: _RegionReader) -> None:
-        """Take the sinks that had to do without back to a region that has come to life again."""
+        """Take the handlers that had to do without back to a region that has come to life again."""
         reader.silent = False
         for handler, source in self._sources.items():
             if source.place().file == reader.place.file:
@@ -394,7 +394,7 @@ class Regions:
                 self._close_reader(reader)
 
     def _settle_all(self) -> None:
-        """Take sinks that receive from sockets to their regions, where these are there by now."""
+        """Take handlers that receive from sockets to their regions, where these are there by now."""
         for handler, source in tuple(self._sources.items()):
             if self.path(handler) is None:
                 reader = self._reader(source)

@@ -5,7 +5,7 @@ second copy on the wire and no second wake-up of the loop (at 1 kHz about 40 µs
 100 µs with a socket of its own), and messages of different topics keep the order in which the server sent them, in
 which a snapshot closes the rows of its tick.
 
-The socket is read whenever the loop runs, wanted or not: what waits is bounded by what the sinks keep, never by how
+The socket is read whenever the loop runs, wanted or not: what waits is bounded by what the handlers keep, never by how
 fast they are read, and a subscriber that is not read cannot fill the server's queues.
 """
 
@@ -68,13 +68,13 @@ class MessageHandler(ABC):
     def on_end(self, error: Callable[[], URLabError]) -> None:
         """Take note that nothing will come any more, and why."""
 
-    def on_drained(self) -> None:  # noqa: B027 - a sink that acts on each message needs nothing here
+    def on_drained(self) -> None:  # noqa: B027 - a handler that acts on each message needs nothing here
         """Act on the messages that just came, after the last of a batch."""
 
-    def on_connection(self, connected: bool) -> None:  # noqa: B027 - most sinks need not know
+    def on_connection(self, connected: bool) -> None:  # noqa: B027 - most handlers need not know
         """Take note that the connection was made or lost."""
 
-    def on_gap(self, why: str) -> None:  # noqa: B027 - a sink that keeps only the newest misses nothing
+    def on_gap(self, why: str) -> None:  # noqa: B027 - a handler that keeps only the newest misses nothing
         """Take note that messages are missing before the next one."""
 
 
@@ -160,7 +160,7 @@ class _Subscriber:
 
     def attach(self, handler: MessageHandler, subscription: Subscription) -> None:
         for prefix in subscription.filters:
-            self._socket.subscribe(prefix)  # counted by the socket: equal filters of several sinks are kept apart
+            self._socket.subscribe(prefix)  # counted by the socket: equal filters of several handlers are kept apart
         self._handlers[handler] = subscription
         self._routes.clear()
         # Any use of the socket may consume its descriptor's edge.

@@ -45,7 +45,7 @@ class _Rerun:
 
     @property
     def address(self) -> str:
-        """See `Sink`."""
+        """See `ViewBackend`."""
         return f"http://127.0.0.1:{self._web_port}" if self._web else ""
 
     @property
@@ -55,7 +55,7 @@ class _Rerun:
         return self._stream
 
     def open(self) -> None:
-        """See `Sink`."""
+        """See `ViewBackend`."""
         import rerun as rr  # noqa: PLC0415
 
         recording = rr.RecordingStream("urlab")
@@ -72,7 +72,7 @@ class _Rerun:
         self._stream = recording
 
     def use(self, simulation: Simulation, scene: SceneMessages) -> None:
-        """See `Sink`."""
+        """See `ViewBackend`."""
         import rerun as rr  # noqa: PLC0415
 
         recording = self._recording
@@ -90,7 +90,7 @@ class _Rerun:
             recording.log(where, before[where].cleared(), static=True)  # type: ignore[attr-defined]  # of each archetype
 
     def show(self, moment: Moment) -> None:
-        """See `Sink`."""
+        """See `ViewBackend`."""
         import rerun as rr  # noqa: PLC0415
 
         recording = self._recording
@@ -110,7 +110,7 @@ class _Rerun:
             recording.log("world/contacts/forces", rr.Arrows3D(vectors=_NEWTON_M * forces, origins=origins))
 
     def show_picture(self, picture: CameraPicture, ns: int) -> None:
-        """See `Sink`."""
+        """See `ViewBackend`."""
         import rerun as rr  # noqa: PLC0415
 
         recording, camera = self._recording, picture.camera
@@ -134,11 +134,11 @@ class _Rerun:
             recording.log(f"{where}/image", rr.EncodedImage(contents=data, media_type=media))
 
     def idle(self) -> bool:
-        """See `Sink`."""
+        """See `ViewBackend`."""
         return True
 
     def close(self) -> None:
-        """See `Sink`."""
+        """See `ViewBackend`."""
         recording, self._stream = self._recording, None
         recording.flush(timeout_sec=5.0)
         recording.disconnect()
@@ -291,5 +291,5 @@ def rerun_view(
         raise ValueError("give one of save, connect and web")
     options = ViewOptions(cameras=cameras, camera_hz=camera_hz, max_hz=max_hz, contacts=contacts)
     path = None if save is None else Path(save)
-    sink = _Rerun(save=path, connect=connect, web=web, web_port=web_port, grpc_port=grpc_port, sensors=sensors)
-    return make_view(client, sink, options, "rerun_view")
+    backend = _Rerun(save=path, connect=connect, web=web, web_port=web_port, grpc_port=grpc_port, sensors=sensors)
+    return make_view(client, backend, options, "rerun_view")

@@ -137,9 +137,9 @@ class _Start:
 class AsyncView:
     """A view that is open between `async with` and its end. Made by `rerun_view` and its siblings."""
 
-    def __init__(self, client: AsyncClient, sink: ViewBackend, options: ViewOptions, name: str) -> None:
+    def __init__(self, client: AsyncClient, backend: ViewBackend, options: ViewOptions, name: str) -> None:
         self._client = client
-        self._sink = sink
+        self._backend = backend
         self._options = options
         self._name = name
         self._follower = Follower(
@@ -166,7 +166,7 @@ class AsyncView:
     @property
     def address(self) -> str:
         """Where what is served can be seen; empty before the block, and where nothing is served."""
-        return self._sink.address
+        return self._backend.address
 
     @property
     def closed(self) -> bool:
@@ -183,7 +183,7 @@ class AsyncView:
             raise URLabError("A view opens once.", hint="Call the function that made it again.")
         scene = self._follower.check()
         self._opened = True
-        await anyio.to_thread.run_sync(self._sink.open)
+        await anyio.to_thread.run_sync(self._backend.open)
         state = self._client._state  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
         with state.mirror.lock:
             data = state.mirror.data
@@ -231,7 +231,7 @@ class AsyncView:
             while not self._stop.wait(pause):
                 started = time.monotonic()
                 self._drain()
-                if not self._sink.idle():
+                if not self._backend.idle():
                     return
                 took = time.monotonic() - started
                 pause = max(period - took, took)  # at most half of a processor's time
@@ -242,7 +242,7 @@ class AsyncView:
         finally:
             self._gone.set()
             try:
-                self._sink.close()
+                self._backend.close()
             except Exception as error:  # noqa: BLE001
                 self._error = self._error or error
                 log.warning("%s: the view could not be closed well: %s", self._name, error)
@@ -253,7 +253,7 @@ class AsyncView:
         while self._pictures:
             _, picture = self._pictures.popitem()
             ns = self._shown if picture.nanoseconds is None else max(0, self._clock.offset + picture.nanoseconds)
-            self._sink.show_picture(picture, ns)
+            self._backend.show_picture(picture, ns)
             self._counts["frames"] += 1
 
     def _show(self, item: State | _Start) -> None:
@@ -263,7 +263,7 @@ class AsyncView:
                 return  # what follows has no model; the last scene stays
             simulation = Simulation(item.scene, item.scene.model)
             self._simulation, self._scene = simulation, item.scene
-            self._sink.use(simulation, item.scene)
+            self._backend.use(simulation, item.scene)
         state = item if isinstance(item, State) else None
         contacts = self._options.contacts
         if isinstance(item, State):
@@ -277,7 +277,7 @@ class AsyncView:
             simulation.start_from(item.qpos, item.qvel, forces=contacts)
             step, wall_ns, restarts = item.step, time.time_ns(), False
         self._shown = self._clock.advance(item.nanoseconds, restarts)
-        self._sink.show(
+        self._backend.show(
             Moment(self._shown, wall_ns, step, item.scene, simulation, self._clock.episode, contacts, state)
         )
         self._counts["states"] += 1
@@ -308,15 +308,15 @@ class View(BlockingTwin[AsyncView]):
 
 
 @overload
-def make_view(client: AsyncClient, sink: ViewBackend, options: ViewOptions, name: str) -> AsyncView: ...
+def make_view(client: AsyncClient, backend: ViewBackend, options: ViewOptions, name: str) -> AsyncView: ...
 @overload
-def make_view(client: URLabClient, sink: ViewBackend, options: ViewOptions, name: str) -> View: ...
+def make_view(client: URLabClient, backend: ViewBackend, options: ViewOptions, name: str) -> View: ...
 @overload
 def make_view(
-    client: AsyncClient | URLabClient, sink: ViewBackend, options: ViewOptions, name: str
+    client: AsyncClient | URLabClient, backend: ViewBackend, options: ViewOptions, name: str
 ) -> AsyncView | View: ...
 def make_view(
-    client: AsyncClient | URLabClient, sink: ViewBackend, options: ViewOptions, name: str
+    client: AsyncClient | URLabClient, backend: ViewBackend, options: ViewOptions, name: str
 ) -> AsyncView | View:
     """Return a view of the client's own flavour.
 
@@ -327,7 +327,7 @@ def make_view(
         if not 0 < value <= 1000:
             raise ValueError(f"{key} is above 0 and at most 1000, not {value}")
     core = aio_of(client) if isinstance(client, URLabClient) else client
-    view = AsyncView(core, sink, options, name)
+    view = AsyncView(core, backend, options, name)
     if isinstance(client, URLabClient):
         return View(view, portal_of(client))
     return view

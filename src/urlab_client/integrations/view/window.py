@@ -38,11 +38,11 @@ class _Window:
 
     @property
     def address(self) -> str:
-        """See `Sink`."""
+        """See `ViewBackend`."""
         return ""
 
     def open(self) -> None:
-        """See `Sink`."""
+        """See `ViewBackend`."""
         missing = missing_for_window()
         if missing:
             raise URLabError(
@@ -50,7 +50,7 @@ class _Window:
             )
 
     def use(self, simulation: Simulation, scene: SceneMessages) -> None:
-        """See `Sink`."""
+        """See `ViewBackend`."""
         import mujoco  # noqa: PLC0415
 
         viewer: Any = import_module("mujoco.viewer")
@@ -60,7 +60,7 @@ class _Window:
         self._viewer = viewer.launch_passive(simulation.model, self._data, show_left_ui=False, show_right_ui=False)
 
     def show(self, moment: Moment) -> None:
-        """See `Sink`."""
+        """See `ViewBackend`."""
         import mujoco  # noqa: PLC0415
 
         if self._data is None or not self._viewer.is_running():
@@ -71,14 +71,14 @@ class _Window:
         self._viewer.sync()
 
     def show_picture(self, picture: CameraPicture, ns: int) -> None:
-        """See `Sink`."""
+        """See `ViewBackend`."""
 
     def idle(self) -> bool:
-        """See `Sink`."""
+        """See `ViewBackend`."""
         return self._viewer is None or bool(self._viewer.is_running())
 
     def close(self) -> None:
-        """See `Sink`."""
+        """See `ViewBackend`."""
         viewer, self._viewer = self._viewer, None
         if viewer is not None:
             viewer.close()

@@ -163,9 +163,9 @@ class Play:
             Refusal: `shutting_down`.
         """
         # NaN compares false, so it does not wait.
-        patience = min(timeout_s, MAX_WAIT_S) if timeout_s > 0.0 else 0.0
+        wait_s = min(timeout_s, MAX_WAIT_S) if timeout_s > 0.0 else 0.0
         with self._changed:
-            self._changed.wait_for(lambda: self._closing or self.state is not PIEState.COMPILING, patience)
+            self._changed.wait_for(lambda: self._closing or self.state is not PIEState.COMPILING, wait_s)
             if self._closing:
                 raise Refusal("shutting_down", "the server is stopping")
             return PIEState.TIMEOUT if self.state is PIEState.COMPILING else self.state

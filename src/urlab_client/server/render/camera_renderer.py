@@ -1,8 +1,8 @@
 """Camera images, drawn with MuJoCo's renderer in a thread of their own.
 
-For the handler of `step`, which asks a `CameraRenderer` for frames. OpenGL is looked for when the first frame is wanted,
-in a child process, because a broken driver may end the process that loads it. A machine without OpenGL serves no
-frames; everything else goes on.
+The handler of `step` asks a `CameraRenderer` for frames. The first frame triggers the search for OpenGL, in a child
+process, because a broken driver may end the process that loads it. A machine without OpenGL serves no frames;
+everything else goes on.
 
 The colours of the segmentation modes are reproducible. The group of an articulation is the CRC-32 of its class name,
 that of a prop the CRC-32 of its mesh file's stem or its shape. A tint's seed is 1 + (group) for `semantic` and
