@@ -58,6 +58,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "system",
         "limits",
         "refusal",
+        "health",
         "assets",
         "compile",
         "editor",

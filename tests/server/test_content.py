@@ -340,7 +340,9 @@ def test_an_import_onto_a_full_disk_is_refused_and_leaves_nothing(workspace: Wor
             with pytest.raises(Refusal, match="import_failed: cannot store the snapshot"):
                 workspace.content.import_xml(path, force_reimport=True, trusted=True)
         (workspace.saved / "snapshot").mkdir()
-        order = sandbox._Order(str(other), str(workspace.saved / "snapshot" / "s"), [str(workspace.models)], Limits())
+        order = sandbox._SandboxJob(
+            str(other), str(workspace.saved / "snapshot" / "s"), [str(workspace.models)], Limits()
+        )
         outcome = sandbox._work(order)  # of a child, whose files have a limit of their own
         shutil.rmtree(workspace.saved / "snapshot")
 

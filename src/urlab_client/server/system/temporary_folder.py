@@ -116,18 +116,29 @@ def sweep(folder: Path, *patterns: str) -> None:
         folder: The folder; it need not exist.
         patterns: What such things are called, relative to it.
     """
-    with contextlib.suppress(OSError):
-        descriptor = None if sys.platform == "win32" else os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            if sys.platform != "win32" and descriptor is not None:
-                import fcntl  # noqa: PLC0415
+    with contextlib.suppress(OSError), _alone_in(folder):
+        for pattern in patterns:
+            for left in folder.glob(pattern):
+                shutil.rmtree(left, ignore_errors=True)
+                with contextlib.suppress(OSError):
+                    left.parent.rmdir()  # if it held nothing else
 
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            for pattern in patterns:
-                for left in folder.glob(pattern):
-                    shutil.rmtree(left, ignore_errors=True)
-                    with contextlib.suppress(OSError):
-                        left.parent.rmdir()  # if it held nothing else
-        finally:
-            if descriptor is not None:
-                os.close(descriptor)
+
+@contextlib.contextmanager
+def _alone_in(folder: Path) -> Generator[None]:
+    """Lock a folder that nobody works in.
+
+    Raises:
+        OSError: Somebody does, or there is no such folder.
+    """
+    if sys.platform == "win32":
+        yield
+        return
+    import fcntl  # noqa: PLC0415
+
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(descriptor)
