@@ -23,7 +23,6 @@ from urlab_client.server.compile.scene import ArticulationIndex, CompiledScene, 
 from urlab_client.server.editor.markers import Drawings
 from urlab_client.server.editor.viewport import Viewport
 from urlab_client.server.editor.world import EditorWorld
-from urlab_client.server.health import Health
 from urlab_client.server.limits import Limits
 from urlab_client.server.physics.controllers import ControllerConfig
 from urlab_client.server.physics.engine import Engine
@@ -33,6 +32,7 @@ from urlab_client.server.physics.replay import recordings, replay_folder
 from urlab_client.server.render.camera_renderer import CameraRenderer, RenderQuality
 from urlab_client.server.session import ServerSession
 from urlab_client.server.system.allocator import trim
+from urlab_client.server.system.health import Health
 
 __all__ = ["PhysicsConfig", "ServerCore", "unmatched_names"]
 

@@ -42,7 +42,6 @@ from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import CameraFrame
 from urlab_client.server.compile.scene import CompiledScene, SceneCamera
 from urlab_client.server.editor.viewport import ViewMode
-from urlab_client.server.health import Health
 from urlab_client.server.render.viewport_picture import (
     ViewportPicture,
     add_primitives,
@@ -53,6 +52,7 @@ from urlab_client.server.render.viewport_picture import (
     outline,
     showing,
 )
+from urlab_client.server.system.health import Health
 from urlab_client.server.system.thread_join import ended
 
 __all__ = [
