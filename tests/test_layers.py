@@ -58,7 +58,6 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "system",
         "limits",
         "refusal",
-        "health",
         "assets",
         "compile",
         "editor",
