@@ -20,8 +20,8 @@ from hypothesis import strategies as st
 from publisher import Publisher
 from waiting import DEADLINE_S, pass_time, until
 
-from urlab_client.aio.reception import LiveReception
-from urlab_client.aio.sources import CameraSource, EventBus, RowSource, StateSource
+from urlab_client.aio.live.live_state import LiveState
+from urlab_client.aio.live.sources import CameraSource, EventBus, RowSource, StateSource
 from urlab_client.aio.streams import Stream
 from urlab_client.aio.transport.subscriber import Subscriptions
 from urlab_client.protocol.enums import CameraMode
@@ -796,7 +796,7 @@ class TestBackground:
 
     async def test_the_newest_snapshot_is_taken_over(self, publisher: Publisher, state: StateSource) -> None:
         taken: list[float] = []
-        reception = LiveReception(state, lambda found: taken.append(found.time), threading.RLock())
+        reception = LiveState(state, lambda found: taken.append(found.time), threading.RLock())
         reception.start()
         reception.start()
         async with Marker(state, publisher) as marker:
@@ -825,7 +825,7 @@ class TestBackground:
 
         holder = asyncio.create_task(asyncio.to_thread(hold))
         assert await asyncio.to_thread(held.wait, DEADLINE_S)
-        reception = LiveReception(state, lambda found: taken.append(found.time), lock)
+        reception = LiveState(state, lambda found: taken.append(found.time), lock)
         reception.start()
         async with Marker(state, publisher) as marker:
             await publisher.subscribed(STATE)
@@ -845,7 +845,7 @@ class TestBackground:
             if found.time > 0:
                 raise ProtocolError("state/full: its model has 5.", hint="Call discover().")
 
-        reception = LiveReception(state, absorb, threading.RLock())
+        reception = LiveState(state, absorb, threading.RLock())
         reception.start()
         async with Marker(state, publisher) as marker:
             await publisher.subscribed(STATE)

@@ -13,7 +13,7 @@ import zmq
 from wire import Wire
 
 from urlab_client.server import SimulatedServer
-from urlab_client.server.rendering import CameraStudio
+from urlab_client.server.render.camera_renderer import CameraRenderer
 
 ROBOT = """
 <mujoco model="robot">
@@ -133,7 +133,7 @@ def test_images_go_on_after_one_that_failed(
             failed.set()
             raise MemoryError("no room for pixels")
 
-        patch.setattr(CameraStudio, "frames", fail)
+        patch.setattr(CameraRenderer, "frames", fail)
         socket = subscribe(wrist["zmq_endpoint"], wrist["zmq_topic"] + " ")
         assert failed.wait(30.0)
     assert socket.recv_multipart()[0] == b"robot/camera/wrist "

@@ -15,7 +15,7 @@ from wire import Wire
 from urlab_client import InternalError, URLabClient
 from urlab_client.protocol.enums import PIEState
 from urlab_client.server import SimulatedServer
-from urlab_client.server.play import Play
+from urlab_client.server.physics.play import Play
 
 
 def strike(thread: threading.Thread) -> None:

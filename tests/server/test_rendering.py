@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from wire import Wire
 
-from urlab_client.server import SimulatedServer, rendering
-from urlab_client.server.rendering import NO_HIT_CM, find_backend, tint
+from urlab_client.server import SimulatedServer
+from urlab_client.server.render import camera_renderer
+from urlab_client.server.render.camera_renderer import NO_HIT_CM, find_backend, tint
 
 # Looks along +x at a wall 2 m away, whose upper half is red and whose lower half is blue.
 WALL = """
@@ -266,9 +267,9 @@ def test_without_opengl_frames_are_left_out(
 def test_a_machine_without_opengl_is_told_what_to_install(
     play: Play, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(rendering.sys, "platform", "linux")
-    monkeypatch.setattr(rendering, "_PROBE", "raise SystemExit('no {name} today')")
-    monkeypatch.setattr(rendering, "_find", rendering._find.__wrapped__)
+    monkeypatch.setattr(camera_renderer.sys, "platform", "linux")
+    monkeypatch.setattr(camera_renderer, "_PROBE", "raise SystemExit('no {name} today')")
+    monkeypatch.setattr(camera_renderer, "_find", camera_renderer._find.__wrapped__)
     wire = play("drop")
     with caplog.at_level(logging.WARNING, logger="urlab_client.server"):
         assert "cameras" not in wire.ask("step", include_cameras={"above": "sync"})
@@ -279,8 +280,8 @@ def test_a_machine_without_opengl_is_told_what_to_install(
 
 
 def test_a_driver_that_kills_its_process_kills_no_server(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rendering, "_PROBE", "import os; os.abort()  # {name}")
-    assert "ended with code" in str(rendering._probe("egl"))
+    monkeypatch.setattr(camera_renderer, "_PROBE", "import os; os.abort()  # {name}")
+    assert "ended with code" in str(camera_renderer._probe("egl"))
 
 
 def fail(*arguments: object) -> None:
@@ -289,9 +290,9 @@ def fail(*arguments: object) -> None:
 
 def test_a_frame_that_cannot_be_drawn_is_left_out_alone(play: Play, monkeypatch: pytest.MonkeyPatch) -> None:
     wire = play("drop")
-    for _ in range(rendering.MAX_FAILED):
+    for _ in range(camera_renderer.MAX_FAILED):
         with monkeypatch.context() as patch:
-            patch.setattr(rendering._Stage, "draw", fail)
+            patch.setattr(camera_renderer._Stage, "draw", fail)
             assert "cameras" not in wire.ask("step", include_cameras={"above": "sync"})
         assert "cameras" in wire.ask("step", include_cameras={"above": "sync"})
 
@@ -301,8 +302,8 @@ def test_drawing_that_fails_again_and_again_is_given_up(
 ) -> None:
     wire = play("drop")
     with monkeypatch.context() as patch, caplog.at_level(logging.ERROR, logger="urlab_client.server"):
-        patch.setattr(rendering._Stage, "draw", fail)
-        for _ in range(rendering.MAX_FAILED + 1):
+        patch.setattr(camera_renderer._Stage, "draw", fail)
+        for _ in range(camera_renderer.MAX_FAILED + 1):
             assert "cameras" not in wire.ask("step", include_cameras={"above": "sync"})
     assert caplog.text.count("drawing failed") == 1
     assert "cameras" not in wire.ask("step", include_cameras={"above": "sync"})

@@ -20,7 +20,8 @@ from wire import Wire
 from urlab_client import ImportFailed, URLabTimeoutError
 from urlab_client._landlock import is_available
 from urlab_client.aio import URLabClient
-from urlab_client.server import Limits, SimulatedServer, sandbox, simulated
+from urlab_client.server import Limits, SimulatedServer, simulated
+from urlab_client.server.assets import sandbox
 
 Serve = Callable[..., Wire]
 
@@ -313,10 +314,10 @@ def test_recordings_stay_where_they_belong(folder: Path) -> None:
         wire.ask("recording_start")
         wire.ask("step", n_steps=3)
         wire.ask("recording_stop")
-        door = folder / "root" / "door"
-        door.symlink_to(folder)
+        fence = folder / "root" / "fence"
+        fence.symlink_to(folder)
         outside = sorted(folder.iterdir())
-        for path in (*PATHS, str(door / "out.json"), str(folder / "out.json")):
+        for path in (*PATHS, str(fence / "out.json"), str(folder / "out.json")):
             text = path.replace("{root}", str(folder / "root")).replace("{folder}", str(folder))
             if text:
                 reply = wire.raw({"op": "recording_save", "session_id": wire.session_id, "path": text})
@@ -325,7 +326,7 @@ def test_recordings_stay_where_they_belong(folder: Path) -> None:
                 reply = wire.raw({"op": "replay_load", "session_id": wire.session_id, "path": text})
                 assert reply["op"] == "replay_load_ok" or reply["code"] == "path_not_readable", text
         assert sorted(folder.iterdir()) == outside
-        assert os.path.lexists(door)
+        assert os.path.lexists(fence)
 
 
 def test_a_level_that_a_client_opens_names_no_files_elsewhere(folder: Path, tmp_path: Path) -> None:

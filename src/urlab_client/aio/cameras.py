@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.publishers import Publishers, SharedFrame
-from urlab_client.aio.reception import Pictures
+from urlab_client.aio.live.live_state import LatestPicture
+from urlab_client.aio.live.publishers import Publishers, SharedFrame
 from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS, Stream
 from urlab_client.protocol.enums import CameraMode, known
 from urlab_client.protocol.messages.session import CameraInfo
@@ -34,7 +34,7 @@ class URLabCameraView:
         self.delivered = True
         self._publishers = publishers
         # Fed by the client. Not declared above, so that the façade has none.
-        self.pictures = Pictures(publishers.camera(self))
+        self.pictures = LatestPicture(publishers.camera(self))
 
     @property
     def latest_frame(self) -> Pixels | None:

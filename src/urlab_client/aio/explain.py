@@ -14,7 +14,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from urlab_client.aio.session import Session
-from urlab_client.aio.state import SimState
+from urlab_client.aio.state.sim_state import SimState
 from urlab_client.protocol.enums import ControlMode, PIEState, StepMode
 from urlab_client.protocol.errors import RPC_ERRORS, SessionTakenOver, URLabError
 from urlab_client.protocol.messages.session import Meta

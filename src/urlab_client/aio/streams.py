@@ -11,9 +11,9 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Generic, Protocol, Self, TypeVar
 
-from urlab_client.aio.buffers import Buffer, Entry
 from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.transport.subscriber import MessageGone, Sink
+from urlab_client.aio.stream_buffer import BufferedMessage, StreamBuffer
+from urlab_client.aio.transport.subscriber import MessageGone, MessageHandler
 from urlab_client.protocol.errors import (
     ConcurrentReadError,
     ProtocolError,
@@ -43,12 +43,12 @@ class _Source(Protocol[T_co]):
 
     name: str
 
-    def attach(self, sink: Sink) -> None:
-        """Begin to feed `sink`, from the event loop."""
+    def attach(self, handler: MessageHandler) -> None:
+        """Begin to feed `handler`, from the event loop."""
         ...
 
-    def detach(self, sink: Sink) -> None:
-        """Stop feeding `sink`. Idempotent."""
+    def detach(self, handler: MessageHandler) -> None:
+        """Stop feeding `handler`. Idempotent."""
         ...
 
     def wants(self, topic: bytes, payload: BytesLike) -> bool:
@@ -59,16 +59,16 @@ class _Source(Protocol[T_co]):
         """Make an item of a message. Raises `ProtocolError`."""
         ...
 
-    def first_after(self, sink: Sink) -> float:
+    def first_after(self, handler: MessageHandler) -> float:
         """Return how many seconds the first item may be in coming; 0 where nothing says that it takes long."""
         ...
 
-    def silence(self, sink: Sink, seconds: float) -> tuple[str, str]:
+    def silence(self, handler: MessageHandler, seconds: float) -> tuple[str, str]:
         """Return why nothing came for so long, and what to do about it."""
         ...
 
 
-class _Channel(Sink, Generic[T]):
+class _StreamChannel(MessageHandler, Generic[T]):
     """Buffer, reader and end of one stream. What receives holds it, and it does not hold the stream: a stream that is
     dropped without being closed can so be collected, and stops receiving then.
 
@@ -77,7 +77,13 @@ class _Channel(Sink, Generic[T]):
     """
 
     def __init__(
-        self, source: _Source[T], buffer: Buffer, *, tolerant: bool, timeout: Timeout, default_timeout: float | None
+        self,
+        source: _Source[T],
+        buffer: StreamBuffer,
+        *,
+        tolerant: bool,
+        timeout: Timeout,
+        default_timeout: float | None,
     ) -> None:
         self.closed = False
         self._source = source
@@ -245,7 +251,7 @@ class _Channel(Sink, Generic[T]):
             item.dropped, item.gap = entry.dropped, entry.gap
             return item
 
-    def _decoded(self, entry: Entry) -> T | None:
+    def _decoded(self, entry: BufferedMessage) -> T | None:
         """Return the item of a message, None if it is malformed."""
         with self._lock:
             if entry.item is not None or entry.malformed:
@@ -351,8 +357,10 @@ class Stream(Generic[T]):
         Raises:
             ValueError: Unknown policy, or a limit below 1.
         """
-        kept = Buffer(StreamPolicy(policy), buffer, buffer_bytes)
-        self._channel = _Channel(source, kept, tolerant=tolerant, timeout=timeout, default_timeout=default_timeout)
+        kept = StreamBuffer(StreamPolicy(policy), buffer, buffer_bytes)
+        self._channel = _StreamChannel(
+            source, kept, tolerant=tolerant, timeout=timeout, default_timeout=default_timeout
+        )
         if eager:
             self._channel.attach()
 
@@ -429,7 +437,7 @@ class Stream(Generic[T]):
         return await self._channel.next()
 
     def __del__(self) -> None:
-        channel: _Channel[T] | None = getattr(self, "_channel", None)  # None if the constructor failed
+        channel: _StreamChannel[T] | None = getattr(self, "_channel", None)  # None if the constructor failed
         if channel is not None:
             channel.abandon()
 

@@ -22,8 +22,8 @@ from urlab_client.protocol.controller_text import ControllerText
 from urlab_client.protocol.enums import CameraMode, StepMode
 
 if TYPE_CHECKING:
-    from urlab_client.server.guard import CurveServer
     from urlab_client.server.simulated import SimulatedServer
+    from urlab_client.server.transport.curve_authentication import CurveServer
 
 __all__ = ["add_parser", "run"]
 
@@ -222,13 +222,13 @@ def run(arguments: ServeArguments) -> int:
         threading.Thread(target=_watch_input, args=[events], name="urlab-stdin", daemon=True).start()
     import_mujoco()
     _check_paths(arguments)
-    from urlab_client.server.heap import share_heaps  # noqa: PLC0415
-    from urlab_client.server.scratch import Scratch  # noqa: PLC0415
+    from urlab_client.server.system.allocator import limit_arenas  # noqa: PLC0415
+    from urlab_client.server.system.temporary_folder import TemporaryFolder  # noqa: PLC0415
 
-    share_heaps()
+    limit_arenas()
 
-    with Scratch() as scratch:
-        server = _server(arguments, arguments.saved_dir or scratch.path)
+    with TemporaryFolder() as temporary:
+        server = _server(arguments, arguments.saved_dir or temporary.path)
         starter = _Starter(server, events)
         starter.start()
         if _next(events) is _Event.STARTED:
@@ -311,7 +311,7 @@ def _watch_input(events: _Events) -> None:
 
 
 def _server(arguments: ServeArguments, saved_dir: Path) -> SimulatedServer:
-    from urlab_client.server.controllers import ControllerConfig  # noqa: PLC0415
+    from urlab_client.server.physics.controllers import ControllerConfig  # noqa: PLC0415
     from urlab_client.server.simulated import SimulatedServer  # noqa: PLC0415
 
     try:
@@ -343,7 +343,7 @@ def _server(arguments: ServeArguments, saved_dir: Path) -> SimulatedServer:
 
 
 def _curve(arguments: ServeArguments) -> CurveServer | None:
-    from urlab_client.server.guard import CurveServer  # noqa: PLC0415
+    from urlab_client.server.transport.curve_authentication import CurveServer  # noqa: PLC0415
 
     if arguments.server_key is None:
         if arguments.allow_client or arguments.allow_any_client:
@@ -385,7 +385,7 @@ def _check_ports(arguments: ServeArguments) -> None:
 
 
 def _check_paths(arguments: ServeArguments) -> None:
-    from urlab_client.server.bundled import bundled_models  # noqa: PLC0415
+    from urlab_client.server.assets.bundled_robots import bundled_models  # noqa: PLC0415
 
     bundled = bundled_models()
     for model in arguments.models:

@@ -21,7 +21,7 @@ import msgspec
 import zmq
 
 from urlab_client.protocol.registry import OPS
-from urlab_client.server.endpoint import RpcEndpoint
+from urlab_client.server.transport.endpoint import RpcEndpoint
 
 __all__ = [
     "ActiveFault",

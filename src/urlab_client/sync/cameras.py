@@ -10,7 +10,7 @@ import numpy as np
 
 from urlab_client.aio import cameras as aio
 from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.publishers import SharedFrame
+from urlab_client.aio.live.publishers import SharedFrame
 from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraInfo

@@ -9,9 +9,9 @@ from typing import Any, Literal
 
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
-from urlab_client.aio.state import SimState
-from urlab_client.integrations._feed.samples import Picture, Schedule, State
-from urlab_client.integrations._feed.scene import CameraLayout, Scene
+from urlab_client.aio.state.sim_state import SimState
+from urlab_client.integrations._feed.samples import CameraPicture, Schedule, State
+from urlab_client.integrations._feed.scene_messages import CameraLayout, SceneMessages
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import ClientClosed, StreamOverflow, URLabError
 from urlab_client.protocol.messages.session import HelloOk, ResetOk, StateReply, StepOk
@@ -59,15 +59,15 @@ class Follower:
         self._pictures = Schedule(self._camera_ns)
         self._needs_model = needs_model
         self._buffer = buffer
-        self._put: Callable[[State | Picture], None] | None = None
-        self._scene: Scene | None = None
+        self._put: Callable[[State | CameraPicture], None] | None = None
+        self._scene: SceneMessages | None = None
         self._described: HelloOk | None = None
         self._due_at: int | None = None
         self._tasks: set[asyncio.Task[None]] = set()
         self._camera_tasks: list[asyncio.Task[None]] = []
         self._live = False
 
-    def check(self) -> Scene:
+    def check(self) -> SceneMessages:
         """Describe what there is.
 
         Raises:
@@ -88,7 +88,7 @@ class Follower:
             raise KeyError(unknown)
         return self._current()
 
-    def start(self, put: Callable[[State | Picture], None]) -> None:
+    def start(self, put: Callable[[State | CameraPicture], None]) -> None:
         """Hand on what comes from now on; `put` is called on the event loop and must be quick."""
         self._put = put
         self._state.observers.append(self)
@@ -143,14 +143,14 @@ class Follower:
 
     # Inside
 
-    def _current(self) -> Scene:
+    def _current(self) -> SceneMessages:
         """Return the scene, described anew when there was another handshake."""
         hello = self._state.hello
         if self._scene is None or hello is not self._described:
             if self._scene is not None and (unknown := self._unknown_cameras()):
                 log.warning("%s: in the new scene there is %s", self._name, unknown)
             self._described = hello
-            self._scene = Scene.of(self._state, self._views())
+            self._scene = SceneMessages.of(self._state, self._views())
             if self._live:
                 self._follow_cameras(self._scene)
         return self._scene
@@ -191,7 +191,7 @@ class Follower:
             for name, frame in (reply.cameras or {}).items():
                 camera = scene.cameras.get(id(state.camera(name)))
                 if camera is not None:
-                    put(Picture(camera, frame, nanoseconds, wall_ns))
+                    put(CameraPicture(camera, frame, nanoseconds, wall_ns))
 
     def _listen(self) -> None:
         """Follow the streams, as live mode brings nothing by replies."""
@@ -200,7 +200,7 @@ class Follower:
         self._begin(self._follow_states())
         self._follow_cameras(scene)
 
-    def _follow_cameras(self, scene: Scene) -> None:
+    def _follow_cameras(self, scene: SceneMessages) -> None:
         """Follow this scene's cameras instead of those before."""
         for task in self._camera_tasks:
             task.cancel()
@@ -250,4 +250,4 @@ class Follower:
                     return
                 nanoseconds = round((self._state.sim_time if sample.sim_time is None else sample.sim_time) * _NS)
                 if self._put is not None and schedule.due(nanoseconds):
-                    self._put(Picture(camera, sample.pixels, nanoseconds, sample.recv_wall_time_ns))
+                    self._put(CameraPicture(camera, sample.pixels, nanoseconds, sample.recv_wall_time_ns))
