@@ -222,7 +222,7 @@ def test_mujoco_s_own_leniency_is_understood(wire: Wire, folder: Path) -> None:
 @pytest.mark.skipif(not is_available(), reason="the kernel has no Landlock")
 def test_the_kernel_keeps_mujoco_from_files_that_a_check_missed(folder: Path, tmp_path: Path) -> None:
     program = (
-        "from urlab_client.server import sandbox\n"
+        "from urlab_client.server.assets import sandbox\n"
         "sandbox.check_references = lambda *arguments: None\n"
         "sandbox._serve()\n"
     )
@@ -231,7 +231,7 @@ def test_the_kernel_keeps_mujoco_from_files_that_a_check_missed(folder: Path, tm
         model = folder / "root" / f"{name}.xml"
         model.write_text(FIGURE.format(file=file))
         (tmp_path / name).mkdir()
-        order = sandbox._Order(str(model), str(tmp_path / name / "snapshot"), [str(folder / "root")], LIMITS)
+        order = sandbox._SandboxJob(str(model), str(tmp_path / name / "snapshot"), [str(folder / "root")], LIMITS)
         orders += msgspec.json.encode(order) + b"\n"
     child = subprocess.run([sys.executable, "-c", program], input=orders, stdout=subprocess.PIPE, check=True)
     inside, outside = map(msgspec.json.decode, child.stdout.splitlines())
