@@ -105,7 +105,7 @@ def test_meta_and_the_reference_have_their_row(tree: Path) -> None:
     row = next(line for line in reference.splitlines() if line.startswith("| [`get_mass`]("))
     assert "`get_mass()`" in row
     assert "| play | read |" in row
-    catalogue = run(tree, ["-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/server/test_meta.py"])
+    catalogue = run(tree, ["-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", "tests/server/test_meta.py"])
     assert catalogue.returncode == 0, catalogue.stdout
 
 

@@ -254,7 +254,7 @@ class SimState:
                 self.mirror.use(loaded)
             self.hello = hello
             self._bind_articulations(hello.articulations)
-            self._bind_entities(hello.entities or {})
+            self._bind_entities(hello.plain_entities)
             cameras = hello.global_cameras or {}
             self.global_cameras = NameMap(
                 {n: self._global_camera(n, info) for n, info in cameras.items()}, kind="camera"

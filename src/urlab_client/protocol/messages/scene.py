@@ -42,6 +42,8 @@ __all__ = [
     "ImportXmlOk",
     "LoadLevel",
     "LoadLevelOk",
+    "RemoveActor",
+    "RemoveActorOk",
     "SaveLevel",
     "SaveLevelOk",
     "SetActorTransform",
@@ -227,6 +229,19 @@ class DestroyActorOk(Reply, tag="destroy_actor_ok", kw_only=True):
 
 class DestroyActor(Request[DestroyActorOk], tag="destroy_actor", kw_only=True, omit_defaults=True):
     """Remove an actor from the edited level."""
+
+    target: ActorTarget
+    target_by: TargetBy = "actor_id"
+
+
+class RemoveActorOk(Reply, tag="remove_actor_ok", kw_only=True):
+    """The actor is gone from the edited level."""
+
+    requires_pie_restart: RequiresPieRestart
+
+
+class RemoveActor(Request[RemoveActorOk], tag="remove_actor", kw_only=True, omit_defaults=True):
+    """Remove an actor from the edited level; the beta's name of `destroy_actor`."""
 
     target: ActorTarget
     target_by: TargetBy = "actor_id"

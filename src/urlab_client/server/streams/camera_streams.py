@@ -19,9 +19,9 @@ import zmq
 from urlab_client._uninterrupted import uninterrupted
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.rows import camera_filter
-from urlab_client.server.health import Health
 from urlab_client.server.physics.play import Running
 from urlab_client.server.refusal import Refusal
+from urlab_client.server.system.health import Health
 from urlab_client.server.system.thread_join import ended
 from urlab_client.server.transport.curve_authentication import CurveKeys, ZapAuthenticator
 from urlab_client.server.transport.endpoint import PortInUse, bind_tcp, bound_peers, tcp

@@ -45,11 +45,11 @@ from urlab_client.protocol.rows import (
     gains_by_parameter,
 )
 from urlab_client.server.compile.scene import CompiledScene
-from urlab_client.server.health import Health
 from urlab_client.server.physics.controllers import ArticulationControl, Twist
 from urlab_client.server.physics.observe import Observer, sim_clock, wall_clock
 from urlab_client.server.physics.play import Running
 from urlab_client.server.refusal import Refusal
+from urlab_client.server.system.health import Health
 from urlab_client.server.system.thread_join import ended
 from urlab_client.server.transport.curve_authentication import CurveKeys, ZapAuthenticator
 from urlab_client.server.transport.endpoint import bind_tcp, bound_peers

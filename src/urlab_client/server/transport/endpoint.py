@@ -17,8 +17,8 @@ from typing import ClassVar, Final
 import zmq
 
 from urlab_client._uninterrupted import uninterrupted
-from urlab_client.server.health import Health
 from urlab_client.server.limits import Limits
+from urlab_client.server.system.health import Health
 from urlab_client.server.system.thread_join import ended
 from urlab_client.server.transport.curve_authentication import CurveKeys, ZapAuthenticator
 
