@@ -293,43 +293,6 @@ class SceneOps(Facade, twin=aio.SceneOps):
         return self._portal.call(self._aio.actor_hierarchy, target, by_name=by_name, timeout=timeout)
 
 
-class FarmOps(Facade, twin=aio.FarmOps):
-    """Generated part of `client.farm`."""
-
-    __slots__ = ()
-    _aio: aio.FarmOps
-
-    def acquire_lease(self, owner: str = "", *, ttl_s: float = 60.0, timeout: Timeout = DEFAULT) -> str:
-        """Take the server's one driver lease and return its id.
-
-            The server enforces nothing by it: it tells other clients that the server is in use. Every request keeps it
-            alive.
-
-        Args:
-            owner: Who takes it, for people.
-            ttl_s: Seconds without a request after which it ends; 0 or less ends it at once.
-            timeout: Seconds to wait; None waits without limit.
-
-        Raises:
-            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            LeaseBusy: Somebody holds the server's driver lease.
-        """
-        return self._portal.call(self._aio.acquire_lease, owner, ttl_s=ttl_s, timeout=timeout)
-
-    def release_lease(self, lease_id: str, *, timeout: Timeout = DEFAULT) -> None:
-        """Give the driver lease back.
-
-        Args:
-            lease_id: What `acquire_lease` returned.
-            timeout: Seconds to wait; None waits without limit.
-
-        Raises:
-            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            BadRequest: The frame is neither a msgpack map nor a JSON object.
-        """
-        self._portal.call(self._aio.release_lease, lease_id, timeout=timeout)
-
-
 class OutlinerOps(Facade, twin=aio.OutlinerOps):
     """Generated part of `client.outliner`."""
 
@@ -749,3 +712,40 @@ class ViewportOps(Facade, twin=aio.ViewportOps):
             timeout: Seconds to wait; None waits without limit.
         """
         return self._portal.call(self._aio.untrack, timeout=timeout)
+
+
+class FarmOps(Facade, twin=aio.FarmOps):
+    """Generated part of `client.farm`."""
+
+    __slots__ = ()
+    _aio: aio.FarmOps
+
+    def acquire_lease(self, owner: str = "", *, ttl_s: float = 60.0, timeout: Timeout = DEFAULT) -> str:
+        """Take the server's one driver lease and return its id.
+
+            The server enforces nothing by it: it tells other clients that the server is in use. Every request keeps it
+            alive.
+
+        Args:
+            owner: Who takes it, for people.
+            ttl_s: Seconds without a request after which it ends; 0 or less ends it at once.
+            timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
+            LeaseBusy: Somebody holds the server's driver lease.
+        """
+        return self._portal.call(self._aio.acquire_lease, owner, ttl_s=ttl_s, timeout=timeout)
+
+    def release_lease(self, lease_id: str, *, timeout: Timeout = DEFAULT) -> None:
+        """Give the driver lease back.
+
+        Args:
+            lease_id: What `acquire_lease` returned.
+            timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
+            BadRequest: The frame is neither a msgpack map nor a JSON object.
+        """
+        self._portal.call(self._aio.release_lease, lease_id, timeout=timeout)
