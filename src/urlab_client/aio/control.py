@@ -136,9 +136,10 @@ class Control:
         try:
             reply = await ask(request, limits)
         except NotControlOwner as refusal:
-            if refusal.owner != UNCLAIMED or not self._wanted or not robots:
+            if refusal.owner not in {UNCLAIMED, *self._names} or not self._wanted or not robots:
                 raise self._refused(robots, refusal) from None
-            # The claim ran out, or play was started anew. Nothing was written, so once more is not twice.
+            # The claim ran out, play was started anew, or it was made in a session that is gone. Nothing was written,
+            # so once more is not twice.
             for key in robots:
                 await self._claim(self._asked(key), ask, limits)
             try:
@@ -187,11 +188,6 @@ class Control:
         """Note that play ended, and every claim with it."""
         self._held.clear()
         self._others.clear()
-
-    def renew_session(self) -> None:
-        """Note that a session was opened anew: claims in the name of the one before are of no use any more."""
-        if self._session.features.reads_owner is False:
-            self._held.clear()
 
     def _robots(self, request: ControlRequest[Reply]) -> list[str]:
         """Return the keys of the robots that a request writes to."""
