@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
+from urlab_client._mujoco import control_counts, control_starts
 from urlab_client.aio.layout import QPOS_WIDTH, QVEL_WIDTH
 from urlab_client.aio.records import ArticulationRecord
 from urlab_client.protocol.base import Floats
@@ -261,11 +262,11 @@ def _actuators(record: ArticulationRecord, model: mujoco.MjModel | None) -> list
     joint_of = {joint_id: name for name, joint_id in record.layout.joints.items()}
     actuators: list[Actuator] = []
     start = 0
+    counts, starts = control_counts(model), control_starts(model)
     for name, i in record.layout.actuators.items():
         kind = types.get(name)
         driven = int(model.actuator_trnid[i][0]) if model.actuator_trntype[i] in _JOINT_TRANSMISSIONS else -1
-        width = int(model.actuator_ctrlnum[i])
-        first = int(model.actuator_ctrladr[i])
+        width, first = int(counts[i]), int(starts[i])
         actuators.append(
             Actuator(
                 record,

@@ -21,6 +21,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client._mujoco import control_counts, control_starts, force_counts, force_starts, merge_assets
 from urlab_client.protocol.base import Vec3
 from urlab_client.protocol.controller_text import CUSTOM_TEXT, ControllerText
 from urlab_client.protocol.rotation import rotate, wxyz
@@ -332,7 +333,7 @@ def _compose(
             if converted is not None:
                 bodies.append(converted)
     _restore_world_references(spec, {f"{actor.prefix}world" for actor, _ in articulations})
-    spec.dedup_assets()  # instances of one robot share its meshes and textures
+    merge_assets(spec)
     return spec, bodies
 
 
@@ -632,7 +633,7 @@ def _index(
     sensors, sensor_names = find(objects.mjOBJ_SENSOR, blueprint.sensors)
     cameras, camera_names = find(objects.mjOBJ_CAMERA, blueprint.cameras)
     positions, velocities = _joint_widths(model, joints)
-    controls = model.actuator_ctrlnum[actuators]
+    controls = control_counts(model)[actuators]
     return ArticulationIndex(
         key=actor.name,
         prefix=actor.prefix,
@@ -649,9 +650,9 @@ def _index(
         sensor_names=sensor_names,
         qpos_adr=_spans(model.jnt_qposadr[joints], positions),
         qvel_adr=_spans(model.jnt_dofadr[joints], velocities),
-        ctrl_adr=_spans(model.actuator_ctrladr[actuators], controls),
+        ctrl_adr=_spans(control_starts(model)[actuators], controls),
         act_adr=np.repeat(model.actuator_actadr[actuators], controls).astype(np.int32),
-        force_adr=_spans(model.actuator_outadr[actuators], model.actuator_outnum[actuators]),
+        force_adr=_spans(force_starts(model)[actuators], force_counts(model)[actuators]),
         actuator_types=MappingProxyType({name: blueprint.actuator_types[name] for name in actuator_names}),
         cameras=tuple(
             _camera(model, int(index), name, camera_size) for index, name in zip(cameras, camera_names, strict=True)
