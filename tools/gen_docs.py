@@ -137,7 +137,7 @@ def render() -> str:
     import urlab_client.server.handlers  # noqa: F401  # registers the handlers
     from urlab_client.protocol import errors
     from urlab_client.protocol.registry import ENVELOPE_ERRORS, OPS
-    from urlab_client.server.dispatch import HANDLERS
+    from urlab_client.server.rpc.dispatch import HANDLERS
 
     namespaces: dict[str, list[Op]] = {}
     for op in OPS.values():

@@ -23,12 +23,12 @@ from urlab_client.protocol.messages.scene import CurrentLevel, CurrentLevelOk
 from urlab_client.protocol.messages.session import Meta, MetaOk
 from urlab_client.protocol.registry import OPS
 from urlab_client.server import SimulatedServer
-from urlab_client.server.content import ContentRoot
+from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.core import PhysicsConfig, ServerCore
-from urlab_client.server.dispatch import Dispatcher, HandlerTable
+from urlab_client.server.editor.world import EditorWorld
 from urlab_client.server.handlers import HANDLERS
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.world import World
+from urlab_client.server.rpc.dispatch import Dispatcher, HandlerTable
 
 Serve = Callable[..., Wire]
 
@@ -240,7 +240,7 @@ def test_a_frame_beyond_the_limit_is_answered(idle: Wire) -> None:
 
 @pytest.fixture
 def core(tmp_path: Path) -> ServerCore:
-    world = World(ContentRoot(tmp_path))
+    world = EditorWorld(ContentRoot(tmp_path))
     return ServerCore(world=world, physics=PhysicsConfig(), camera_endpoint=lambda *_: "tcp://127.0.0.1:5558")
 
 

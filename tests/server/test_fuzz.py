@@ -29,14 +29,14 @@ from urlab_client.protocol.rows import (
     STATE_FULL,
     ActuatorInfo,
     ControlPayload,
-    Topic,
+    StreamTopic,
     TopicKind,
     decode_gains,
     decode_row,
 )
 from urlab_client.server import Limits, SimulatedServer
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.requests import Incoming, RequestReader
+from urlab_client.server.rpc.requests import Incoming, RequestReader
 
 FRAMES = 5_000 * FACTOR
 """For each direction of the codec."""
@@ -86,7 +86,7 @@ def test_stream_payloads_are_read_or_raise_what_callers_expect() -> None:
     readers: list[Callable[[bytes], Any]] = [ControlPayload.decode, decode_gains, ActuatorInfo.decode]
 
     def reader_of(kind: TopicKind) -> Callable[[bytes], Any]:
-        return lambda payload: decode_row(Topic(kind, "bot", "x"), payload)
+        return lambda payload: decode_row(StreamTopic(kind, "bot", "x"), payload)
 
     readers += [reader_of(kind) for kind in kinds]
     done = 0

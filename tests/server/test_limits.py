@@ -16,7 +16,8 @@ from waiting import eventually
 from wire import Wire, pack
 
 from urlab_client.protocol.registry import OPS
-from urlab_client.server import Limits, SimulatedServer, endpoint
+from urlab_client.server import Limits, SimulatedServer
+from urlab_client.server.transport import endpoint
 
 Serve = Callable[..., Wire]
 SMALL = Limits(
@@ -135,7 +136,7 @@ def test_a_frame_beyond_all_limits_costs_its_sender_the_connection(small: Wire) 
 
 
 def test_no_reply_tells_of_the_program(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
-    from urlab_client.server.dispatch import Dispatcher
+    from urlab_client.server.rpc.dispatch import Dispatcher
 
     wire = serve("bot", play=True)
 

@@ -21,7 +21,7 @@ from urlab_client.protocol.messages.session import ArticulationCommand, Step
 from urlab_client.protocol.registry import OPS
 from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.requests import Incoming, RequestReader, need, usable
+from urlab_client.server.rpc.requests import Incoming, RequestReader, need, usable
 
 READER = RequestReader()
 DEPTH = Limits().request_depth

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from urlab_client.aio.deadline import DEFAULT, Timeout, shared
-from urlab_client.aio.transport.base import Transport
+from urlab_client.aio.transport.base import RequestTransport
 from urlab_client.protocol.base import Needs, Op, Reply, Request
 from urlab_client.protocol.codec import check_request, decode_reply, encode_request, op_of
 from urlab_client.protocol.errors import ConnectionLost, ServerUnreachable, UnknownOp, URLabRPCError, URLabTimeoutError
@@ -35,7 +35,7 @@ class Session:
             server after that was lost, which only a refused or accepted session id shows.
     """
 
-    def __init__(self, transport: Transport, *, default_timeout: float | None, json: bool = False) -> None:
+    def __init__(self, transport: RequestTransport, *, default_timeout: float | None, json: bool = False) -> None:
         self.session_id = ""
         self.offered: frozenset[str] | None = None
         self.on_refusal: Callable[[URLabRPCError], None] | None = None
@@ -48,7 +48,7 @@ class Session:
         self._aside: asyncio.Task[Reply] | None = None
 
     @property
-    def transport(self) -> Transport:
+    def transport(self) -> RequestTransport:
         """What carries the requests."""
         return self._transport
 

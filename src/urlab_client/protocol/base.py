@@ -20,6 +20,7 @@ __all__ = [
     "ActorId",
     "ActorTarget",
     "Color",
+    "Effect",
     "EulerDeg",
     "Floats",
     "Needs",
@@ -31,7 +32,6 @@ __all__ = [
     "Request",
     "RequiresPieRestart",
     "TargetBy",
-    "Timing",
     "Vec3",
     "doc",
 ]
@@ -84,7 +84,7 @@ class Needs(StrEnum):
     MANAGER = "manager_required"
 
 
-class Timing(StrEnum):
+class Effect(StrEnum):
     """What the caller may assume when the reply to an op is lost."""
 
     READ = "read"
@@ -119,7 +119,7 @@ class Op:
     ns: str = ""
     method: str = ""
     needs: Needs = Needs.EDITOR
-    effect: Timing = Timing.WRITE
+    effect: Effect = Effect.WRITE
     timeout: float | None = None
     hot: bool = False
     errors: tuple[str, ...] = ()

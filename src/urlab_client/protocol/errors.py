@@ -97,6 +97,11 @@ def _rebuild(cls: type[URLabError], args: tuple[Any, ...], state: dict[str, Any]
     return error
 
 
+def _sentence(text: str) -> str:
+    """Return a text that another sentence may follow: a server's message may lack its full stop."""
+    return text if not text or text.endswith((".", "!", "?", "…")) else f"{text}."
+
+
 class URLabError(Exception):
     """Base of everything this package raises on purpose.
 
@@ -118,7 +123,7 @@ class URLabError(Exception):
 
     def __str__(self) -> str:
         text = str(self.args[0]) if self.args else ""
-        return f"{text} {self.hint}" if self.hint else text
+        return f"{_sentence(text)} {self.hint}" if self.hint else text
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _rebuild, (type(self), self.args, dict(self.__dict__))

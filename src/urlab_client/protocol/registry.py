@@ -9,7 +9,7 @@ from typing import Annotated, Any, Union, get_args, get_origin
 import msgspec
 
 from urlab_client.protocol import errors
-from urlab_client.protocol.base import Needs, Op, Timing
+from urlab_client.protocol.base import Effect, Needs, Op
 from urlab_client.protocol.messages import debug, outliner, recording, runtime, scene, session, sim, viewport
 from urlab_client.protocol.types import ActorBounds, CameraPose, MocapPose, RecordingSummary, ReplayStatus
 
@@ -67,7 +67,7 @@ def _described(annotation: Any) -> bool:
 
 
 _EDITOR = 30.0  # editor ops wait for the game thread, and level or mesh work can hold it for long
-_READ = Timing.READ
+_READ = Effect.READ
 _MANAGER = Needs.MANAGER
 
 OPS: Mapping[str, Op] = registry(

@@ -11,7 +11,7 @@ from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.namespaces._base import Vector, fill, target_by
 from urlab_client.aio.namespaces._ops import RuntimeOps
 from urlab_client.aio.session import Session
-from urlab_client.aio.state import SimState
+from urlab_client.aio.state.sim_state import SimState
 from urlab_client.protocol.codec import building
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.messages.runtime import ContactFilter, GetContacts, SetQpos, SetSimOptions

@@ -10,7 +10,7 @@ import msgspec
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.namespaces._base import Namespace
 from urlab_client.aio.session import Session
-from urlab_client.aio.state import SimState
+from urlab_client.aio.state.sim_state import SimState
 from urlab_client.protocol.enums import PIEState
 from urlab_client.protocol.errors import URLabPIEError, URLabTimeoutError
 from urlab_client.protocol.messages.sim import BeginPie, BeginPieOk, PieStatus, StopPie

@@ -41,9 +41,9 @@ from urlab_client.protocol.messages.scene import (
 )
 from urlab_client.protocol.types import ActorHierarchyNode
 from urlab_client.server.core import ServerCore
-from urlab_client.server.dispatch import handles
-from urlab_client.server.requests import need, usable
-from urlab_client.server.world import ActorRow, HierarchyNode
+from urlab_client.server.editor.world import ActorRow, HierarchyNode
+from urlab_client.server.rpc.dispatch import handles
+from urlab_client.server.rpc.requests import need, usable
 
 
 @handles(ImportXml)

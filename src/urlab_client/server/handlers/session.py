@@ -32,14 +32,14 @@ from urlab_client.protocol.messages.session import (
     StepOk,
 )
 from urlab_client.protocol.registry import OPS
-from urlab_client.server.controllers import ArticulationControl, float32
+from urlab_client.server.compile.scene import EntityIndex
 from urlab_client.server.core import ServerCore
-from urlab_client.server.dispatch import handles
-from urlab_client.server.observe import sim_clock, wall_clock
-from urlab_client.server.play import Running
+from urlab_client.server.physics.controllers import ArticulationControl, float32
+from urlab_client.server.physics.observe import sim_clock, wall_clock
+from urlab_client.server.physics.play import Running
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.rendering import Exposure
-from urlab_client.server.scene import EntityIndex
+from urlab_client.server.render.camera_renderer import Exposure
+from urlab_client.server.rpc.dispatch import handles
 
 logger = logging.getLogger("urlab_client.server")
 
