@@ -14,22 +14,27 @@ PACKAGE = Path(__file__).resolve().parents[1] / "src" / "urlab_client"
 ALLOWED: dict[str, frozenset[str]] = {
     "protocol": frozenset(),
     "keys": frozenset({"protocol"}),
-    "aio": frozenset({"_children", "_confined", "_landlock", "_mjcf_files", "_processors", "keys", "protocol"}),
+    "aio": frozenset(
+        {"_children", "_confined", "_landlock", "_mjcf_files", "_mujoco", "_processors", "keys", "protocol"}
+    ),
     "sync": frozenset({"aio", "protocol"}),
-    "server": frozenset({"_children", "_confined", "_landlock", "_mjcf_files", "_processors", "keys", "protocol"}),
+    "server": frozenset(
+        {"_children", "_confined", "_landlock", "_mjcf_files", "_mujoco", "_processors", "keys", "protocol"}
+    ),
     "enums": frozenset({"protocol"}),
     "_children": frozenset(),
     "_confined": frozenset(),
+    "_mujoco": frozenset(),
     "_landlock": frozenset(),
     "_mjcf_files": frozenset(),
     "_installation": frozenset(),
     "_processors": frozenset(),
     "": frozenset({"_installation", "sync", "enums", "protocol"}),
-    "integrations": frozenset({"", "aio", "enums", "keys", "protocol", "server", "sync"}),
+    "integrations": frozenset({"", "_mujoco", "aio", "enums", "keys", "protocol", "server", "sync"}),
     "cluster": frozenset({"integrations", "protocol", "sync"}),
     "web": frozenset({"aio", "protocol"}),
     "cli": frozenset(
-        {"", "_installation", "aio", "enums", "integrations", "keys", "protocol", "server", "sync", "web"}
+        {"", "_installation", "_mujoco", "aio", "enums", "integrations", "keys", "protocol", "server", "sync", "web"}
     ),
     "__main__": frozenset({"cli"}),
 }
