@@ -8,8 +8,11 @@ The client's import of this module must not import MuJoCo: that takes longer tha
 
 from __future__ import annotations
 
-import itertools
+import contextlib
+import hashlib
+import tempfile
 import zipfile
+from collections.abc import Generator, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,11 +23,14 @@ if TYPE_CHECKING:
     import mujoco
 
 __all__ = [
+    "MODEL_FILE",
     "actuator_count",
     "actuator_kind",
     "check_copy",
     "control_counts",
     "control_starts",
+    "copy_options",
+    "export_model",
     "force_counts",
     "force_starts",
     "merge_assets",
@@ -36,6 +42,9 @@ __all__ = [
 ]
 
 Indices = NDArray[np.int32]
+
+MODEL_FILE = "model.xml"
+_ARCHIVE = "model.mjz"  # whose stem names the model in it
 
 
 # Actuators have had several controls and forces each since 3.11; before, `nu` counted both them and their controls.
@@ -126,51 +135,77 @@ def write_model(spec: mujoco.MjSpec, folder: Path) -> None:
 
     Raises:
         mujoco.FatalError: It must be compiled first: before 3.16 always.
+        ValueError: One of its files is not where this MuJoCo looks; see `check_copy`.
     """
     compiler: Any = spec.compiler
-    if not hasattr(compiler, "savecompiled"):
-        _write_files(spec, folder)
+    if _writes_archives(spec):
+        compiler.savecompiled = False
+        # Beside the folder: a confined process can write nowhere else.
+        with _archive(spec, folder.with_name(_ARCHIVE)) as content:
+            content.extractall(folder)
         return
-    compiler.savecompiled = False
-    archive = folder.with_name("model.mjz")
-    spec.encode(str(archive))
-    with zipfile.ZipFile(archive) as content:
-        content.extractall(folder)
-    archive.unlink()
-
-
-def _write_files(spec: mujoco.MjSpec, folder: Path) -> None:
-    """`write_model` before 3.16, whose archives name files in folders of their own wrongly."""
     spec.to_xml()  # says whether it can be written, before anything is changed
+    text, files = _written_by_hand(spec)
     folder.mkdir(parents=True)
-    number = itertools.count()
+    for name, data in files.items():
+        (folder / name).write_bytes(data)
+    (folder / MODEL_FILE).write_text(text, "utf-8")
+
+
+def export_model(spec: mujoco.MjSpec) -> tuple[str, dict[str, bytes]]:
+    """Return a compiled spec as MJCF, and the content of the files that it names, by their names there."""
+    if not _writes_archives(spec):
+        return _written_by_hand(spec.copy())
+    with tempfile.TemporaryDirectory() as folder, _archive(spec, Path(folder, _ARCHIVE)) as content:
+        files = {name: content.read(name) for name in content.namelist() if not name.endswith("/")}
+    return files.pop(MODEL_FILE).decode(), files
+
+
+def _writes_archives(spec: mujoco.MjSpec) -> bool:
+    """Whether MuJoCo writes a spec with its files: before 3.16 it names those in folders of their own wrongly."""
+    return hasattr(spec.compiler, "savecompiled")
+
+
+@contextlib.contextmanager
+def _archive(spec: mujoco.MjSpec, path: Path) -> Generator[zipfile.ZipFile]:
+    spec.encode(str(path))
+    with zipfile.ZipFile(path) as content:
+        yield content
+    path.unlink()
+
+
+def _written_by_hand(spec: mujoco.MjSpec) -> tuple[str, dict[str, bytes]]:
+    """Give a spec's files names that no other file has, and return what the archive would hold."""
+    files: dict[str, bytes] = {}
     compilers: list[Any] = [spec.compiler]  # and those of attached models
 
-    def moved(file: str, directory: str) -> str:
-        content = spec.assets.get(file)
-        if content is None:
+    def renamed(file: str, directory: str) -> str:
+        data = spec.assets.get(file)
+        if data is None:
             try:
-                content = Path(spec.modelfiledir, directory, file).read_bytes()
+                data = Path(spec.modelfiledir, directory, file).read_bytes()
             except OSError:
                 raise _unwritable() from None
-        name = f"{next(number)}-{Path(file).name}"
-        (folder / name).write_bytes(content)
-        spec.assets = {**spec.assets, name: content}
+        digest = hashlib.sha256(data).hexdigest()[:16]
+        name = Path(file).name
+        name = name if name.startswith(digest) else f"{digest}-{name}"
+        files[name] = data
         return name
 
     for asset in (*spec.meshes, *spec.hfields, *spec.skins):
         if asset.file:
-            asset.file = moved(asset.file, asset.compiler.meshdir)
+            asset.file = renamed(asset.file, asset.compiler.meshdir)
             compilers.append(asset.compiler)
     for texture in spec.textures:
         directory = texture.compiler.texturedir
         if texture.file:
-            texture.file = moved(texture.file, directory)
-        texture.cubefiles = [moved(file, directory) if file else "" for file in texture.cubefiles]
+            texture.file = renamed(texture.file, directory)
+        texture.cubefiles = [renamed(file, directory) if file else "" for file in texture.cubefiles]
         compilers.append(texture.compiler)
     for compiler in compilers:
         compiler.meshdir = compiler.texturedir = ""
-    (folder / "model.xml").write_text(spec.to_xml(), "utf-8")
+    spec.assets = {**spec.assets, **files}
+    return spec.to_xml(), files
 
 
 def check_copy(original: mujoco.MjModel, copy: mujoco.MjModel) -> None:
@@ -199,7 +234,23 @@ def mujoco_version() -> str:
     return mujoco.mj_versionString()
 
 
-def merge_assets(spec: mujoco.MjSpec) -> None:
-    """Let instances of one robot share its meshes and textures; before 3.17 each has its own, at the cost of memory."""
+def copy_options(options: mujoco.MjOption, model: mujoco.MjModel) -> None:
+    """Give a model all options of another one; before 3.10 they are copied one by one."""
+    for name in dir(options):
+        value = getattr(options, name)
+        if not name.startswith("_") and not callable(value):
+            setattr(model.opt, name, value)
+
+
+def merge_assets(spec: mujoco.MjSpec, folders: Iterable[Path]) -> None:
+    """Let instances of one robot share its meshes and textures; before 3.17 each has its own, at the cost of memory.
+
+    Args:
+        spec: What the robots were attached to.
+        folders: What `write_model` wrote of them.
+    """
     if hasattr(spec, "dedup_assets"):
         spec.dedup_assets()
+    if not _writes_archives(spec):
+        files = [file for folder in folders for file in folder.iterdir() if file.name != MODEL_FILE]
+        spec.assets = {file.name: file.read_bytes() for file in files}

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import logging
 import re
-import tempfile
-import zipfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property, lru_cache
@@ -21,7 +19,14 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client._mujoco import control_counts, control_starts, force_counts, force_starts, merge_assets
+from urlab_client._mujoco import (
+    control_counts,
+    control_starts,
+    export_model,
+    force_counts,
+    force_starts,
+    merge_assets,
+)
 from urlab_client.protocol.base import Vec3
 from urlab_client.protocol.controller_text import CUSTOM_TEXT, ControllerText
 from urlab_client.protocol.rotation import rotate, wxyz
@@ -200,12 +205,8 @@ class CompiledScene:
 
     @cached_property
     def _export(self) -> tuple[str, dict[str, bytes]]:
-        with tempfile.TemporaryDirectory() as folder, mujoco_messages():
-            archive = Path(folder) / "model.mjz"
-            self.spec.encode(str(archive))
-            with zipfile.ZipFile(archive) as content:
-                files = {name: content.read(name) for name in content.namelist() if not name.endswith("/")}
-        xml = files.pop("model.xml").decode()
+        with mujoco_messages():
+            xml, files = export_model(self.spec)
         names: dict[str, str] = {}
         for path in sorted(files):
             names[path] = _unique(path.rpartition("/")[2], set(names.values()))
@@ -335,7 +336,7 @@ def _compose(
             if converted is not None:
                 bodies.append(converted)
     _restore_world_references(spec, {f"{actor.prefix}world" for actor, _ in articulations})
-    merge_assets(spec)
+    merge_assets(spec, children)
     return spec, bodies
 
 
