@@ -357,7 +357,7 @@ class Regions:
         """Take the sinks that had to do without back to a region that has come to life again."""
         reader.silent = False
         for sink, source in self._sources.items():
-            if source.place().file == reader.place.file:
+            if _file_of(source) == reader.place.file:
                 self._subscriptions.detach(sink)
                 reader.sinks[sink] = None
 
@@ -404,3 +404,10 @@ class Regions:
 
     def _now(self) -> float:
         return 0.0 if self._loop is None else self._loop.time()
+
+
+def _file_of(source: RegionSource) -> str | None:
+    try:
+        return source.place().file
+    except ProtocolError:  # what a server calls its cameras may be anything
+        return None
