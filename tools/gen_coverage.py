@@ -7,17 +7,18 @@ spawn_grid`, `art.root_quat_w`); ops whose methods are generated are all called 
 
 from __future__ import annotations
 
-import argparse
 import ast
 import sys
 import tomllib
 from collections import defaultdict
-from pathlib import Path
+from collections.abc import Sequence
 
-ROOT = Path(__file__).resolve().parent.parent
-TESTS = ROOT / "tests"
+import generated
+from generated import REPOSITORY
+
+TESTS = REPOSITORY / "tests"
 ROWS = TESTS / "reference" / "rows.toml"
-OUTPUT = ROOT / "docs" / "coverage.md"
+OUTPUT = REPOSITORY / "docs" / "coverage.md"
 PARTS = ("aio", "conformance", "sync", "cli")
 SHOWN = 3
 
@@ -35,7 +36,7 @@ def uses() -> dict[tuple[str, str], list[str]]:
     for path in sorted(path for part in PARTS for path in (TESTS / part).glob("test_*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)) and node.name.startswith("test_"):
-                test = f"{path.relative_to(ROOT)}::{node.name}"
+                test = f"{path.relative_to(REPOSITORY)}::{node.name}"
                 for pair in {pair for child in ast.walk(node) for pair in read_by(child)}:
                     found[pair].append(test)
     return found
@@ -50,7 +51,7 @@ def read_by(node: ast.AST) -> list[tuple[str, str]]:
 
 
 def generated_methods() -> set[tuple[str, str]]:
-    sys.path.insert(0, str(ROOT / "src"))
+    sys.path.insert(0, str(REPOSITORY / "src"))
     from urlab_client.protocol.registry import OPS
 
     return {(op.ns, op.method) for op in OPS.values() if op.generated}
@@ -95,19 +96,12 @@ def render() -> tuple[str, list[str]]:
     return "\n".join(lines) + "\n", missing
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--check", action="store_true", help="fail on a stale page or an untested row, write nothing")
-    arguments = parser.parse_args()
+def main(argv: Sequence[str] | None = None) -> int:
     text, missing = render()
     for row in missing:
         print(f"no test uses {row}", file=sys.stderr)
-    if not arguments.check:
-        OUTPUT.write_text(text, encoding="utf-8")
-    elif not OUTPUT.exists() or OUTPUT.read_text(encoding="utf-8") != text:
-        print(f"{OUTPUT.relative_to(ROOT)} is stale: run python tools/gen_coverage.py", file=sys.stderr)
-        return 1
-    return 1 if missing else 0
+    status = generated.main("gen_coverage.py", argv, lambda: {OUTPUT: text})
+    return 1 if missing else status
 
 
 if __name__ == "__main__":

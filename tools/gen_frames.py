@@ -5,13 +5,12 @@ Run without arguments to write, with `--check` to fail when the file is stale.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
-ROOT = Path(__file__).resolve().parent.parent
-OUTPUT = ROOT / "docs" / "images" / "frames.svg"
+import generated
+
+OUTPUT = generated.REPOSITORY / "docs" / "images" / "frames.svg"
 
 STYLE = "text{font:14px sans-serif;fill:#223}.n{font-weight:bold}.c{font-family:monospace;font-size:13px}"
 AXES = {"x": "#c62828", "y": "#2e7d32", "z": "#1565c0"}
@@ -66,17 +65,7 @@ def render() -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--check", action="store_true", help="fail when the file is stale, write nothing")
-    arguments = parser.parse_args(argv)
-    text = render()
-    if OUTPUT.exists() and OUTPUT.read_text(encoding="utf-8") == text:
-        return 0
-    if arguments.check:
-        print(f"{OUTPUT.relative_to(ROOT)} is stale: run python tools/gen_frames.py", file=sys.stderr)
-        return 1
-    OUTPUT.write_text(text, encoding="utf-8")
-    return 0
+    return generated.main("gen_frames.py", argv, lambda: {OUTPUT: render()})
 
 
 if __name__ == "__main__":

@@ -7,17 +7,17 @@ arguments to write, with `--check` to fail when the file is stale.
 
 from __future__ import annotations
 
-import argparse
 import ast
 import re
-import subprocess
 import sys
 import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parent.parent
-SRC = ROOT / "src"
+import generated
+
+SRC = generated.REPOSITORY / "src"
 MESSAGES = SRC / "urlab_client" / "protocol" / "messages"
 TYPES = SRC / "urlab_client" / "protocol" / "types.py"
 OUTPUT = SRC / "urlab_client" / "aio" / "namespaces" / "_ops.py"
@@ -35,24 +35,8 @@ VECTORS = {
 }
 
 
-class Source:
+class Source(generated.Source):
     """The struct declarations of one module."""
-
-    def __init__(self, path: Path) -> None:
-        self.text = path.read_text(encoding="utf-8")
-        tree = ast.parse(self.text)
-        self.classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
-        self.aliases: dict[str, ast.expr] = {}
-        for node in tree.body:
-            if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
-                self.aliases[node.targets[0].id] = node.value
-            elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.value is not None:
-                self.aliases[node.target.id] = node.value
-
-    def segment(self, node: ast.AST) -> str:
-        text = ast.get_source_segment(self.text, node)
-        assert text is not None  # noqa: S101
-        return text
 
     def fields(self, cls: str) -> list[ast.AnnAssign]:
         node = self.classes[cls]
@@ -71,8 +55,8 @@ class Source:
             return self.annotation(node.slice.elts[0])
         if isinstance(node, ast.BinOp):
             return f"{self.annotation(node.left)} | {self.annotation(node.right)}"
-        if isinstance(node, ast.Name) and node.id in self.aliases and node.id not in VECTORS:
-            return self.annotation(self.aliases[node.id])
+        if isinstance(node, ast.Name) and node.id in self.assignments and node.id not in VECTORS:
+            return self.annotation(self.assignments[node.id])
         return self.segment(node)
 
 
@@ -177,7 +161,7 @@ def reply_annotation(op: Any) -> str:
     return source.annotation(field.annotation)
 
 
-def render() -> str:
+def render() -> dict[Path, str]:
     sys.path.insert(0, str(SRC))
     from urlab_client.protocol.registry import OPS
 
@@ -200,7 +184,7 @@ def render() -> str:
         *(f"from {module} import {', '.join(sorted(names))}" for module, names in sorted(used.items())),
         f"from urlab_client.protocol.types import {', '.join(types)}",
     ]
-    return formatted("\n".join([HEADER, *imports, "", body]))
+    return generated.tidied({OUTPUT: "\n".join([HEADER, *imports, "", body])}, SRC, "urlab_client")
 
 
 def groups_text(groups: dict[str, list[str]]) -> list[str]:
@@ -213,34 +197,8 @@ def groups_text(groups: dict[str, list[str]]) -> list[str]:
     return lines
 
 
-def formatted(text: str) -> str:
-    for command in (["check", "--select", "F401,I", "--fix", "--quiet"], ["format", "--quiet"]):
-        done = subprocess.run(  # noqa: S603
-            [sys.executable, "-m", "ruff", *command, "--stdin-filename", str(OUTPUT), "-"],
-            input=text,
-            capture_output=True,
-            text=True,
-            check=True,
-            cwd=ROOT,
-        )
-        text = done.stdout
-    return text
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--check", action="store_true", help="fail when the file is stale, write nothing")
-    arguments = parser.parse_args()
-    text = render()
-    current = OUTPUT.read_text(encoding="utf-8") if OUTPUT.exists() else ""
-    if text == current:
-        return 0
-    if arguments.check:
-        print(f"{OUTPUT.relative_to(ROOT)} is stale: run python tools/gen_ops.py", file=sys.stderr)
-        return 1
-    OUTPUT.write_text(text, encoding="utf-8")
-    print(f"wrote {OUTPUT.relative_to(ROOT)}")
-    return 0
+def main(argv: Sequence[str] | None = None) -> int:
+    return generated.main("gen_ops.py", argv, render)
 
 
 if __name__ == "__main__":

@@ -9,10 +9,11 @@ from threading import Event
 from typing import Any
 
 import pytest
+from bare_loop import run_bare
 
 from urlab_client import ServerUnreachable, URLabTimeoutError
 from urlab_client.aio import URLabClient
-from urlab_client.aio.transport import line
+from urlab_client.aio.transport import connection_status
 from urlab_client.protocol.messages.streams import ServerLost, ServerSilent
 
 Main = Callable[[URLabClient], Coroutine[Any, Any, None]]
@@ -23,19 +24,23 @@ def compute(seconds: float) -> None:
     Event().wait(seconds)
 
 
-@pytest.fixture(params=["asyncio", "uvloop"])
+LOOPS = ["selector", "bare", *(["uvloop"] if sys.platform != "win32" else [])]
+
+
+@pytest.fixture(params=LOOPS)
 def run(request: pytest.FixtureRequest, scripted: Any) -> Callable[[Main], None]:
-    """Run something with a client of the scripted server, on a loop of either kind."""
-    if request.param == "uvloop" and sys.platform == "win32":
-        pytest.skip("uvloop is not for Windows")
+    """Run something with a client of the scripted server, on a loop of each kind."""
 
     async def with_client(main: Main) -> None:
         async with URLabClient("tcp://127.0.0.1", step_port=scripted.port, local_model=False) as client:
             await main(client)
 
     def runner(main: Main) -> None:
-        if request.param == "asyncio":
-            asyncio.run(with_client(main))
+        if request.param == "bare":
+            run_bare(with_client(main))
+        elif request.param == "selector":
+            with asyncio.Runner(loop_factory=asyncio.SelectorEventLoop) as runner:
+                runner.run(with_client(main))
         else:
             import uvloop
 
@@ -92,7 +97,7 @@ async def test_the_server_is_not_taken_for_lost(client: Any, scripted: Any) -> N
         call = asyncio.create_task(client.meta())
         await asyncio.sleep(0)
         scripted.request()
-        compute(line.NOTICED_S + 0.5)
+        compute(connection_status.NOTICED_S + 0.5)
         assert await call
         assert await client.meta()
         told = list(iter(events.receive_nowait, None))

@@ -28,7 +28,7 @@ from urlab_client.aio import URLabClient, URLabPDController
 from urlab_client.protocol.rows import (
     ActuatorInfo,
     ControlPayload,
-    Topic,
+    StreamTopic,
     decode_camera,
     decode_gains,
     decode_row,
@@ -282,7 +282,7 @@ def test_any_step_reply_is_taken_over_whole_or_not_at_all(direct: Session) -> No
         assert direct.ask("step", STEP, direct.client.step) is None
         before = look(direct.client)
         error = direct.ask("step", reply, direct.client.step)
-        in_doubt = bool(direct.client._state.doubts)
+        in_doubt = bool(direct.client._state.pending)
         after = look(direct.client)
         assert in_doubt == (error is not None)
         assert error is None or (isinstance(error, ProtocolError) and same(before, after))
@@ -302,7 +302,7 @@ def test_any_push_reply_is_taken_over_whole_or_not_at_all(puppet: Session) -> No
         assert (mine.qpos == before[1]).all(), "in puppet mode the local state is the user's"
         assert mine.time == before[2]
         assert error is None or isinstance(error, ProtocolError)
-        assert bool(puppet.client._state.doubts) == (error is not None)
+        assert bool(puppet.client._state.pending) == (error is not None)
 
     check()
 
@@ -319,7 +319,7 @@ def test_any_reset_reply_is_taken_over_whole_or_not_at_all(direct: Session) -> N
         error = direct.ask("reset", reply, direct.client.reset)
         after = look(direct.client)
         assert error is None or (isinstance(error, ProtocolError) and same(before, after))
-        assert bool(direct.client._state.doubts) == (error is not None)
+        assert bool(direct.client._state.pending) == (error is not None)
 
     check()
 
@@ -328,7 +328,7 @@ def test_a_refused_step_is_not_in_doubt(direct: Session) -> None:
     gone = {"op": "error", "code": "session_expired", "message": "session 'x' is not the active one"}
     error = direct.ask("step", gone, direct.client.step)
     assert isinstance(error, SessionTakenOver)
-    assert not direct.client._state.doubts
+    assert not direct.client._state.pending
 
 
 def test_any_handshake_is_taken_over_whole_or_not_at_all(direct: Session) -> None:
@@ -380,7 +380,7 @@ def test_what_is_wrong_with_a_reply_is_said(direct: Session, place: tuple[Any, .
     assert isinstance(error, ProtocolError)
     assert problem in str(error)
     assert same(before, look(direct.client))
-    assert direct.client._state.doubts
+    assert direct.client._state.pending
 
 
 CRATE = ("entities", "crate")
@@ -465,7 +465,7 @@ def test_any_handshake_without_a_local_model(scripted: Any) -> None:
 def test_any_snapshot_is_taken_over_whole_or_not_at_all(direct: Session) -> None:
     client = direct.client
     direct.run(client.runtime.set_mode("live"))
-    reception = client._state._reception
+    reception = client._state._live
 
     def hand_in(document: dict[str, Any]) -> None:
         reception.on_message(b"state/full", msgspec.msgpack.encode(document))
@@ -570,7 +570,7 @@ def test_positions_that_nobody_can_have_written(direct: Session, count: int) -> 
 def test_any_row(topic: bytes, payload: bytes) -> None:
     for parsed in (b"bot/joint/elbow", b"bot/sensor/s", b"bot/base_state/root", b"scene/crate/qpos", topic):
         try:
-            decode_row(Topic.parse(parsed), payload)
+            decode_row(StreamTopic.parse(parsed), payload)
         except ProtocolError:
             continue
 

@@ -21,8 +21,8 @@ MESSAGE = 60  # bytes: more than some heartbeats, less than any request or reply
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[SimulatedServer]:
-    with SimulatedServer("arm", play=True) as made:
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimulatedServer]:
+    with SimulatedServer("arm", play=True, shm_dir=tmp_path_factory.mktemp("shm")) as made:
         yield made
 
 
@@ -72,6 +72,35 @@ async def test_a_step_whose_reply_was_lost_is_counted_and_not_repeated(client: U
     assert found.time == client.sim_time == pytest.approx(0.016)
     assert client.session_id == session
     assert (await client.step()).step == client.step_count == 9
+
+
+@pytest.mark.parametrize("transport", ["zmq", "shm"])
+async def test_with_nothing_in_doubt_everything_stays(server: SimulatedServer, transport: str) -> None:
+    async with URLabClient(**server.client_options() | {"step_mode": "direct", "transport": transport}) as client:
+        await client.discover()
+        for _ in range(2):
+            await client.step(5)
+            before, session = client.sim_time, client.session_id
+            found = await client.resync()
+            assert (found.session_held, found.session_renewed, found.playing, found.settled) == (
+                True,
+                False,
+                True,
+                True,
+            )
+            assert (found.steps_sent, found.steps_applied, found.reset_applied) == (0, 0, None)
+            assert (found.step, found.time) == (client.step_count, before)
+            assert client.session_id == session
+        assert (await client.step()).step == client.step_count == 11
+
+
+async def test_a_reconnection_alone_leaves_no_doubt(client: URLabClient, relay: Relay) -> None:
+    session = client.session_id
+    relay.cut()
+    await until(lambda: not client.connected)
+    found = await client.resync()
+    assert (found.session_held, found.session_renewed, found.steps_applied, found.step) == (True, False, 0, 5)
+    assert client.session_id == session
 
 
 async def test_a_step_that_never_arrived_is_shut_out_before_it_may_be_repeated(

@@ -232,6 +232,7 @@ async def test_an_expired_session_says_so_and_discover_recovers(client: Any, scr
     assert isinstance(info.value, URLabRPCError)
     assert isinstance(info.value, ConnectionError)
     assert info.value.code == "session_expired"
+    assert str(info.value).startswith("set_paused: session_expired: unknown session. Call discover() ")
     await client.discover()
     scripted.on("set_paused", PAUSED)
     assert await client.runtime.set_paused(True) is True

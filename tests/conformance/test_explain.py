@@ -29,6 +29,18 @@ async def test_no_session(connect: Any) -> None:
         assert "Call discover() first" in problems(await connect(server).explain())
 
 
+async def test_a_session_that_was_taken_over_is_not_a_problem_of_play(connect: Any) -> None:
+    with SimulatedServer("arm", play=True) as server:
+        client, other = connect(server), connect(server)
+        await client.discover()
+        await other.discover()
+        diagnosis = await client.explain()
+        assert not diagnosis.healthy
+        (taken,) = [finding for finding in diagnosis.findings if finding.verdict is Verdict.PROBLEM]
+        assert taken.subject == "session"
+        assert "Call discover()" in taken.text
+
+
 async def test_no_play(connect: Any) -> None:
     with SimulatedServer("arm") as server:
         client = connect(server, step_mode="direct")

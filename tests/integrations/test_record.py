@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
+import gc
 import json
 import math
 import os
@@ -23,6 +25,7 @@ from mcap.reader import make_reader
 from waiting import until
 
 import urlab_client
+from urlab_client import NotReady
 from urlab_client.aio import URLabClient as AsyncClient
 from urlab_client.integrations._feed.messages import (
     ArticulationMessage,
@@ -38,7 +41,7 @@ from urlab_client.integrations._feed.messages import (
 from urlab_client.integrations.record import RecordingError, Run, read_run, record
 from urlab_client.integrations.record import writer as writing
 from urlab_client.integrations.record.reader import _state
-from urlab_client.server import SimulatedServer
+from urlab_client.server import Faults, Refuse, SimulatedServer
 
 # Fields of Foxglove's schemas of these names.
 FOXGLOVE = {
@@ -275,6 +278,37 @@ def test_pictures_come_when_due_and_are_those_of_the_client(client: urlab_client
 
 
 # Live mode
+
+
+def test_a_step_that_fails_costs_no_picture(tmp_path: Path) -> None:
+    faults = Faults()
+    with (
+        SimulatedServer("arm", play=True, faults=faults, camera_size=(16, 12)) as server,
+        urlab_client.URLabClient(**server.client_options(), step_mode="direct") as client,
+    ):
+        client.discover()
+        with record(client, tmp_path / "run.mcap", cameras=["arm/wrist"], camera_hz=1) as recorder:
+            for _ in range(2):
+                with faults.add(Refuse("step", code="not_ready", times=1)), pytest.raises(NotReady):
+                    client.step()
+            assert client.step().cameras
+            assert not client.step().cameras
+        assert recorder.stats.frames == 1
+
+
+async def test_ended_streams_are_not_kept(server: SimulatedServer, tmp_path: Path) -> None:
+    async with AsyncClient(**server.client_options()) as client:
+        await client.discover()
+        async with record(client, tmp_path / "run.mcap"):
+            for _ in range(5):
+                await client.runtime.set_mode("direct")
+                await client.step()
+                await client.runtime.set_mode("live")
+                await client.step()
+            await until(lambda: sum(task.get_name() == "urlab-feed" for task in asyncio.all_tasks()) == 1)
+            gc.collect()
+            kept = [found for found in gc.get_objects() if isinstance(found, asyncio.Task)]
+            assert sum(task.get_name() == "urlab-feed" for task in kept) == 1
 
 
 async def test_live_mode_records_every_snapshot_and_modes_may_change(tmp_path: Path) -> None:

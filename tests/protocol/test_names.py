@@ -80,7 +80,8 @@ class TestLookUp:
             two_robots_and_an_arm()["robot"]
         twin = pickle.loads(pickle.dumps(caught.value))
         assert type(twin) is UnknownName
-        assert str(twin) == str(caught.value)
+        assert str(twin) == str(caught.value) == caught.value.args[0]
+        assert twin.args == caught.value.args
         assert twin.matches == caught.value.matches
 
     def test_an_alias_of_nothing_is_a_mistake(self) -> None:

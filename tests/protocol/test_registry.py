@@ -6,9 +6,9 @@ from typing import Annotated
 
 import pytest
 
-from urlab_client.protocol.base import Needs, Op, Reply, Request, doc
+from urlab_client.protocol.base import DialectName, Needs, Op, Reply, Request, doc
 from urlab_client.protocol.errors import RPC_ERRORS, URLabRPCError, rpc_error
-from urlab_client.protocol.registry import ENVELOPE_ERRORS, OPS, registry
+from urlab_client.protocol.registry import ENVELOPE_ERRORS, OPS, dialect_ops, registry
 
 
 class PokeOk(Reply, tag="poke_ok", kw_only=True):
@@ -66,9 +66,22 @@ def test_a_good_one_carries_everything() -> None:
     )
 
 
-def test_the_wire_has_64_ops() -> None:
-    assert len(OPS) == 64
-    assert sum(op.needs is Needs.EDITOR for op in OPS.values()) == 38
+@pytest.mark.parametrize(("dialect", "ops", "of_the_editor"), [("alpha", 64, 38), ("beta", 75, 39)])
+def test_the_wire_of_each_dialect(dialect: DialectName, ops: int, of_the_editor: int) -> None:
+    offered = dialect_ops(dialect)
+    assert len(offered) == ops
+    assert sum(op.needs is Needs.EDITOR for op in offered.values()) == of_the_editor
+    assert {op for op in OPS if OPS[op].job} == {
+        "import_xml",
+        "create_level",
+        "load_level",
+        "save_level",
+        "spawn_actor",
+        "spawn_grid",
+        "spawn_light",
+        "remove_actor",
+        "duplicate_actor",
+    }
 
 
 def test_every_code_of_the_envelope_has_its_class() -> None:

@@ -20,9 +20,9 @@ from scenes import ASSETS, BALL, BOT, hasty, make_scene
 
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.messages.session import ArticulationCommand, Step
-from urlab_client.server import engine as engine_module
-from urlab_client.server.controllers import ControllerConfig, ControlSource
-from urlab_client.server.engine import Engine, parse_control_source, parse_mode
+from urlab_client.server.physics import engine as engine_module
+from urlab_client.server.physics.controllers import ControllerConfig, ControlSource
+from urlab_client.server.physics.engine import Engine, parse_control_source, parse_mode
 from urlab_client.server.refusal import Refusal
 
 DT = 0.002

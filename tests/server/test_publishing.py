@@ -25,15 +25,16 @@ from urlab_client.protocol.rows import (
     JointRow,
     SceneRow,
     SensorRow,
-    Topic,
+    StreamTopic,
     TwistRow,
     decode_row,
     encode_gains,
 )
-from urlab_client.server import SimulatedServer, publishing
-from urlab_client.server.controllers import ControllerConfig
-from urlab_client.server.endpoint import bound_peers
-from urlab_client.server.engine import Engine
+from urlab_client.server import SimulatedServer
+from urlab_client.server.physics.controllers import ControllerConfig
+from urlab_client.server.physics.engine import Engine
+from urlab_client.server.streams import publishing
+from urlab_client.server.transport.endpoint import bound_peers
 
 Tick = list[tuple[bytes, bytes]]
 
@@ -136,7 +137,7 @@ def snapshot(tick: Tick) -> StateSnapshot:
 
 
 def rows(tick: Tick) -> list[Any]:
-    return [decode_row(Topic.parse(topic), payload) for topic, payload in tick[:-1]]
+    return [decode_row(StreamTopic.parse(topic), payload) for topic, payload in tick[:-1]]
 
 
 def stepped(topic: bytes, payload: bytes) -> bool:
@@ -289,7 +290,7 @@ def test_a_state_beyond_float32_does_not_stop_the_stream(play: Play) -> None:
     bench.wire.ask("step", qpos=[0, 0, 1, 1, 0, 0, 0, 1e300])
     bench.wire.ask("set_mode", mode="live")
     bench.wire.ask("set_paused", paused=True)
-    row = decode_row(Topic.parse(b"bot/joint/j"), bench.subscribe(b"bot/joint/j").recv_multipart()[1])
+    row = decode_row(StreamTopic.parse(b"bot/joint/j"), bench.subscribe(b"bot/joint/j").recv_multipart()[1])
     assert isinstance(row, JointRow)
 
 

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from wire import Wire
 
-from urlab_client.server.recording import Frame, Layout, decode_csv, decode_json, encode_json
+from urlab_client.server.physics.recording import Frame, JointLayout, decode_csv, decode_json, encode_json
 
 Serve = Callable[..., Wire]
 
@@ -76,7 +76,7 @@ def test_102_nothing_to_save(bot: Wire) -> None:
     assert (reply["op"], reply["code"]) == ("error", "path_not_writable")
 
 
-@pytest.mark.parametrize("path", ["/etc/ep.json", "../../../ep.json", "a\0b", ".", "..", "inner/"])
+@pytest.mark.parametrize("path", ["/etc/ep.json", "../../../ep.json", "a\0b", ".", "..", "inner/", "../../Levels"])
 def test_files_elsewhere_are_refused(bot: Wire, path: str) -> None:
     bot.ask("recording_start")
     bot.ask("step")
@@ -91,13 +91,25 @@ def test_links_lead_nowhere_else_and_models_stay(bot: Wire, tmp_path: Path, mode
     (replays / "out").symlink_to(tmp_path)
     bot.ask("recording_start")
     bot.ask("step")
-    for path in ("out/ep.json", str(models / "bot.xml")):
+    inside = tmp_path / "saved" / "mine" / "ep.json"
+    for path in ("out/ep.json", "inner/ep.json", str(inside), str(models / "bot.xml"), str(models / "ep.json")):
         reply = bot.raw({"op": "recording_save", "session_id": bot.session_id, "path": path})
         assert reply["code"] == "path_not_writable", path
     assert "<mujoco" in (models / "bot.xml").read_text()
-    inside = tmp_path / "saved" / "mine" / "ep.json"
-    assert bot.ask("recording_save", path=str(inside))["absolute_path"] == str(inside)
-    assert inside.exists()
+    assert not inside.exists()
+    named = replays / "ep.json"
+    assert bot.ask("recording_save", path=str(named))["absolute_path"] == str(named)
+
+
+def test_no_recording_is_in_the_way_of_levels_and_models(bot: Wire, models: Path) -> None:
+    bot.ask("recording_start")
+    bot.ask("step")
+    for path in ("../../Levels", "../../MuJoCoImports", "../../Levels/lab.json", "../../MuJoCoImports/bot"):
+        reply = bot.raw({"op": "recording_save", "session_id": bot.session_id, "path": path})
+        assert reply["code"] == "path_not_writable", path
+    bot.ask("stop_pie")
+    bot.ask("import_xml", path=str(models / "bot.xml"), force_reimport=True)
+    assert bot.ask("create_level", name="lab")["level_path"] == "/Game/Levels/lab"
 
 
 def frames_equal(ours: list[Frame], theirs: list[Frame]) -> bool:
@@ -113,7 +125,7 @@ joints = st.dictionaries(st.text(max_size=5), st.sampled_from([(7, 6), (4, 3), (
 
 @given(joints, st.lists(numbers, max_size=4), st.data())
 def test_what_is_saved_is_loaded(widths: dict[str, tuple[int, int]], times: list[float], data: Any) -> None:
-    layout = Layout.of((name, *width) for name, width in widths.items())
+    layout = JointLayout.of((name, *width) for name, width in widths.items())
     nq, nv = sum(width[0] for width in widths.values()), sum(width[1] for width in widths.values())
 
     def row(size: int) -> np.ndarray[Any, Any]:
@@ -209,10 +221,10 @@ SAVER = """
 import os, random, signal, sys, time
 from pathlib import Path
 import numpy as np
-from urlab_client.server.content import write_atomic
-from urlab_client.server.recording import Frame, Layout, encode_json
+from urlab_client.server.assets.content import write_atomic
+from urlab_client.server.physics.recording import Frame, JointLayout, encode_json
 
-layout = Layout.of([("j", 1, 1)])
+layout = JointLayout.of([("j", 1, 1)])
 file, chance = Path(sys.argv[1]), random.Random(0)
 
 def content(version):

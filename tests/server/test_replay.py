@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from scenes import BOT, make_scene
 from wire import Wire
 
-from urlab_client.server.recording import Frame, Layout
-from urlab_client.server.replay import Player
+from urlab_client.server.physics.recording import Frame, JointLayout
+from urlab_client.server.physics.replay import Player
 
 
 @pytest.fixture
@@ -156,7 +156,7 @@ def test_nothing_to_play_and_nothing_to_stop(bot: Wire) -> None:
 @given(st.lists(st.floats(-3, 3), min_size=2, max_size=6), st.integers(1, 200))
 def test_poses_lie_between_their_frames(values: list[float], n_steps: int) -> None:
     scene = make_scene(bot=BOT)
-    layout = Layout.of([("bot_j", 1, 1)])
+    layout = JointLayout.of([("bot_j", 1, 1)])
     frames = [Frame(0.01 * at, layout, np.array([value]), np.zeros(1)) for at, value in enumerate(values)]
     one, many = (Player(scene, frames, relative=False) for _ in range(2))
     for _ in range(n_steps):

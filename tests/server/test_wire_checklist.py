@@ -19,7 +19,7 @@ from scenes import hasty as hasty_engine
 from wire import Wire, float32, write_level
 
 from urlab_client.protocol.base import Needs
-from urlab_client.protocol.registry import OPS
+from urlab_client.protocol.dialects import ALPHA
 from urlab_client.server import ControllerConfig, SimulatedServer
 
 Serve = Callable[..., Wire]
@@ -109,6 +109,23 @@ def test_editor_05_levels_are_loaded_by_path(editor: Wire) -> None:
     assert editor.ask("load_level", level_path="lab")["level_path"] == "/Game/Levels/lab"
     assert editor.ask("load_level", level_path="", name="lab")["level_path"] == "/Game/Levels/lab"
     assert editor.refused("load_level", level_path="nowhere") == "load_level_failed"
+
+
+def test_levels_are_named_by_object_path_too(editor: Wire) -> None:
+    assert editor.ask("create_level", name="/Game/Levels/G1.G1")["level_path"] == "/Game/Levels/G1"
+    assert editor.refused("create_level", name="G1") == "create_level_failed"
+    editor.ask("ensure_manager")
+    editor.ask("save_level")
+    editor.ask("create_level", name="G2.G2")
+    assert editor.ask("load_level", level_path="/Game/Levels/G1.G1")["level_path"] == "/Game/Levels/G1.G1"
+    assert editor.ask("current_level")["level_path"] == "/Game/Levels/G1"
+    editor.ask("load_level", level_path="G2.g2")
+    assert editor.ask("begin_pie", level_path="/Game/Levels/G1.G1")["state"] == "ready"
+    editor.ask("stop_pie")
+    assert editor.ask("current_level")["level_path"] == "/Game/Levels/G1"
+    assert editor.ask("destroy_asset", asset_path="/Game/Levels/G1.G1")["was_found"] is True
+    for wrong in ("/Game/Levels/G2.G1", "/Game/Levels/G2.", "/Game/Levels/.G2", "G2.G2.G2"):
+        assert editor.refused("load_level", level_path=wrong) == "load_level_failed"
 
 
 def test_editor_06_a_saved_level_comes_back(editor: Wire, models: Path) -> None:
@@ -387,7 +404,7 @@ def test_editor_33_untracking(editor: Wire, models: Path) -> None:
     assert editor.ask("untrack") == {"op": "untrack_ok", "was_tracking": False}
 
 
-@pytest.mark.parametrize("op", [op.name for op in OPS.values() if op.needs is not Needs.NOTHING])
+@pytest.mark.parametrize("op", [op.name for op in ALPHA.ops.values() if op.needs is not Needs.NOTHING])
 def test_editor_35_session_before_fields(shared: Wire, op: str) -> None:
     for session in ({}, {"session_id": ""}, {"session_id": "0"}, {"session_id": shared.session_id.upper()}):
         reply = shared.raw({"op": op, **session})

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import importlib
-import importlib.util
 import inspect
 import os
 import shutil
@@ -22,23 +21,12 @@ from typing import Any
 
 import pytest
 
+import gen_sync
+from urlab_client.aio.namespaces._base import Namespace
 from urlab_client.protocol.errors import ClientClosed
 
-TOOL = Path(__file__).resolve().parents[2] / "tools" / "gen_sync.py"
+TOOL = Path(gen_sync.__file__)
 DATA = Path(__file__).parent / "data"
-
-
-def load_tool() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("gen_sync", TOOL)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["gen_sync"] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
-
-
-gen_sync = load_tool()
 
 
 def plan_for(folder: Path) -> Any:
@@ -46,10 +34,10 @@ def plan_for(folder: Path) -> Any:
         package=folder / "toylab",
         shown=folder,
         modules=("client.py", "robots.py", "streams.py", "namespaces/*.py"),
-        roots=frozenset({"Client"}),
+        root="Client",
+        dropped=frozenset({"Namespace"}),
         exposed=frozenset({"_data_lock"}),
         renames={
-            "AsyncIterator": "Iterator",
             "__aiter__": "__iter__",
             "__anext__": "__next__",
             "__aenter__": "__enter__",
@@ -147,7 +135,7 @@ class TestCommand:
             "import pathlib, test_gen_sync as t\n"
             "sys.exit(t.gen_sync.main(['--check'], t.plan_for(pathlib.Path(sys.argv[3]))))"
         )
-        for seed in "1", "2", "3":
+        for seed in "1", "2":
             arguments = [str(TOOL.parent), str(Path(__file__).parent), str(tmp_path)]
             done = subprocess.run(
                 [sys.executable, "-c", script, *arguments],
@@ -159,11 +147,6 @@ class TestCommand:
             )
             assert (done.returncode, done.stderr) == (0, "")
 
-    def test_quotes_around_an_annotation_make_no_difference(self, plan: Any) -> None:
-        gen_sync.main([], plan)
-        edit(plan.package / "aio" / "client.py", "to: Body | None = None", 'to: "Body | None" = None')
-        assert gen_sync.main(["--check"], plan) == 0
-
     def test_keeps_the_type_checkers_pragmas_of_a_signature(self, plan: Any) -> None:
         signature = "async def set_gains(self, kp: float = 1.5e-2) -> dict[str, float]:"
         pragma = "  # pyright: ignore[reportRedeclaration]"
@@ -174,7 +157,7 @@ class TestCommand:
 
     def test_needs_no_installed_package(self) -> None:
         done = subprocess.run(
-            [sys.executable, "-I", "-S", str(TOOL), "--help"], check=False, capture_output=True, text=True
+            [sys.executable, "-E", "-s", "-S", str(TOOL), "--help"], check=False, capture_output=True, text=True
         )
         assert done.returncode == 0
         assert "--check" in done.stdout
@@ -203,16 +186,18 @@ REFUSED: dict[str, tuple[str, str]] = {
     "no return annotation": ("async def step(self): ...", "Probe.step needs a return annotation"),
     "attribute without description": ("speed: float", "Probe.speed is public: describe it"),
     "class variable": ('limit: ClassVar[int] = 3\n"""Limit."""', "Probe.limit: class variables"),
-    "plain class attribute": ("limit = 3", "Probe.limit: annotate it"),
-    "conditional member": ("if sys.platform:\n    def f(self) -> None: ...", "this kind of statement"),
+    "plain class attribute": ("limit = 3", "Probe: only methods and annotated attributes"),
+    "conditional member": ("if sys.platform:\n    def f(self) -> None: ...", "only methods and annotated attributes"),
+    "any number of arguments": ("async def pick(self, *names: str) -> None: ...", "Probe.pick: *args and positional"),
+    "positional-only": ("async def pick(self, name: str, /) -> None: ...", "Probe.pick: *args and positional-only"),
+    "mirrored object as argument": ("def watch(self, robot: Robot) -> None: ...", "robot takes a mirrored class"),
+    "the same in quotes": ('def watch(self, robot: "Robot | None") -> None: ...', "robot takes a mirrored class"),
     "callback taking a mirrored object": (
         "def watch(self, on_robot: Callable[[Robot], None]) -> None: ...",
-        "on_robot: only C, C | None and other unions",
+        "on_robot takes a mirrored class",
     ),
-    "list of mirrored objects as argument": (
-        "def watch(self, robots: list[Robot]) -> None: ...",
-        "robots: only C, C | None and other unions",
-    ),
+    "list of mirrored objects": ("def all(self) -> list[Robot]: ...", "list[Robot] cannot be mapped"),
+    "result in quotes": ('def get(self) -> "Robot": ...', "cannot be mapped"),
     "mirrored object as key": ("def ids(self) -> dict[Robot, int]: ...", "dict[Robot, int] cannot be mapped"),
     "mirrored object or another": ("def get(self) -> Robot | int | str: ...", "Robot | int | str cannot be mapped"),
 }
@@ -251,6 +236,11 @@ class TestRefusals:
         ("old", "new", "message"),
         [
             ("class SceneOps(Namespace)", "class SceneOps(Namespace, dict[str, int])", "cannot derive from dict"),
+            (
+                "class SceneOps",
+                "class Robot:\n    pass\n\n\nclass SceneOps",
+                "Robot is the name of another mirrored class",
+            ),
             ("class SceneOps(Namespace)", "@final\nclass SceneOps(Namespace)", "class keywords and decorators"),
             ("from toylab.aio.session", "from ..session", "relative import"),
             ("class SceneOps", "async def connect() -> None: ...\n\n\nclass SceneOps", "async function connect"),
@@ -263,22 +253,13 @@ class TestRefusals:
         assert error.startswith("toylab/aio/namespaces/_ops.py:")
         assert message in error
 
-    def test_of_members_that_an_unmirrored_base_would_lose(self, plan: Any, capsys: pytest.CaptureFixture[str]) -> None:
-        edit(
-            plan.package / "aio" / "session.py",
-            "class Namespace:",
-            "class Namespace:\n    def reset(self) -> None: ...\n",
-        )
-        assert gen_sync.main([], plan) == 1
-        assert "SceneOps would lose what it inherits: mirror toylab/aio/session.py" in capsys.readouterr().err
-
     @pytest.mark.parametrize(
         ("change", "message"),
         [
             ({"renames": {"__aenter__": "__enter__", "aopen": "open"}}, "rename rules that nothing needs: aopen"),
             ({"exposed": frozenset({"_data_lock", "_gone"})}, "exposed names that no class has: _gone"),
             ({"modules": ("client.py", "cameras.py")}, "toylab/aio/cameras.py: no such module"),
-            ({"roots": frozenset({"Scene"})}, "Scene is constructed by users: write its __init__ here"),
+            ({"root": "Scene"}, "Scene is constructed by users: write its __init__ here"),
         ],
     )
     def test_of_the_tables(
@@ -291,7 +272,8 @@ class TestRefusals:
         edit(plan.package / "aio" / "robots.py", '        """Push it."""\n', "")
         assert gen_sync.main([], plan) == 1
         error = capsys.readouterr().err
-        assert error.startswith("toylab/aio/robots.py: its mirror does not pass ruff check")
+        assert error.startswith("what was generated does not pass ruff check; correct its source:\n")
+        assert "toylab/sync/robots.py:" in error
         assert "D102" in error
 
 
@@ -323,8 +305,8 @@ class TestResult:
             lab("sync.client").Client("")
 
     def test_calls_run_on_the_calling_thread_with_their_arguments(self, client: Any) -> None:
-        assert client.step(3, 4, 5, timeout=1.0) == 3
-        assert client._aio._session.log[-1] == ("step", 3, (4, 5), 1.0)
+        assert client.step(3, timeout=1.0) == 3
+        assert client._aio._session.log[-1] == ("step", 3, 1.0)
         assert client.step() == 1
         assert client._aio._session.threads == {threading.current_thread().name}
 
@@ -361,7 +343,6 @@ class TestResult:
         assert client.robots is client.robots
         assert client.bodies_by_id[2] is dog
         assert client.find("dog_1") is dog
-        assert client.all_bodies()[1] is dog
         assert dog.controller is dog.controller
         scene = client.scene
         assert client.scene is scene
@@ -384,16 +365,6 @@ class TestResult:
     ) -> None:
         assert lab("sync.robots").Joint is lab("aio.robots").Joint
         assert client.robots["dog"].joints is client._aio.robots["dog"].joints
-
-    def test_arguments_are_unwrapped(self, client: Any) -> None:
-        dog, ball = client.robots["dog"], client.bodies_by_id[1]
-        both = client.attach(dog, ball)
-        assert both[0] is dog
-        assert both[1] is ball
-        assert client.attach(dog)[0] is dog
-        assert client.look(dog) == "object"
-        assert client.look("dog") == "name"
-        assert type(client).describe(client, True) == "Client True"
 
     def test_properties_can_be_set_where_the_source_lets_them(self, client: Any) -> None:
         ball = client.bodies_by_id[1]
@@ -418,7 +389,6 @@ class TestResult:
         assert client._data_lock is client._aio._data_lock
         assert len(client) == 1
         assert repr(client) == "<Client>"
-        assert type(client).default_port() == 5559
 
     def test_a_traceback_shows_one_facade_line(self, client: Any) -> None:
         with pytest.raises(LookupError) as caught:
@@ -458,3 +428,7 @@ class TestResult:
 
 def test_the_checked_in_facade_is_current(capsys: pytest.CaptureFixture[str]) -> None:
     assert gen_sync.main(["--check"]) == 0, capsys.readouterr().err
+
+
+def test_the_base_class_that_the_facade_does_without_has_nothing_public() -> None:
+    assert [name for name in vars(Namespace) if not name.startswith("_")] == []

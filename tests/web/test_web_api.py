@@ -21,7 +21,7 @@ from urlab_client.aio import URLabClient
 from urlab_client.protocol.registry import OPS
 from urlab_client.server import SimulatedServer
 from urlab_client.web import Access, app
-from urlab_client.web.lease import Lease, NotDriving, Viewer
+from urlab_client.web.driving_lease import DrivingLease, NotDriving, Viewer
 
 
 @pytest.fixture(scope="module")
@@ -160,6 +160,25 @@ def test_states_are_dropped_and_not_queued_for_a_viewer_that_is_busy(http: TestC
         while (message := busy.receive_json())["type"] != "state":
             pass
         assert message["seq"] >= ahead
+
+
+@pytest.mark.parametrize("path", ["/api/live", "/api/cameras/arm/wrist/live"])
+def test_a_binary_frame_closes_its_socket_and_no_other(http: TestClient, path: str) -> None:
+    with http.websocket_connect("ws://localhost/api/live") as other:
+        with http.websocket_connect(f"ws://localhost{path}") as socket:
+            socket.send_bytes(b"\x00")
+            while (said := socket.receive())["type"] != "websocket.close":
+                pass
+            assert said["code"] == 1003
+        heard(other, "status")
+
+
+def test_a_message_too_deep_to_read_is_refused(http: TestClient) -> None:
+    deep = '{"type": "name", "more": ' + "[" * 100_000 + "]" * 100_000 + "}"
+    with http.websocket_connect("ws://localhost/api/live") as live:
+        live.send_text(deep)
+        assert heard(live, "refused")["error"]["code"] == "bad_request"
+    assert http.post("/api/step", content=deep).status_code == 400
 
 
 def test_one_drives_and_the_others_wait(http: TestClient) -> None:
@@ -317,7 +336,7 @@ def test_it_can_be_mounted_in_a_backend_that_has_its_own_door(server: SimulatedS
 
 def test_the_controls_are_lost_by_not_using_them() -> None:
     now = 0.0
-    lease = Lease(10.0, clock=lambda: now)
+    lease = DrivingLease(10.0, clock=lambda: now)
     ann, bob = Viewer("a", "Ann"), Viewer("b", "Bob")
     lease.use(ann)
     now = 9.0

@@ -18,25 +18,25 @@ from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.explain import diagnose
 from urlab_client.aio.launch import SCHEME, LaunchedTransport
-from urlab_client.aio.mirror import model_names
+from urlab_client.aio.live.publishers import Publishers
+from urlab_client.aio.model.mirror import model_names
 from urlab_client.aio.namespaces.debug import DebugNamespace
+from urlab_client.aio.namespaces.farm import FarmNamespace
 from urlab_client.aio.namespaces.outliner import OutlinerNamespace
 from urlab_client.aio.namespaces.recording import RecordingNamespace, ReplayNamespace
 from urlab_client.aio.namespaces.runtime import RuntimeNamespace
 from urlab_client.aio.namespaces.scene import SceneNamespace
 from urlab_client.aio.namespaces.sim import SimNamespace
 from urlab_client.aio.namespaces.viewport import ViewportNamespace
-from urlab_client.aio.publishers import Publishers
-from urlab_client.aio.recovery import resync
 from urlab_client.aio.session import Session
-from urlab_client.aio.state import SimState
+from urlab_client.aio.state.connection_monitor import ConnectionMonitor
+from urlab_client.aio.state.recovery import resync
+from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS, Stream
-from urlab_client.aio.transport.base import Transport as TransportProtocol
-from urlab_client.aio.transport.base import TransportStats
+from urlab_client.aio.transport.base import RequestTransport, TransportStats
 from urlab_client.aio.transport.curve import ClientKeys, client_keys, is_local
-from urlab_client.aio.transport.shm import SharedMemory, ShmTransport
+from urlab_client.aio.transport.shm import SharedMemoryRegions, ShmTransport
 from urlab_client.aio.transport.zmq import ZmqTransport
-from urlab_client.aio.watch import Watch
 from urlab_client.protocol.base import Reply, Request
 from urlab_client.protocol.codec import op_of
 from urlab_client.protocol.enums import CameraTiming, ObservationLevel, StepMode, Transport
@@ -45,7 +45,7 @@ from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.protocol.messages.session import Meta as MetaRequest
 from urlab_client.protocol.messages.session import MetaOk, OpInfo, Reset, ResetOk, Step, StepOk
 from urlab_client.protocol.messages.streams import ClientEvent, RowSample, StateSnapshot, StreamPolicy
-from urlab_client.protocol.names import NameMap
+from urlab_client.protocol.names import NameMap, unknown_name
 from urlab_client.protocol.rows import TopicKind
 from urlab_client.protocol.types import ClientConfig, Diagnosis, Resync
 
@@ -157,7 +157,7 @@ class URLabClient:
         if rcv_timeout_ms <= 0:
             raise ValueError(f"rcv_timeout_ms must be above 0, got {rcv_timeout_ms}")
         keys = client_keys(address, self._config.server_key, self._config.client_key)
-        memory = SharedMemory(shm_dir) if Transport(transport) is Transport.SHM else None
+        memory = SharedMemoryRegions(shm_dir) if Transport(transport) is Transport.SHM else None
         plain = _transport(address, step_port, keys, shm=memory is not None)
         self._transport = plain if memory is None else ShmTransport(plain, memory)
         self._session = Session(self._transport, default_timeout=rcv_timeout_ms / 1000, json=encoding == "json")
@@ -165,6 +165,7 @@ class URLabClient:
             lambda: self._transport.endpoint,
             lambda: self._transport.state_port or state_port,
             default_timeout=rcv_timeout_ms / 1000,
+            live=lambda: self._state.mode is StepMode.LIVE,
             keys=keys,
             memory=memory,
         )
@@ -178,8 +179,8 @@ class URLabClient:
             trusted=trust_server or keys is not None or is_local(address),
             live_pictures=live_pictures,
         )
-        self._watch = Watch(self._session, self._state)
-        self._transport.on_event = self._watch.on_line
+        self._watch = ConnectionMonitor(self._session, self._state)
+        self._transport.on_event = self._watch.on_connection
         self._closed = False
         self._scene = SceneNamespace(self._session)
         self._sim = SimNamespace(self._session, self._state)
@@ -187,6 +188,7 @@ class URLabClient:
         self._outliner = OutlinerNamespace(self._session)
         self._debug = DebugNamespace(self._session)
         self._viewport = ViewportNamespace(self._session)
+        self._farm = FarmNamespace(self._session)
         self._recording = RecordingNamespace(self._session)
         self._replay = ReplayNamespace(self._session)
 
@@ -221,6 +223,11 @@ class URLabClient:
     def viewport(self) -> ViewportNamespace:
         """The editor's perspective viewport."""
         return self._viewport
+
+    @property
+    def farm(self) -> FarmNamespace:
+        """Sharing servers among clients."""
+        return self._farm
 
     @property
     def recording(self) -> RecordingNamespace:
@@ -432,10 +439,10 @@ class URLabClient:
                     record.drop_wrenches(wrenches)
             state.absorb(reply, "step", into_mirror=state.mode is not StepMode.PUPPET)
         except BaseException as error:
-            state.doubts.add_steps(state, error, 1 if state.mode is StepMode.PUPPET else max(n_steps, 1), carried)
+            state.pending.add_steps(state, error, 1 if state.mode is StepMode.PUPPET else max(n_steps, 1), carried)
             raise
-        if state.doubts:
-            state.doubts.clear()
+        if state.pending:
+            state.pending.clear()
         if state.mode is StepMode.PUPPET:
             with state.mirror.lock:
                 state.mirror.perturb(reply.perturbation)
@@ -479,9 +486,9 @@ class URLabClient:
             reply = await self._session.call(request, timeout=timeout)
             self._state.absorb_reset(reply, request.keyframe_name)
         except BaseException as error:
-            self._state.doubts.add_reset(self._state, error, request.keyframe_name)
+            self._state.pending.add_reset(self._state, error, request.keyframe_name)
             raise
-        self._state.doubts.clear()
+        self._state.pending.clear()
         return reply
 
     async def resync(self, *, timeout: Timeout = DEFAULT) -> Resync:
@@ -677,7 +684,7 @@ class URLabClient:
         for name in include:
             if self._state.camera(name) is None:
                 known = [f"{art.prefix}/{camera}" for art in self.articulations.values() for camera in art.cameras]
-                raise KeyError(f"no camera {name!r}; there are: {', '.join(known) or 'none'}")
+                raise unknown_name("camera", name, [*known, *self.global_cameras])
         return {name: str(CameraTiming(timing)) for name, timing in include.items()}
 
     def _joint_values(self, key: str, values: Mapping[str, float]) -> dict[str, float]:
@@ -702,7 +709,7 @@ class URLabClient:
         raise UnknownKeyframe("unknown_keyframe", f"{problem}. Nothing was sent.", op="reset")
 
 
-def _transport(address: str, step_port: int, keys: ClientKeys | None, *, shm: bool) -> TransportProtocol:
+def _transport(address: str, step_port: int, keys: ClientKeys | None, *, shm: bool) -> RequestTransport:
     if address.startswith(SCHEME):
         return LaunchedTransport(address, shm=shm)
     scheme, separator, rest = address.partition("://")

@@ -14,9 +14,9 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from urlab_client.aio.session import Session
-from urlab_client.aio.state import SimState
+from urlab_client.aio.state.sim_state import SimState
 from urlab_client.protocol.enums import ControlMode, PIEState, StepMode
-from urlab_client.protocol.errors import RPC_ERRORS, URLabError
+from urlab_client.protocol.errors import RPC_ERRORS, SessionTakenOver, URLabError
 from urlab_client.protocol.messages.session import Meta
 from urlab_client.protocol.messages.sim import PieStatus
 from urlab_client.protocol.types import ClientConfig, Diagnosis, Finding, Verdict
@@ -132,7 +132,8 @@ async def _play(session: Session, state: SimState) -> tuple[Finding, bool]:
     except URLabError as error:  # no answer, too: the editor's main thread may be stuck
         if isinstance(error, RPC_ERRORS["unknown_op"]):
             return Finding(Verdict.NOTE, "play", "A packaged build: its play state cannot be asked for."), True
-        return Finding(Verdict.PROBLEM, "play", str(error)), False
+        subject = "session" if isinstance(error, SessionTakenOver) else "play"
+        return Finding(Verdict.PROBLEM, subject, str(error)), False
     if second.state != PIEState.READY:
         advice = {
             PIEState.OFF: "Call sim.start().",

@@ -1,7 +1,8 @@
 """`sim://…` addresses: a simulated server in a child process, started when first needed and stopped with the client.
 
 The child is this package's own command line, so that the client needs no import of the server. It ends when its
-standard input closes: it cannot outlive the client, however that dies.
+standard input closes: it cannot outlive the client, however that dies. A Ctrl-C that interrupts the client does not
+reach it: the simulation is still there afterwards.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from urllib.parse import parse_qsl
 import msgspec
 from msgspec import Struct
 
+from urlab_client._children import APART
 from urlab_client.aio.transport.base import TransportStats
 from urlab_client.aio.transport.zmq import ZmqTransport
 from urlab_client.protocol.base import Op
@@ -227,9 +229,9 @@ class LaunchedTransport:
 async def _start(command: Sequence[str]) -> asyncio.subprocess.Process | _Watched:
     pipe = subprocess.PIPE
     try:
-        return await asyncio.create_subprocess_exec(*command, stdin=pipe, stdout=pipe, stderr=pipe)
+        return await asyncio.create_subprocess_exec(*command, stdin=pipe, stdout=pipe, stderr=pipe, **APART)
     except NotImplementedError:  # what asyncio says of a loop that starts no processes
-        return _Watched(subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe))  # noqa: ASYNC220, S603
+        return _Watched(subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, **APART))  # noqa: ASYNC220, S603
 
 
 class _Watched:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client.cli._files import replaced
-from urlab_client.server.geometry import Box, box_around
+from urlab_client.server.editor.geometry import Box, box_around
 
 if TYPE_CHECKING:
     import mujoco
@@ -60,8 +60,8 @@ def draw_state(model: mujoco.MjModel, data: mujoco.MjData, path: Path) -> str:
     """
     import mujoco  # noqa: PLC0415
 
-    with tempfile.TemporaryDirectory(prefix="urlab-picture-") as scratch:
-        folder = Path(scratch)
+    with tempfile.TemporaryDirectory(prefix="urlab-picture-") as name:
+        folder = Path(name)
         mujoco.mj_saveModel(model, str(folder / "model.mjb"))
         np.savez(folder / "state.npz", qpos=data.qpos, mocap_pos=data.mocap_pos, mocap_quat=data.mocap_quat)
         reasons: list[str] = []

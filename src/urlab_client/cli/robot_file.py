@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 
 from urlab_client.cli._failure import CommandError, one_line
-from urlab_client.server.bundled import bundled_models
-from urlab_client.server.content import mujoco_messages
-from urlab_client.server.geometry import box_around
+from urlab_client.server.assets.bundled_robots import bundled_models
+from urlab_client.server.assets.content import mujoco_messages
+from urlab_client.server.editor.geometry import box_around
 
 __all__ = ["RobotFile", "read_robot"]
 

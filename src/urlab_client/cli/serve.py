@@ -22,8 +22,8 @@ from urlab_client.protocol.controller_text import ControllerText
 from urlab_client.protocol.enums import CameraMode, StepMode
 
 if TYPE_CHECKING:
-    from urlab_client.server.guard import CurveServer
     from urlab_client.server.simulated import SimulatedServer
+    from urlab_client.server.transport.curve_authentication import CurveServer
 
 __all__ = ["add_parser", "run"]
 
@@ -85,7 +85,7 @@ def add_parser(commands: Commands) -> None:
         "serve",
         help="run a simulated server",
         description="Run a simulated server that any URLab client can talk to. It ends with exit code 0 on SIGINT "
-        "(Ctrl-C) and SIGTERM.",
+        "(Ctrl-C) and SIGTERM, and with 2 when it fails.",
     )
     parser.add_argument(
         "models",
@@ -202,7 +202,8 @@ def add_parser(commands: Commands) -> None:
     life.add_argument(
         "--until-eof",
         action="store_true",
-        help="also end when standard input closes, so that the server cannot outlive whoever holds the other end",
+        help="also end when standard input closes, so that the server cannot outlive whoever holds the other end; "
+        "SIGINT is ignored then, unless standard input is a terminal",
     )
     parser.set_defaults(run=run)
 
@@ -211,32 +212,35 @@ def run(arguments: ServeArguments) -> int:
     """Serve until told to stop.
 
     Raises:
-        CommandError: An option cannot be honoured, or a model cannot be used.
+        CommandError: An option cannot be honoured, a model cannot be used, or a thread of the server died.
         OSError: A port is in use, or a folder cannot be used.
     """
     _check_ports(arguments)
     events: _Events = queue.SimpleQueue()
-    _stop_on_signals(events)
+    _stop_on_signals(events, ignore_interrupt=arguments.until_eof and not os.isatty(0))
     if arguments.until_eof:
         threading.Thread(target=_watch_input, args=[events], name="urlab-stdin", daemon=True).start()
     import_mujoco()
     _check_paths(arguments)
-    from urlab_client.server.heap import share_heaps  # noqa: PLC0415
-    from urlab_client.server.scratch import Scratch  # noqa: PLC0415
+    from urlab_client.server.system.allocator import limit_arenas  # noqa: PLC0415
+    from urlab_client.server.system.temporary_folder import TemporaryFolder  # noqa: PLC0415
 
-    share_heaps()
+    limit_arenas()
 
-    with Scratch() as scratch:
-        server = _server(arguments, arguments.saved_dir or scratch.path)
+    with TemporaryFolder() as temporary:
+        server = _server(arguments, arguments.saved_dir or temporary.path)
         starter = _Starter(server, events)
         starter.start()
         if _next(events) is _Event.STARTED:
             if starter.error is not None:
                 raise starter.error
             with server:
+                server.add_failure_callback(lambda _: events.put(_Event.FAILED))
                 _announce(server, arguments)
-                while _next(events) is not _Event.STOP:
+                while (event := _next(events)) is _Event.STARTED:
                     pass
+                if event is _Event.FAILED:
+                    raise CommandError(str(server.failure))
             return 0
         starter.join(_PATIENCE_S)
         stuck = starter.is_alive()
@@ -253,6 +257,7 @@ class _Event(Enum):
 
     STARTED = "started"
     STOP = "stop"
+    FAILED = "failed"
 
 
 _Events: TypeAlias = "queue.SimpleQueue[_Event]"  # unlike a threading.Event, it may be used in signal handlers
@@ -285,11 +290,12 @@ def _next(events: _Events) -> _Event:
             return events.get(timeout=_WAIT_S)
 
 
-def _stop_on_signals(events: _Events) -> None:
+def _stop_on_signals(events: _Events, *, ignore_interrupt: bool) -> None:
     def stop(number: int, frame: FrameType | None) -> None:
         events.put(_Event.STOP)
 
-    signal.signal(signal.SIGINT, stop)
+    # Ctrl-C reaches all processes of a terminal, but is meant for the one that a user runs and that holds our input.
+    signal.signal(signal.SIGINT, signal.SIG_IGN if ignore_interrupt else stop)
     signal.signal(signal.SIGTERM, stop)
     hangup = getattr(signal, "SIGHUP", None)
     if hangup is not None and signal.getsignal(hangup) != signal.SIG_IGN:  # nohup wants it ignored
@@ -305,7 +311,7 @@ def _watch_input(events: _Events) -> None:
 
 
 def _server(arguments: ServeArguments, saved_dir: Path) -> SimulatedServer:
-    from urlab_client.server.controllers import ControllerConfig  # noqa: PLC0415
+    from urlab_client.server.physics.controllers import ControllerConfig  # noqa: PLC0415
     from urlab_client.server.simulated import SimulatedServer  # noqa: PLC0415
 
     try:
@@ -337,7 +343,7 @@ def _server(arguments: ServeArguments, saved_dir: Path) -> SimulatedServer:
 
 
 def _curve(arguments: ServeArguments) -> CurveServer | None:
-    from urlab_client.server.guard import CurveServer  # noqa: PLC0415
+    from urlab_client.server.transport.curve_authentication import CurveServer  # noqa: PLC0415
 
     if arguments.server_key is None:
         if arguments.allow_client or arguments.allow_any_client:
@@ -379,7 +385,7 @@ def _check_ports(arguments: ServeArguments) -> None:
 
 
 def _check_paths(arguments: ServeArguments) -> None:
-    from urlab_client.server.bundled import bundled_models  # noqa: PLC0415
+    from urlab_client.server.assets.bundled_robots import bundled_models  # noqa: PLC0415
 
     bundled = bundled_models()
     for model in arguments.models:

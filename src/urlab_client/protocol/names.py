@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from typing import Any, NoReturn, TypeVar, cast, overload
 
-__all__ = ["NameMap", "UnknownName", "owner_of", "split_prefix"]
+__all__ = ["NameMap", "UnknownName", "owner_of", "split_prefix", "unknown_name"]
 
 T = TypeVar("T")
 D = TypeVar("D")
@@ -20,6 +20,8 @@ _LISTED = 20
 
 class UnknownName(KeyError):
     """A name that a `NameMap` does not have, or an alias of several of its entries.
+
+    `args[0]` is the message, as `str()` gives it.
 
     Attributes:
         kind: What was looked for, for example `articulation`.
@@ -43,20 +45,42 @@ class UnknownName(KeyError):
         known: tuple[str, ...],
         suggestions: tuple[str, ...],
     ) -> None:
-        super().__init__(kind, name, matches, known, suggestions)
         self.kind = kind
         self.name = name
         self.matches = matches
         self.known = known
         self.suggestions = suggestions
+        super().__init__(self._message())
 
-    def __str__(self) -> str:
+    def _message(self) -> str:
         if self.matches:
             return f"{self.kind} {self.name!r} is ambiguous: it could mean {_listed(self.matches, 'or')}."
         text = f"no {self.kind} {self.name!r}."
         if self.suggestions:
             text += f" Did you mean {_listed(self.suggestions, 'or')}?"
         return f"{text} Known: {_listed(self.known, 'and')}." if self.known else f"{text} There are none."
+
+    def __str__(self) -> str:
+        return str(self.args[0])  # a plain KeyError puts it in quotes
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.kind, self.name, self.matches, self.known, self.suggestions)
+
+
+def unknown_name(
+    kind: str, name: object, known: Collection[str], *, aliases: Collection[str] = (), matches: Sequence[str] = ()
+) -> UnknownName:
+    """Return the error for a name that is not among those known, with those spelled alike.
+
+    Args:
+        kind: What was looked for, for example `camera`.
+        name: The name that was asked for.
+        known: All names there are.
+        aliases: Further names that would have been found.
+        matches: The names that an ambiguous one could mean.
+    """
+    alike = difflib.get_close_matches(name, [*known, *aliases]) if isinstance(name, str) else []
+    return UnknownName(kind, name, tuple(matches), tuple(known), tuple(alike))
 
 
 def _listed(names: Sequence[str], conjunction: str) -> str:
@@ -137,11 +161,9 @@ class NameMap(dict[str, T]):
         return default if found is None else super().__getitem__(found)
 
     def _unknown(self, name: object) -> UnknownName:
-        known = tuple(self)
         matches = self._aliases.get(cast("str", name), ())
         unique = [alias for alias, keys in self._aliases.items() if len(keys) == 1]
-        suggestions = difflib.get_close_matches(name, [*known, *unique]) if isinstance(name, str) else []
-        return UnknownName(self.kind, name, matches, known, tuple(suggestions))
+        return unknown_name(self.kind, name, self, aliases=unique, matches=matches)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return NameMap, (dict(self), self._aliases, self.kind)

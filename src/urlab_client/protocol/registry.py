@@ -3,17 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from types import MappingProxyType, UnionType
 from typing import Annotated, Any, Union, get_args, get_origin
 
 import msgspec
 
 from urlab_client.protocol import errors
-from urlab_client.protocol.base import Needs, Op, Timing
-from urlab_client.protocol.messages import debug, outliner, recording, runtime, scene, session, sim, viewport
+from urlab_client.protocol.base import DialectName, Effect, Needs, Op
+from urlab_client.protocol.messages import (
+    cameras,
+    control,
+    debug,
+    farm,
+    jobs,
+    outliner,
+    recording,
+    runtime,
+    scene,
+    session,
+    sim,
+    uploads,
+    viewport,
+)
 from urlab_client.protocol.types import ActorBounds, CameraPose, MocapPose, RecordingSummary, ReplayStatus
 
-__all__ = ["ENVELOPE_ERRORS", "OPS", "registry"]
+__all__ = ["ENVELOPE_ERRORS", "OPS", "dialect_ops", "registry"]
 
 ENVELOPE_ERRORS = (
     "not_ready",
@@ -67,7 +82,7 @@ def _described(annotation: Any) -> bool:
 
 
 _EDITOR = 30.0  # editor ops wait for the game thread, and level or mesh work can hold it for long
-_READ = Timing.READ
+_READ = Effect.READ
 _MANAGER = Needs.MANAGER
 
 OPS: Mapping[str, Op] = registry(
@@ -79,7 +94,7 @@ OPS: Mapping[str, Op] = registry(
         # Above the server's own limit of 5 s, or its step_timeout would arrive too late.
         timeout=6.5,
         hot=True,
-        errors=("not_ready", "step_timeout", "shutting_down"),
+        errors=("not_ready", "not_control_owner", "step_timeout", "shutting_down"),
         declares=(
             "op:string",
             "time:float",
@@ -154,7 +169,7 @@ OPS: Mapping[str, Op] = registry(
         request=runtime.SetControlSource,
         ns="runtime",
         needs=_MANAGER,
-        errors=("not_ready", "missing_field", "bad_value", "unknown_articulation"),
+        errors=("not_ready", "missing_field", "bad_value", "unknown_articulation", "not_control_owner"),
         generated=True,
         positional=1,
         undeclared=("source",),
@@ -164,7 +179,7 @@ OPS: Mapping[str, Op] = registry(
         request=runtime.SetTwist,
         ns="runtime",
         needs=_MANAGER,
-        errors=("not_ready", "missing_field", "unknown_articulation", "no_twist_controller"),
+        errors=("not_ready", "missing_field", "unknown_articulation", "not_control_owner", "no_twist_controller"),
         generated=True,
         positional=1,
         undeclared=("articulation",),
@@ -174,7 +189,7 @@ OPS: Mapping[str, Op] = registry(
         request=runtime.SetQpos,
         ns="runtime",
         needs=_MANAGER,
-        errors=("not_ready", "missing_field", "unknown_articulation", "no_joints", "dim_mismatch"),
+        errors=("not_ready", "missing_field", "unknown_articulation", "not_control_owner", "no_joints", "dim_mismatch"),
         declares=(
             "op:string",
             "target:string",
@@ -213,6 +228,15 @@ OPS: Mapping[str, Op] = registry(
         generated=True,
         returns="keyframes",
     ),
+    Op(
+        request=runtime.SetUserChannels,
+        ns="runtime",
+        needs=_MANAGER,
+        errors=("not_ready",),
+        dialects=("beta",),
+    ),
+    *control.OPS,
+    *cameras.OPS,
     # --- recording, replay: the plugin declares no reply fields for these ---
     Op(
         request=recording.RecordingStart,
@@ -298,12 +322,14 @@ OPS: Mapping[str, Op] = registry(
     # --- scene ---
     Op(
         request=scene.ImportXml,
+        job=True,
         ns="scene",
         timeout=120.0,
         errors=("missing_field", "import_failed"),
     ),
     Op(
         request=scene.CreateLevel,
+        job=True,
         ns="scene",
         timeout=_EDITOR,
         errors=("missing_field", "create_level_failed"),
@@ -312,13 +338,14 @@ OPS: Mapping[str, Op] = registry(
     ),
     Op(
         request=scene.LoadLevel,
+        job=True,
         ns="scene",
         timeout=_EDITOR,
         errors=("missing_field", "load_level_failed"),
         generated=True,
         positional=1,
     ),
-    Op(request=scene.SaveLevel, ns="scene", timeout=_EDITOR, errors=("save_level_failed",), generated=True),
+    Op(request=scene.SaveLevel, job=True, ns="scene", timeout=_EDITOR, errors=("save_level_failed",), generated=True),
     Op(
         request=scene.CurrentLevel,
         ns="scene",
@@ -336,15 +363,17 @@ OPS: Mapping[str, Op] = registry(
         generated=True,
         returns="was_existing",
     ),
-    Op(request=scene.SpawnActor, ns="scene", timeout=_EDITOR, errors=("missing_field", "spawn_failed")),
+    Op(request=scene.SpawnActor, job=True, ns="scene", timeout=_EDITOR, errors=("missing_field", "spawn_failed")),
     Op(
         request=scene.SpawnGrid,
+        job=True,
         ns="scene",
         timeout=60.0,
         errors=("missing_field", "invalid_count", "too_many_cells", "spawn_failed"),
     ),
     Op(
         request=scene.SpawnLight,
+        job=True,
         ns="scene",
         timeout=_EDITOR,
         errors=("spawn_failed",),
@@ -365,8 +394,15 @@ OPS: Mapping[str, Op] = registry(
         ns="scene",
         timeout=_EDITOR,
         errors=("missing_field", "destroy_failed"),
-        generated=True,
-        positional=1,
+        dialects=("alpha",),
+    ),
+    Op(
+        request=scene.RemoveActor,
+        ns="scene",
+        timeout=_EDITOR,
+        errors=("missing_field", "destroy_failed"),
+        dialects=("beta",),
+        job=True,
     ),
     Op(
         request=scene.DestroyAsset,
@@ -388,6 +424,7 @@ OPS: Mapping[str, Op] = registry(
     ),
     Op(
         request=scene.DuplicateActor,
+        job=True,
         ns="scene",
         timeout=_EDITOR,
         errors=("missing_field", "duplicate_failed"),
@@ -403,6 +440,9 @@ OPS: Mapping[str, Op] = registry(
         positional=1,
     ),
     Op(request=scene.Snapshot, ns="scene", effect=_READ, timeout=_EDITOR, errors=("snapshot_failed",)),
+    *jobs.OPS,
+    *uploads.OPS,
+    *farm.OPS,
     # --- sim ---
     # The server may take 10 s to reach its game thread, on top of the request's own timeout_s.
     Op(
@@ -563,3 +603,9 @@ OPS: Mapping[str, Op] = registry(
     ),
     Op(request=viewport.Untrack, ns="viewport", timeout=_EDITOR, generated=True, returns="was_tracking"),
 )
+
+
+@cache
+def dialect_ops(dialect: DialectName) -> Mapping[str, Op]:
+    """Return the ops that a generation of the plugin offers, by name."""
+    return MappingProxyType({name: op for name, op in OPS.items() if dialect in op.dialects})

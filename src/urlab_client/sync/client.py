@@ -26,6 +26,7 @@ from urlab_client.sync._portal import FacadeRoot
 from urlab_client.sync.articulation import URLabArticulation, URLabEntity
 from urlab_client.sync.cameras import URLabCameraView
 from urlab_client.sync.namespaces.debug import DebugNamespace
+from urlab_client.sync.namespaces.farm import FarmNamespace
 from urlab_client.sync.namespaces.outliner import OutlinerNamespace
 from urlab_client.sync.namespaces.recording import RecordingNamespace, ReplayNamespace
 from urlab_client.sync.namespaces.runtime import RuntimeNamespace
@@ -152,6 +153,11 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
     def viewport(self) -> ViewportNamespace:
         """The editor's perspective viewport."""
         return self._portal.wrap(ViewportNamespace, self._aio.viewport)
+
+    @property
+    def farm(self) -> FarmNamespace:
+        """Sharing servers among clients."""
+        return self._portal.wrap(FarmNamespace, self._aio.farm)
 
     @property
     def recording(self) -> RecordingNamespace:

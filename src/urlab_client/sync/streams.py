@@ -72,7 +72,8 @@ class Stream(Facade, Generic[T], twin=aio.Stream):
         """Return the next item.
 
         Args:
-            timeout: Seconds to wait; None waits without limit.
+            timeout: Seconds to wait; None waits without limit. By default the client's `rcv_timeout_ms`, or 30 s where
+                that is less and a server in live mode may still be preparing its first picture.
 
         Raises:
             URLabTimeoutError: Nothing came in time; says at which stage, and what to look at.

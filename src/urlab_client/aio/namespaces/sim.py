@@ -10,7 +10,7 @@ import msgspec
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.namespaces._base import Namespace
 from urlab_client.aio.session import Session
-from urlab_client.aio.state import SimState
+from urlab_client.aio.state.sim_state import SimState
 from urlab_client.protocol.enums import PIEState
 from urlab_client.protocol.errors import URLabPIEError, URLabTimeoutError
 from urlab_client.protocol.messages.sim import BeginPie, BeginPieOk, PieStatus, StopPie
@@ -47,7 +47,7 @@ class SimNamespace(Namespace):
         client was made with is in force again; in live mode physics starts paused.
 
         Args:
-            level_path: Level to open first, a full `/Game/` path.
+            level_path: Level to open first, a full `/Game/` path: `/Game/Levels/lab` or `/Game/Levels/lab.lab`.
             timeout_s: Seconds to wait for the compile.
             raise_on_failure: Raise unless play is ready; else return the result in any state.
             on_progress: Called with the state about every quarter of a second while the model compiles.

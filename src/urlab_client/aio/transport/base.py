@@ -11,7 +11,7 @@ from urlab_client.protocol.base import Op
 from urlab_client.protocol.messages.session import HelloOk
 from urlab_client.protocol.messages.streams import ClientEvent
 
-__all__ = ["Transport", "TransportStats"]
+__all__ = ["RequestTransport", "TransportStats"]
 
 
 class TransportStats(Struct):
@@ -34,7 +34,7 @@ class TransportStats(Struct):
     over_zmq: dict[str, int] = {}
 
 
-class Transport(Protocol):
+class RequestTransport(Protocol):
     """One request at a time goes out, one reply comes back. Used from one event loop."""
 
     stats: TransportStats

@@ -17,10 +17,10 @@ __all__ = ["borrow", "give_back"]
 Context = zmq.Context[zmq.Socket[bytes]]
 
 _MOST_SOCKETS: Final = 16_384
-"""ZeroMQ's own limit is 1023, about 340 clients; the table is that of their addresses alone."""
+"""ZeroMQ's default is 1023, about 340 clients; the table is that of their addresses alone. Windows allows one less."""
 
 
-class _Shared:
+class _SharedContext:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._context: Context | None = None
@@ -30,7 +30,7 @@ class _Shared:
         with self._lock:
             if self._context is None:
                 self._context = zmq.Context()
-                self._context.max_sockets = _MOST_SOCKETS
+                self._context.max_sockets = min(_MOST_SOCKETS, self._context.get(zmq.SOCKET_LIMIT))
             self._users += 1
             return self._context
 
@@ -45,12 +45,12 @@ class _Shared:
         context.term()
 
 
-_shared = _Shared()
+_shared = _SharedContext()
 
 
 def _start_over() -> None:
     global _shared  # noqa: PLW0603  # a fork's copy of the context has no threads behind it
-    _shared = _Shared()
+    _shared = _SharedContext()
 
 
 if hasattr(os, "register_at_fork"):

@@ -1,4 +1,4 @@
-"""Requests over a ZeroMQ DEALER socket, driven by the caller's asyncio loop without a thread of our own.
+"""Requests over a ZeroMQ DEALER socket, driven by the caller's asyncio loop.
 
 The server's REP socket echoes the envelope, so each request carries an id: a reply that comes after its request gave
 up is recognised and dropped, and the next request works. Replies complete futures from the reader callback; nothing
@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import logging
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, cast
@@ -17,12 +18,13 @@ from typing import Any, cast
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
+from urlab_client.aio.transport import connection_status
 from urlab_client.aio.transport import context as shared_context
-from urlab_client.aio.transport import line
 from urlab_client.aio.transport.base import TransportStats
+from urlab_client.aio.transport.busy_poll import BusyPoll
 from urlab_client.aio.transport.curve import ClientKeys
-from urlab_client.aio.transport.spin import Spin
-from urlab_client.protocol.base import Op, Timing
+from urlab_client.aio.transport.readiness import Readiness, watch_socket
+from urlab_client.protocol.base import Effect, Op
 from urlab_client.protocol.codec import MAX_REPLY_BYTES
 from urlab_client.protocol.errors import (
     AuthenticationFailed,
@@ -91,16 +93,18 @@ class ZmqTransport:
         self._context: zmq.Context[zmq.Socket[bytes]] | None = None
         self._socket: zmq.Socket[bytes] | None = None
         self._monitor: zmq.Socket[bytes] | None = None
+        self._replies: Readiness | None = None
+        self._events: Readiness | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._due = 0.0
-        self._spin = Spin(_SPIN_S, _LONGEST_SPIN_S)
+        self._busy_poll = BusyPoll(_SPIN_S, _LONGEST_SPIN_S)
         self._sent: dict[bytes, _Sent] = {}
         self._waiting: set[asyncio.Future[None]] = set()
         self._last_id = 0
         self._connected = False
         self._closed = False
-        self._obstacle = line.UNANSWERED
-        self._attempts = line.Attempts(0.0)
+        self._obstacle = connection_status.UNANSWERED
+        self._attempts = connection_status.Attempts(0.0)
         self.lost_at = 0.0
         self._silent_since: float | None = None
         self._retrying = False
@@ -123,7 +127,7 @@ class ZmqTransport:
 
     async def request(self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None) -> bytes:
         """See `Transport.request`."""
-        loop, socket = self._open()
+        loop, socket, replies = self._open()
         send = socket.send
         while True:
             if not self._connected:
@@ -146,18 +150,21 @@ class ZmqTransport:
             break
         entry = self._sent[key] = _Sent(op, loop.create_future(), started, deadline)
         self.stats.sent += 1
+        sent = time.perf_counter()
         if deadline is not None:
             self._expire_at(loop, deadline)
         try:
             # Sending may have consumed the descriptor's edge, so look at least once for what arrived meanwhile.
-            if self._spin.pays(op.name):
-                await self._spin.look(op.name, entry.reply, self._on_readable)
+            if self._busy_poll.pays(op.name):
+                await self._busy_poll.look(op.name, entry.reply, self._on_readable)
             elif cast("int", socket.get(_EVENTS)) & _POLLIN:
                 loop.call_soon(self._on_readable)
+            if not entry.reply.done():
+                replies.expect()
             answer = await entry.reply
         finally:
             self._sent.pop(key, None)
-        self._spin.note(op.name, loop.time() - started)
+        self._busy_poll.note(op.name, time.perf_counter() - sent)
         return answer
 
     async def follow(self, hello: HelloOk) -> None:
@@ -178,52 +185,51 @@ class ZmqTransport:
             return
         if self._timer is not None:
             self._timer.cancel()
-        if not self._loop.is_closed():  # an abandoned client may outlive its loop
-            self._loop.remove_reader(self._socket)
-            self._loop.remove_reader(self._monitor)
+        for readiness in (self._replies, self._events):
+            if readiness is not None:
+                readiness.close()
         self._socket.disable_monitor()
         self._monitor.close(linger=0)
         self._socket.close(linger=0)
         shared_context.give_back(self._context)
 
-    def _open(self) -> tuple[asyncio.AbstractEventLoop, zmq.Socket[bytes]]:
+    def _open(self) -> tuple[asyncio.AbstractEventLoop, zmq.Socket[bytes], Readiness]:
         if self._closed:
             raise ClientClosed(f"The client of {self._endpoint} is closed.", hint="Make a new client.")
         loop = asyncio.get_running_loop()
-        if self._socket is not None:
+        if self._socket is not None and self._replies is not None:
             if loop is not self._loop:
                 raise URLabError(
                     "This client belongs to another event loop.", hint="Make one client per loop, or use the façade."
                 )
-            return loop, self._socket
+            return loop, self._socket, self._replies
         context = shared_context.borrow()
         socket = context.socket(zmq.DEALER)
-        line.configure(socket)
+        connection_status.configure(socket)
         # A request must not wait in a queue for a server that is gone: it would reach the next one.
         socket.immediate = True
         socket.maxmsgsize = MAX_REPLY_BYTES  # refused when it is announced, before it fills the memory
         if self._keys is not None:
             self._keys.protect(socket)
-        monitor = socket.get_monitor_socket(line.WATCHED)
+        monitor = socket.get_monitor_socket(connection_status.WATCHED)
+        self._attempts = connection_status.Attempts(loop.time())
         try:
-            loop.add_reader(monitor, self._on_event)
-            loop.add_reader(socket, self._on_readable)
-            self._attempts = line.Attempts(loop.time())
             socket.connect(self._endpoint)
-        except (NotImplementedError, zmq.ZMQError) as error:
+        except zmq.ZMQError as error:
             socket.disable_monitor()
             monitor.close(linger=0)
             socket.close(linger=0)
             shared_context.give_back(context)
-            if isinstance(error, NotImplementedError):
-                raise URLabError(
-                    f"{type(loop).__name__} cannot watch sockets.",
-                    hint="Run the client on a selector event loop, or use the blocking client, which brings its own.",
-                ) from error
             raise ValueError(f"{self._endpoint!r} is not an address ZeroMQ can connect to: {error}") from error
         self._loop, self._context, self._socket, self._monitor = loop, context, socket, monitor
+        self._events = watch_socket(loop, monitor, self._on_event)
+        self._replies = watch_socket(loop, socket, self._on_readable, awaited=self._awaited)
         loop.call_soon(self._on_event)
-        return loop, socket
+        return loop, socket, self._replies
+
+    def _awaited(self) -> bool:
+        """Whether a reply is to come, perhaps to a request that has given up."""
+        return self._silent_since is not None or any(not entry.reply.done() for entry in self._sent.values())
 
     async def _wait_connected(self, loop: asyncio.AbstractEventLoop, op: Op, connect_by: float | None) -> None:
         waiter: asyncio.Future[None] = loop.create_future()
@@ -232,7 +238,7 @@ class ZmqTransport:
         if self._given_up and self._socket is not None:
             # Told why, ZeroMQ does not try again by itself; by now the server may have learnt the key.
             self._given_up = False
-            line.reconnect(self._socket, self._endpoint)
+            connection_status.reconnect(self._socket, self._endpoint)
 
         def give_up() -> None:
             self._on_event()  # as in `_expire`
@@ -275,7 +281,7 @@ class ZmqTransport:
                     self._expire_at(loop, entry.deadline)
 
     def _give_up(self, entry: _Sent, seconds: float) -> None:
-        executed = "" if entry.op.effect is Timing.READ else " The request was sent and may still be executed."
+        executed = "" if entry.op.effect is Effect.READ else " The request was sent and may still be executed."
         entry.reply.set_exception(
             URLabTimeoutError(
                 f"{entry.op.name}: no reply from {self._endpoint} within {_ms(seconds)}.{executed}",
@@ -324,7 +330,7 @@ class ZmqTransport:
 
     def _note(self, event: zmq.Event, value: int) -> None:
         obstacle = self._attempts.obstacle(event, value, 0.0 if self._loop is None else self._loop.time())
-        self._retrying = self._retrying or event in line.RETRYING
+        self._retrying = self._retrying or event in connection_status.RETRYING
         if event is zmq.Event.HANDSHAKE_SUCCEEDED:
             self._connected = True
             self._rejections = 0
@@ -338,7 +344,7 @@ class ZmqTransport:
             self._lose()
         elif obstacle is not None:
             self._obstacle = obstacle
-            if event in line.FAILED_HANDSHAKES and value != errno.EAGAIN:  # which says that time was up
+            if event in connection_status.FAILED_HANDSHAKES and value != errno.EAGAIN:  # which says that time was up
                 self._rejections += 1
                 self._note_rejection(event, value)
 
@@ -374,7 +380,9 @@ class ZmqTransport:
         if self._loop is not None:
             # Also when a handshake broke off: ZeroMQ does not try again after garbage in it.
             self._retrying = False
-            self._loop.call_later(line.REVIVE_S if self._connected else line.RETRY_S, self._revive)
+            self._loop.call_later(
+                connection_status.REVIVE_S if self._connected else connection_status.RETRY_S, self._revive
+            )
         self._connected = False
         self._silent_since = None
         self._fail_sent(self._lost)
@@ -382,7 +390,7 @@ class ZmqTransport:
     def _revive(self) -> None:
         self._on_event()
         if not self._retrying and not self._closed and self._socket is not None:
-            line.reconnect(self._socket, self._endpoint)
+            connection_status.reconnect(self._socket, self._endpoint)
 
     def _tell_connected(self) -> None:
         if self.stats.connects == 1 or self._loop is None:
@@ -397,7 +405,7 @@ class ZmqTransport:
     def _lost(self, entry: _Sent) -> URLabError:
         name = entry.op.name
         text = f"{name}: the connection to {self._endpoint} was lost after the request was sent."
-        if entry.op.effect is Timing.READ:
+        if entry.op.effect is Effect.READ:
             return ConnectionLost(text, op=name, hint="The op changes nothing: it can be sent again.")
         return OutcomeUnknown(
             text, op=name, hint="Whether it was executed is unknown: client.resync() finds out, and goes on."

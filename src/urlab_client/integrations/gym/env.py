@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.integrations.gym.episode import Episode
+from urlab_client.integrations.gym.episode import EnvEpisode
 from urlab_client.integrations.gym.spaces import Observation, SpaceMapping, SpaceMode
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.sync._portal import aio_of, portal_of
@@ -97,7 +97,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         self.client = client
         self.render_mode = render_mode
         self._rendered = () if render_mode is None else (render_camera or _first_camera(client),)
-        self._episode = Episode(
+        self._episode = EnvEpisode(
             aio_of(client),
             space_mode=space_mode,
             observations=observations,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.launch import SCHEME
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn
-from urlab_client.integrations.gym.episode import Episode
+from urlab_client.integrations.gym.episode import EnvEpisode
 from urlab_client.integrations.gym.spaces import Observation, SpaceMode
 from urlab_client.integrations.gym.vectorized import Indices, Vectorized
 from urlab_client.protocol.errors import URLabError
@@ -32,7 +32,7 @@ class _Session:
     def __init__(self, address: str, client_options: Mapping[str, Any], episode_options: Mapping[str, Any]) -> None:
         self.address = address
         self.restarts = -1
-        self.episode: Episode | None = None
+        self.episode: EnvEpisode | None = None
         self._client_options = client_options
         self._episode_options = episode_options
 
@@ -55,12 +55,12 @@ class _Session:
         if episode is not None:
             await episode.client.close()
 
-    async def open(self) -> Episode:
+    async def open(self) -> EnvEpisode:
         """Start the session."""
         client = URLabClient(self.address, **self._client_options)
         try:
             await client.discover()
-            self.episode = Episode(client, **self._episode_options)
+            self.episode = EnvEpisode(client, **self._episode_options)
         except BaseException:
             await client.close()
             raise
@@ -158,7 +158,7 @@ class URLabVectorEnv(Vectorized):
         """Close the clients, and the servers they started."""
         self._portal.close(self._close_all())
 
-    async def _open_all(self) -> Episode:
+    async def _open_all(self) -> EnvEpisode:
         found = await asyncio.gather(*(session.open() for session in self._sessions), return_exceptions=True)
         for i, episode in enumerate(found):
             if isinstance(episode, BaseException):

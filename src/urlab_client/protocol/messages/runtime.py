@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from msgspec import Struct
 
-from urlab_client.protocol.base import ActorId, Floats, QuatWXYZ, Reply, Request, TargetBy, Vec3, doc
+from urlab_client.protocol.base import ActorId, ControlRequest, Floats, QuatWXYZ, Reply, Request, TargetBy, Vec3, doc
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.types import Contact, KeyframeInfo, SimOptions
 
@@ -36,6 +36,8 @@ __all__ = [
     "SetSimSpeedOk",
     "SetTwist",
     "SetTwistOk",
+    "SetUserChannels",
+    "SetUserChannelsOk",
 ]
 
 
@@ -84,7 +86,7 @@ class SetControlSourceOk(Reply, tag="set_control_source_ok", kw_only=True, omit_
     articulation: Annotated[str | None, doc("Articulation key, with that scope.")] = None
 
 
-class SetControlSource(Request[SetControlSourceOk], tag="set_control_source", kw_only=True, omit_defaults=True):
+class SetControlSource(ControlRequest[SetControlSourceOk], tag="set_control_source", kw_only=True, omit_defaults=True):
     """Choose whose set-points drive the actuators: those of this protocol or those of the editor's panel."""
 
     source: Annotated[str, doc("`zmq` or `ui`.")]
@@ -99,7 +101,7 @@ class SetTwistOk(Reply, tag="set_twist_ok", kw_only=True):
     angular: Annotated[Vec3, doc("(0, 0, yaw rate), rad/s.")]
 
 
-class SetTwist(Request[SetTwistOk], tag="set_twist", kw_only=True, omit_defaults=True):
+class SetTwist(ControlRequest[SetTwistOk], tag="set_twist", kw_only=True, omit_defaults=True):
     """Store a commanded base velocity for policies to read; it does not drive the simulation."""
 
     articulation: Annotated[str, doc("Articulation key.")]
@@ -117,7 +119,7 @@ class SetQposOk(Reply, tag="set_qpos_ok", kw_only=True, omit_defaults=True):
     free_base_shortcut: Annotated[bool, doc("True when only the free base was written.")]
 
 
-class SetQpos(Request[SetQposOk], tag="set_qpos", kw_only=True, omit_defaults=True):
+class SetQpos(ControlRequest[SetQposOk], tag="set_qpos", kw_only=True, omit_defaults=True):
     """Write joint positions of an articulation and run `mj_forward`; velocities and time stay."""
 
     target: Annotated[str, doc("Actor id, or the articulation key with `by_name`.")]
@@ -137,7 +139,7 @@ class SetMocapPoseOk(MocapReply, tag="set_mocap_pose_ok", kw_only=True):
     """The pose in force."""
 
 
-class SetMocapPose(Request[SetMocapPoseOk], tag="set_mocap_pose", kw_only=True, omit_defaults=True):
+class SetMocapPose(ControlRequest[SetMocapPoseOk], tag="set_mocap_pose", kw_only=True, omit_defaults=True):
     """Place a mocap body; body poses follow at the next step or `forward()`."""
 
     body: Annotated[str, doc("Compiled body name, prefix included.")]
@@ -201,6 +203,32 @@ class ConfigureController(Request[ConfigureControllerOk], tag="configure_control
 
     articulation: Annotated[str, doc("Articulation key.")]
     params: Annotated[dict[str, Any], doc("Parameters to change.")]
+
+
+class SetUserChannelsOk(Reply, tag="set_user_channels_ok", kw_only=True):
+    """What became of the values; a success even if none was taken."""
+
+    applied: Annotated[int, doc("Number of values taken.")]
+    rejected: Annotated[
+        dict[str, str],
+        doc(
+            "Reason by `<articulation>/<channel>` or `scene/<channel>`: `undeclared_or_kind_mismatch`, "
+            "`unsupported_value`, `unsupported_object` or `null_value`."
+        ),
+    ]
+
+
+class SetUserChannels(Request[SetUserChannelsOk], tag="set_user_channels", kw_only=True, omit_defaults=True):
+    """Write values of channels that the level declares for its robots or the scene; they come back with the state.
+
+    Returns the reason by `<articulation>/<channel>` or `scene/<channel>` for each value that was not taken.
+    """
+
+    arts: Annotated[
+        dict[str, dict[str, Any]] | None,
+        doc("Articulation to channel to a bool, number, text, list of numbers, or map of `pos` and `quat`."),
+    ] = None
+    scene: Annotated[dict[str, Any] | None, doc("Channel of the scene to value.")] = None
 
 
 class SetSimOptionsOk(Reply, tag="set_sim_options_ok", kw_only=True):

@@ -42,6 +42,8 @@ __all__ = [
     "ImportXmlOk",
     "LoadLevel",
     "LoadLevelOk",
+    "RemoveActor",
+    "RemoveActorOk",
     "SaveLevel",
     "SaveLevelOk",
     "SetActorTransform",
@@ -90,7 +92,7 @@ class CreateLevel(Request[CreateLevelOk], tag="create_level", kw_only=True, omit
     The level has no manager actor yet; `ensure_manager` adds the one that a play session needs.
     """
 
-    name: Annotated[str, doc("Short name, or a path beginning with `/Game/`.")]
+    name: Annotated[str, doc("Short name, or a package or object path beginning with `/Game/`.")]
     force_overwrite: Annotated[bool, doc("Replace an existing level of that name.")] = False
 
 
@@ -101,7 +103,9 @@ class LoadLevelOk(LevelReply, tag="load_level_ok", kw_only=True):
 class LoadLevel(Request[LoadLevelOk], tag="load_level", kw_only=True):
     """Open an existing level; unsaved edits of the open one are lost."""
 
-    name_or_path: Annotated[str, doc("Short name, or a path beginning with `/Game/`.")] = field(name="level_path")
+    name_or_path: Annotated[str, doc("Short name, or a package or object path beginning with `/Game/`.")] = field(
+        name="level_path"
+    )
 
 
 class SaveLevelOk(LevelReply, tag="save_level_ok", kw_only=True):
@@ -225,6 +229,19 @@ class DestroyActorOk(Reply, tag="destroy_actor_ok", kw_only=True):
 
 class DestroyActor(Request[DestroyActorOk], tag="destroy_actor", kw_only=True, omit_defaults=True):
     """Remove an actor from the edited level."""
+
+    target: ActorTarget
+    target_by: TargetBy = "actor_id"
+
+
+class RemoveActorOk(Reply, tag="remove_actor_ok", kw_only=True):
+    """The actor is gone from the edited level."""
+
+    requires_pie_restart: RequiresPieRestart
+
+
+class RemoveActor(Request[RemoveActorOk], tag="remove_actor", kw_only=True, omit_defaults=True):
+    """Remove an actor from the edited level; the beta's name of `destroy_actor`."""
 
     target: ActorTarget
     target_by: TargetBy = "actor_id"

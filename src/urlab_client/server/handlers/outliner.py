@@ -23,10 +23,10 @@ from urlab_client.protocol.messages.outliner import (
     SelectActorOk,
 )
 from urlab_client.protocol.types import BlueprintInfo
-from urlab_client.server.actors import QuickConvert as QuickConvertSettings
+from urlab_client.server.assets.actors import ConversionSettings as QuickConvertSettings
 from urlab_client.server.core import ServerCore
-from urlab_client.server.dispatch import handles
-from urlab_client.server.requests import need
+from urlab_client.server.rpc.dispatch import handles
+from urlab_client.server.rpc.requests import need
 
 
 @handles(ListActors)

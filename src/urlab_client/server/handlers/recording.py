@@ -29,15 +29,15 @@ from urlab_client.protocol.messages.recording import (
     ReplayStop,
     ReplayStopOk,
 )
-from urlab_client.server.content import write_atomic
-from urlab_client.server.controllers import float32
+from urlab_client.server.assets.content import write_atomic
 from urlab_client.server.core import ServerCore
-from urlab_client.server.dispatch import handles
-from urlab_client.server.play import Running
-from urlab_client.server.recording import LIVE_SESSION, duration, encode_json
+from urlab_client.server.physics.controllers import float32
+from urlab_client.server.physics.play import Running
+from urlab_client.server.physics.recording import LIVE_SESSION, duration, encode_json
+from urlab_client.server.physics.replay import Player, ReplaySessions, replay_folder
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.replay import Player, ReplaySessions, replay_folder
-from urlab_client.server.requests import need
+from urlab_client.server.rpc.dispatch import handles
+from urlab_client.server.rpc.requests import need
 
 UNLIMITED_S: Final = 3.4028234663852886e38
 """The largest float32."""
@@ -49,27 +49,54 @@ def _sessions(server: ServerCore) -> tuple[Running, ReplaySessions]:
     return running, running.sessions
 
 
-def _locate(server: ServerCore, path: str, code: str) -> Path:
-    """Return the file meant by a request: relative to the replay directory, and below a folder open to clients.
+def _locate(server: ServerCore, path: str, code: str) -> tuple[Path, Path]:
+    """Return the file meant by a request, relative to the folder of recordings, and that folder; links are resolved.
 
     Raises:
-        Refusal: `code`, when it lies elsewhere once links are resolved, or is no usable path.
+        Refusal: `code`, when it is a folder or not a usable path.
     """
-    content = server.world.content
     try:
-        folder = replay_folder(content.root)
+        folder = replay_folder(server.world.content.root).resolve()
         file = Path(os.path.abspath(folder / path))
         real = file.resolve()
         is_folder = path.endswith(("/", os.sep)) or folder.is_relative_to(real) or real.is_dir()
     except (OSError, ValueError, RuntimeError) as error:  # too long, a null byte, a loop of links
-        raise Refusal(code, f"{path!r} is no usable path: {error}", absolute_path=path) from None
-    roots = (content.root, *content.model_roots)
+        raise Refusal(code, f"{path!r} is not a usable path: {error}", absolute_path=path) from None
     if is_folder:
         raise Refusal(code, f"{file} is a folder", absolute_path=str(file))
-    if not any(real.is_relative_to(root) and real != root for root in roots):
-        text = ", ".join(map(str, roots))
-        raise Refusal(code, f"{file} lies outside the folders of recordings ({text})", absolute_path=str(file))
-    return real
+    return real, folder
+
+
+def _to_write(server: ServerCore, path: str) -> Path:
+    """Return the file a recording is saved to: one of its folder, where it can be in the way of nothing else.
+
+    Raises:
+        Refusal: `path_not_writable`.
+    """
+    file, folder = _locate(server, path, "path_not_writable")
+    if file.parent != folder:
+        raise Refusal(
+            "path_not_writable",
+            f"{file} does not lie in the folder of recordings, {folder}: give a file name",
+            absolute_path=str(file),
+        )
+    if file.exists() and not _is_recording(file):
+        raise Refusal("path_not_writable", f"{file} exists and is not a recording", absolute_path=str(file))
+    return file
+
+
+def _to_read(server: ServerCore, path: str) -> Path:
+    """Return the file a recording is loaded from: one of its folder, or one below a model root.
+
+    Raises:
+        Refusal: `path_not_readable`.
+    """
+    file, folder = _locate(server, path, "path_not_readable")
+    folders = (folder, *server.world.content.model_roots)
+    if not any(file.is_relative_to(allowed) for allowed in folders):
+        text = ", ".join(map(str, folders))
+        raise Refusal("path_not_readable", f"{file} lies outside the folders that recordings are loaded from ({text})")
+    return file
 
 
 @handles(RecordingStart)
@@ -103,14 +130,12 @@ def recording_stop(server: ServerCore, request: RecordingStop) -> RecordingStopO
 @handles(RecordingSave)
 def recording_save(server: ServerCore, request: RecordingSave) -> RecordingSaveOk:
     running, sessions = _sessions(server)
-    file = _locate(server, request.path or "recording.json", "path_not_writable")
+    file = _to_write(server, request.path or "recording.json")
     with running.engine.lock:
         frames = sessions.frames
     # The plugin sends no text with these two.
     if not frames:
         raise Refusal("path_not_writable", "", absolute_path=str(file))
-    if file.exists() and not _is_recording(file):
-        raise Refusal("path_not_writable", f"{file} exists and is no recording", absolute_path=str(file))
     try:
         write_atomic(file, encode_json(frames))
     except OSError:
@@ -142,7 +167,7 @@ def recording_clear(server: ServerCore, request: RecordingClear) -> RecordingCle
 def replay_load(server: ServerCore, request: ReplayLoad) -> ReplayLoadOk:
     _, sessions = _sessions(server)
     path = need(request, request.path, "path")
-    file = _locate(server, path, "path_not_readable")
+    file = _to_read(server, path)
     try:
         return ReplayLoadOk(name=sessions.load(file))
     except FileNotFoundError:

@@ -41,9 +41,9 @@ from urlab_client.protocol.messages.scene import (
 )
 from urlab_client.protocol.types import ActorHierarchyNode
 from urlab_client.server.core import ServerCore
-from urlab_client.server.dispatch import handles
-from urlab_client.server.requests import need, usable
-from urlab_client.server.world import ActorRow, HierarchyNode
+from urlab_client.server.editor.world import ActorRow, HierarchyNode
+from urlab_client.server.rpc.dispatch import handles
+from urlab_client.server.rpc.requests import need, usable
 
 
 @handles(ImportXml)
@@ -75,9 +75,10 @@ class LoadLevelByName(LoadLevel, tag="load_level", kw_only=True):
 @handles(LoadLevelByName)
 def load_level(server: ServerCore, request: LoadLevelByName) -> LoadLevelOk:
     level = need(request, usable(request.name_or_path, "") or request.name, "level_path")
-    loaded = server.world.load_level(level)
+    server.world.load_level(level)
     server.drawings.clear(in_play=False)
-    return LoadLevelOk(level_path=loaded)
+    # As the plugin: expanded, but otherwise as it was asked for, so an object path stays one.
+    return LoadLevelOk(level_path=level if level.startswith("/") else f"/Game/Levels/{level}")
 
 
 @handles(SaveLevel)

@@ -17,7 +17,7 @@ from urlab_client.protocol.types import (
 )
 from urlab_client.sync._portal import Facade
 
-__all__ = ["DebugOps", "OutlinerOps", "ReplayOps", "RuntimeOps", "SceneOps", "ViewportOps"]
+__all__ = ["DebugOps", "FarmOps", "OutlinerOps", "ReplayOps", "RuntimeOps", "SceneOps", "ViewportOps"]
 
 
 class RuntimeOps(Facade, twin=aio.RuntimeOps):
@@ -65,6 +65,7 @@ class RuntimeOps(Facade, twin=aio.RuntimeOps):
             MissingField: A required field is absent, empty or malformed.
             BadValue: A value outside the op's list of choices.
             UnknownArticulation: No articulation has this key or actor id.
+            NotControlOwner: Another client controls the robot, or nobody does; nothing was written.
         """
         self._portal.call(self._aio.set_control_source(source, articulation=articulation, timeout=timeout))
 
@@ -88,6 +89,7 @@ class RuntimeOps(Facade, twin=aio.RuntimeOps):
             NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
             MissingField: A required field is absent, empty or malformed.
             UnknownArticulation: No articulation has this key or actor id.
+            NotControlOwner: Another client controls the robot, or nobody does; nothing was written.
             NoTwistController: The articulation has no twist controller.
         """
         self._portal.call(self._aio.set_twist(articulation, linear=linear, angular=angular, timeout=timeout))
@@ -168,7 +170,7 @@ class SceneOps(Facade, twin=aio.SceneOps):
             The level has no manager actor yet; `ensure_manager` adds the one that a play session needs.
 
         Args:
-            name: Short name, or a path beginning with `/Game/`.
+            name: Short name, or a package or object path beginning with `/Game/`.
             force_overwrite: Replace an existing level of that name.
             timeout: Seconds to wait; None waits without limit.
 
@@ -182,7 +184,7 @@ class SceneOps(Facade, twin=aio.SceneOps):
         """Open an existing level; unsaved edits of the open one are lost.
 
         Args:
-            name_or_path: Short name, or a path beginning with `/Game/`.
+            name_or_path: Short name, or a package or object path beginning with `/Game/`.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
@@ -228,20 +230,6 @@ class SceneOps(Facade, twin=aio.SceneOps):
             SpawnFailed: The class cannot be spawned, or the actor id belongs to an actor of another class.
         """
         return self._portal.call(self._aio.ensure_manager(timeout=timeout))
-
-    def destroy_actor(self, target: str, *, by_name: bool = False, timeout: Timeout = DEFAULT) -> None:
-        """Remove an actor from the edited level.
-
-        Args:
-            target: Actor id, or the engine's actor name with `by_name`.
-            by_name: Look `target` up by the engine's actor name instead of the actor id.
-            timeout: Seconds to wait; None waits without limit.
-
-        Raises:
-            MissingField: A required field is absent, empty or malformed.
-            DestroyFailed: No actor matches.
-        """
-        self._portal.call(self._aio.destroy_actor(target, by_name=by_name, timeout=timeout))
 
     def destroy_asset(self, asset_path: str, *, timeout: Timeout = DEFAULT) -> bool:
         """Delete an asset by object path and return whether it existed.
@@ -304,6 +292,43 @@ class SceneOps(Facade, twin=aio.SceneOps):
             ActorHierarchyFailed: No actor matches.
         """
         return self._portal.call(self._aio.actor_hierarchy(target, by_name=by_name, timeout=timeout))
+
+
+class FarmOps(Facade, twin=aio.FarmOps):
+    """Generated part of `client.farm`."""
+
+    __slots__ = ()
+    _aio: aio.FarmOps
+
+    def acquire_lease(self, owner: str = "", *, ttl_s: float = 60.0, timeout: Timeout = DEFAULT) -> str:
+        """Take the server's one driver lease and return its id.
+
+            The server enforces nothing by it: it tells other clients that the server is in use. Every request keeps it
+            alive.
+
+        Args:
+            owner: Who takes it, for people.
+            ttl_s: Seconds without a request after which it ends; 0 or less ends it at once.
+            timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
+            LeaseBusy: Somebody holds the server's driver lease.
+        """
+        return self._portal.call(self._aio.acquire_lease(owner, ttl_s=ttl_s, timeout=timeout))
+
+    def release_lease(self, lease_id: str, *, timeout: Timeout = DEFAULT) -> None:
+        """Give the driver lease back.
+
+        Args:
+            lease_id: What `acquire_lease` returned.
+            timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
+            BadRequest: The frame is neither a msgpack map nor a JSON object.
+        """
+        self._portal.call(self._aio.release_lease(lease_id, timeout=timeout))
 
 
 class OutlinerOps(Facade, twin=aio.OutlinerOps):

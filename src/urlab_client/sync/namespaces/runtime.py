@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from urlab_client.aio.deadline import DEFAULT, Timeout
@@ -81,6 +82,29 @@ class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
             BadValue: Unknown integrator, cone or solver.
         """
         return self._portal.call(self._aio.set_sim_options(timeout=timeout, **opts))
+
+    def set_user_channels(
+        self,
+        arts: Mapping[str, Mapping[str, Any]] | None = None,
+        *,
+        scene: Mapping[str, Any] | None = None,
+        timeout: Timeout = DEFAULT,
+    ) -> dict[str, str]:
+        """Write values of channels that the level declares for its robots or the scene; they come back with the state.
+
+        Args:
+            arts: Articulation to channel to a bool, number, text, list of numbers, or map of `pos` and `quat`.
+            scene: Channel of the scene to value.
+            timeout: Seconds to wait; None waits without limit.
+
+        Returns:
+            Why a value was not taken, by `<articulation>/<channel>` or `scene/<channel>`; empty when all were.
+
+        Raises:
+            KeyError: Unknown articulation; nothing was sent.
+            UnknownOp: The server has no such channels.
+        """
+        return self._portal.call(self._aio.set_user_channels(arts, scene=scene, timeout=timeout))
 
     def set_mode(self, mode: StepMode | str, *, timeout: Timeout = DEFAULT) -> StepMode:
         """Switch the step mode and return the one in force. Any mode but live un-pauses physics.

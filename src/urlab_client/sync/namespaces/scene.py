@@ -114,6 +114,19 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
             )
         )
 
+    def destroy_actor(self, target: str, *, by_name: bool = False, timeout: Timeout = DEFAULT) -> None:
+        """Remove an actor from the edited level.
+
+        Args:
+            target: Actor id, or the engine's actor name with `by_name`.
+            by_name: Look `target` up by the engine's actor name instead of the actor id.
+            timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            DestroyFailed: No actor matches.
+        """
+        self._portal.call(self._aio.destroy_actor(target, by_name=by_name, timeout=timeout))
+
     def snapshot(self, *, timeout: Timeout = DEFAULT) -> SceneSnapshot:
         """Describe every visible actor, with articulation metadata; the play world when it runs.
 

@@ -35,7 +35,7 @@ class SimNamespace(Facade, twin=aio.SimNamespace):
         client was made with is in force again; in live mode physics starts paused.
 
         Args:
-            level_path: Level to open first, a full `/Game/` path.
+            level_path: Level to open first, a full `/Game/` path: `/Game/Levels/lab` or `/Game/Levels/lab.lab`.
             timeout_s: Seconds to wait for the compile.
             raise_on_failure: Raise unless play is ready; else return the result in any state.
             on_progress: Called with the state about every quarter of a second while the model compiles.

@@ -5,17 +5,14 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping
 from types import TracebackType
-from typing import Literal, Self, overload
+from typing import Self
 
 from toylab.aio.namespaces import Scene
 from toylab.aio.robots import Body, Controller, Robot, make_controller
 from toylab.aio.session import DEFAULT, Session, Timeout
 from urlab_client.protocol.names import NameMap
 
-__all__ = ["Anything", "Client"]
-
-Anything = Body | Controller
-"""What can be looked at."""
+__all__ = ["Client"]
 
 
 class Client:
@@ -61,19 +58,9 @@ class Client:
     options: dict[str, int]
     """What else was asked for."""
 
-    @classmethod
-    def default_port(cls) -> int:
-        """Return the port."""
-        return 5559
-
-    @staticmethod
-    def describe(client: Client, verbose: bool = False) -> str:
-        """Describe a client."""
-        return f"{type(client).__name__} {verbose}"
-
-    async def step(self, n_steps: int = 1, /, *extra: int, timeout: Timeout = DEFAULT) -> int:
+    async def step(self, n_steps: int = 1, *, timeout: Timeout = DEFAULT) -> int:
         """Step. `await client.step()` returns the count; see `__aenter__`."""
-        await self._session.call("step", n_steps, extra, timeout)
+        await self._session.call("step", n_steps, timeout)
         return n_steps
 
     async def fail(self, error: BaseException) -> None:
@@ -83,28 +70,6 @@ class Client:
     async def find(self, name: str) -> Body | None:
         """Find a body."""
         return next((body for body in self.bodies_by_id.values() if body.name == name), None)
-
-    async def all_bodies(self) -> tuple[Body, ...]:
-        """Return all bodies."""
-        return tuple(self.bodies_by_id.values())
-
-    @overload
-    async def look(self, at: Anything) -> Literal["object"]: ...
-    @overload
-    async def look(self, at: str) -> Literal["name"]: ...
-    async def look(self, at: Body | Controller | str) -> str:
-        """Tell what was given."""
-        if isinstance(at, str):
-            return "name"
-        if isinstance(at, (Body, Controller)):
-            return "object"
-        raise TypeError(type(at).__name__)
-
-    async def attach(self, robot: Robot, to: Body | None = None) -> list[Body]:
-        """Attach a robot to a body; return both."""
-        assert isinstance(robot, Robot)
-        assert to is None or isinstance(to, Body)
-        return [robot] if to is None else [robot, to]
 
     def local(self, progress: Callable[[float], None], limits: Mapping[str, float] = {"speed": 1.0}) -> Controller:
         """Do something locally."""
@@ -134,5 +99,3 @@ class Client:
     async def close(self) -> None:
         """Close the client."""
         await self._session.call("close")
-
-    aclose = close

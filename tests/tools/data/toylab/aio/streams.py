@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Iterable
+from collections.abc import Iterable
 from types import TracebackType
 from typing import Generic, Self, TypeVar
 
@@ -35,9 +35,13 @@ class Stream(Generic[T]):
         """Close it."""
         await self.aclose()
 
-    def __aiter__(self) -> AsyncIterator[T]:
+    def __aiter__(self) -> Self:
         """Return itself."""
         return self
+
+    def receive_nowait(self) -> T | None:
+        """Return the next item if one waits."""
+        return None
 
     async def __anext__(self) -> T:
         """Return the next item."""

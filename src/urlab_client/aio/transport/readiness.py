@@ -1,0 +1,230 @@
+"""Learning when a socket becomes readable, on every event loop.
+
+A loop with `add_reader` watches sockets itself. Others, above all Windows' default, the Proactor loop, are told by a
+thread that watches for them: one per loop, which lives as long as there is something to watch. It takes a socket off
+its list before it tells the loop, and puts it back when the loop has looked, so that it never tells twice.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import threading
+from collections.abc import Callable, Collection
+from typing import Any, ClassVar, Final, Protocol, cast
+
+import zmq
+
+__all__ = ["Readiness", "Watchable", "watch_socket"]
+
+# How often the thread looks whether the loop has been closed by somebody who left clients open.
+_CHECK_MS: Final = 1000
+_JOIN_S: Final = 1.0
+
+_DRAIN_BYTES: Final = 4096
+_POLLIN: Final = int(zmq.POLLIN)
+
+
+class Watchable(Protocol):
+    """A socket: ZeroMQ's or the system's."""
+
+    def fileno(self) -> int:
+        """Return the descriptor to watch."""
+        ...
+
+
+class Readiness(Protocol):
+    """What tells that one socket is readable."""
+
+    def expect(self) -> None:
+        """Watch from now on, if `awaited` had ended that."""
+        ...
+
+    def close(self) -> None:
+        """Watch no longer; before the socket is closed. Idempotent."""
+        ...
+
+
+def watch_socket(
+    loop: asyncio.AbstractEventLoop,
+    watched: Watchable,
+    on_readable: Callable[[], object],
+    *,
+    awaited: Callable[[], bool] | None = None,
+) -> Readiness:
+    """Call `on_readable` on the event loop whenever a socket is readable.
+
+    Args:
+        loop: The event loop, which is the running one.
+        watched: The socket.
+        on_readable: What to call. It may find that there is nothing to read after all.
+        awaited: Whether anything is to come. Where a thread has to watch, it does so only from `expect` until this
+            says no: a wake-up of the thread for a reply that the loop looks for by itself would delay that. None to
+            watch always.
+    """
+    try:
+        loop.add_reader(watched.fileno(), on_readable)
+    except NotImplementedError:
+        return _Watched(_Watcher.of(loop), watched.fileno(), on_readable, awaited)
+    return _Reader(loop, watched.fileno())
+
+
+class _Reader:
+    """A socket that its event loop watches."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, fd: int) -> None:
+        self._loop = loop
+        self._fd = fd
+        self._closed = False
+
+    def expect(self) -> None:
+        """See `Readiness.expect`: the loop always watches."""
+
+    def close(self) -> None:
+        """See `Readiness.close`."""
+        if not self._closed:
+            self._closed = True
+            if not self._loop.is_closed():  # an abandoned client may outlive its loop
+                self._loop.remove_reader(self._fd)
+
+
+class _Watched:
+    """A socket that the thread watches."""
+
+    def __init__(
+        self, watcher: _Watcher, fd: int, on_readable: Callable[[], object], awaited: Callable[[], bool] | None
+    ) -> None:
+        self.fd = fd
+        self._watcher = watcher
+        self._on_readable = on_readable
+        self._awaited = awaited
+        self._armed = False
+        self._closed = False
+        if awaited is None:
+            self.expect()
+
+    def expect(self) -> None:
+        """See `Readiness.expect`."""
+        if not self._armed and not self._closed:
+            self._armed = True
+            self._watcher.arm(self)
+
+    def close(self) -> None:
+        """See `Readiness.close`."""
+        if not self._closed:
+            self._closed = True
+            self._watcher.release(self)
+
+    def tell(self) -> None:
+        """Take note that it is readable; on the event loop."""
+        self._armed = False
+        try:
+            if not self._closed:
+                self._on_readable()
+        finally:
+            if self._awaited is None or self._awaited():
+                self.expect()
+
+
+class _Watcher:
+    """The thread of one event loop.
+
+    Its poll is ZeroMQ's, which on Windows watches more than the 512 sockets of `select.select`.
+    """
+
+    _of_loops: ClassVar[dict[asyncio.AbstractEventLoop, _Watcher]] = {}
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        self._lock = threading.Lock()
+        self._armed: dict[int, _Watched] = {}
+        self._users = 0
+        self._ended = False
+        self._rung = False
+        self._bell, self._button = socket.socketpair()
+        self._thread = threading.Thread(target=self._run, name="urlab-sockets", daemon=True)
+        self._thread.start()
+
+    @classmethod
+    def of(cls, loop: asyncio.AbstractEventLoop) -> _Watcher:
+        """Return the one of `loop`, which the caller counts among its users from now on."""
+        watcher = cls._of_loops.get(loop)
+        if watcher is None:
+            watcher = cls._of_loops[loop] = cls(loop)
+        watcher._users += 1
+        return watcher
+
+    def arm(self, watched: _Watched) -> None:
+        """Watch until it is readable."""
+        with self._lock:
+            self._armed[watched.fd] = watched
+            self._ring()
+
+    def release(self, watched: _Watched) -> None:
+        """Watch no longer. The last user ends the thread."""
+        with self._lock:
+            if self._armed.get(watched.fd) is watched:
+                del self._armed[watched.fd]
+            self._users -= 1
+            last = not self._users
+            self._ended = self._ended or last
+            self._ring()
+        if last:
+            self._forget()
+            self._thread.join(_JOIN_S)
+
+    def _ring(self) -> None:
+        if not self._rung:
+            self._rung = True
+            self._button.send(b"\0")
+
+    def _forget(self) -> None:
+        if self._of_loops.get(self._loop) is self:
+            del self._of_loops[self._loop]
+
+    def _run(self) -> None:
+        while self._look():
+            pass
+        with self._lock:
+            self._rung = True  # nobody is to ring any more
+            self._armed.clear()
+        self._forget()
+        self._bell.close()
+        self._button.close()
+
+    def _look(self) -> bool:
+        """Wait for news and tell the loop; return whether to go on."""
+        with self._lock:
+            if self._ended:
+                return False
+            fds = [self._bell.fileno(), *self._armed]
+        try:
+            ready = _poll(fds, _CHECK_MS)
+        except zmq.ZMQError:  # on Windows, of a socket that was closed meanwhile
+            self._drop_closed()
+            return True
+        with self._lock:
+            if self._bell.fileno() in ready:
+                self._bell.recv(_DRAIN_BYTES)
+                self._rung = False
+            told = [watched for fd in ready if (watched := self._armed.pop(fd, None)) is not None]
+        try:
+            for watched in told:
+                self._loop.call_soon_threadsafe(watched.tell)
+        except RuntimeError:  # the loop is closed
+            return False
+        return not self._loop.is_closed()
+
+    def _drop_closed(self) -> None:
+        with self._lock:
+            for fd in tuple(self._armed):
+                try:
+                    _poll([fd], 0)
+                except zmq.ZMQError:
+                    del self._armed[fd]
+
+
+def _poll(fds: Collection[int], timeout_ms: int) -> list[int]:
+    """Return which of these are readable, or broken."""
+    poll: Callable[[list[tuple[int, int]], int], list[tuple[int, int]]] = cast("Any", zmq.zmq_poll)
+    return [fd for fd, _ in poll([(fd, _POLLIN) for fd in fds], timeout_ms)]
