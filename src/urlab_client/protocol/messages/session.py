@@ -8,10 +8,11 @@ from typing import Annotated, Any, Final, TypeAlias
 import msgspec
 from msgspec import Struct, field
 
-from urlab_client.protocol.base import ControlRequest, Floats, QuatWXYZ, Reply, Request, Vec3, doc
+from urlab_client.protocol.base import ControlRequest, Effect, Floats, Needs, Op, QuatWXYZ, Reply, Request, Vec3, doc
 
 __all__ = [
     "NOT_SENT",
+    "OPS",
     "ArticulationCommand",
     "ArticulationInfo",
     "ArticulationState",
@@ -429,3 +430,40 @@ class MetaOk(Reply, tag="meta_ok", kw_only=True):
 
 class Meta(Request[MetaOk], tag="meta", kw_only=True):
     """List the ops this server offers; needs no session."""
+
+
+OPS: Final = (
+    Op(request=Hello, method="discover", needs=Needs.NOTHING, effect=Effect.READ, timeout=30.0),
+    Op(request=Meta, needs=Needs.NOTHING, effect=Effect.READ),
+    Op(
+        request=Step,
+        needs=Needs.MANAGER,
+        # Above the server's own limit of 5 s, or its step_timeout would arrive too late.
+        timeout=6.5,
+        hot=True,
+        errors=("not_ready", "not_control_owner", "step_timeout", "shutting_down"),
+        declares=(
+            "op:string",
+            "time:float",
+            "step:int",
+            "per_articulation:object",
+            "sim_time:object?",
+            "wall_time:object?",
+        ),
+    ),
+    Op(
+        request=Reset,
+        needs=Needs.MANAGER,
+        errors=("not_ready", "unknown_keyframe"),
+        declares=("op:string", "time:float", "step:int"),
+    ),
+    Op(
+        request=Forward,
+        ns="runtime",
+        needs=Needs.MANAGER,
+        # Computes what follows from the state, which it leaves as it is: the same the second time.
+        effect=Effect.READ,
+        errors=("not_ready",),
+        declares=("op:string", "time:float", "step:int", "per_articulation:object"),
+    ),
+)

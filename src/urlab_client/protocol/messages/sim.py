@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Final
 
-from urlab_client.protocol.base import Reply, Request, doc
+from urlab_client.protocol.base import EDITOR_TIMEOUT_S, Effect, Op, Reply, Request, doc
 from urlab_client.protocol.enums import PIEState
 from urlab_client.protocol.messages.session import HelloOk
 
-__all__ = ["BeginPie", "BeginPieOk", "PieStatus", "PieStatusOk", "StopPie", "StopPieOk"]
+__all__ = ["OPS", "BeginPie", "BeginPieOk", "PieStatus", "PieStatusOk", "StopPie", "StopPieOk"]
 
 
 class BeginPieOk(Reply, tag="begin_pie_ok", kw_only=True, omit_defaults=True):
@@ -44,3 +44,18 @@ class PieStatusOk(Reply, tag="pie_status_ok", kw_only=True, omit_defaults=True):
 
 class PieStatus(Request[PieStatusOk], tag="pie_status", kw_only=True):
     """Read the state of Play-In-Editor."""
+
+
+OPS: Final = (
+    # The server may take 10 s to reach its game thread, on top of the request's own timeout_s.
+    Op(
+        request=BeginPie,
+        ns="sim",
+        method="start",
+        timeout=45.0,
+        errors=("shutting_down", "load_level_failed"),
+        declares=("op:string", "state:string", "compile_error:string", "handshake_payload:object?"),
+    ),
+    Op(request=StopPie, ns="sim", method="stop", timeout=EDITOR_TIMEOUT_S, errors=("timeout",)),
+    Op(request=PieStatus, ns="sim", method="status", effect=Effect.READ, timeout=EDITOR_TIMEOUT_S),
+)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 import re
 import tempfile
-import zipfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property, lru_cache
@@ -25,7 +24,7 @@ from urlab_client.protocol.base import Vec3
 from urlab_client.protocol.controller_text import CUSTOM_TEXT, ControllerText
 from urlab_client.protocol.rotation import rotate, wxyz
 from urlab_client.server.assets.actors import Actor, Mesh
-from urlab_client.server.assets.content import Blueprint, mujoco_messages, one_line
+from urlab_client.server.assets.content import Blueprint, mujoco_messages, one_line, open_archive
 from urlab_client.server.assets.decomposition import convex_parts
 
 __all__ = [
@@ -202,7 +201,7 @@ class CompiledScene:
         with tempfile.TemporaryDirectory() as folder, mujoco_messages():
             archive = Path(folder) / "model.mjz"
             self.spec.encode(str(archive))
-            with zipfile.ZipFile(archive) as content:
+            with open_archive(archive) as content:
                 files = {name: content.read(name) for name in content.namelist() if not name.endswith("/")}
         xml = files.pop("model.xml").decode()
         names: dict[str, str] = {}

@@ -131,7 +131,7 @@ def _add_assets(reply: HelloOk, running: Running) -> None:
     try:
         reply.mjcf_compiled = running.scene.mjcf()
         reply.vfs_assets = running.scene.assets()
-    except (ValueError, mujoco.FatalError) as error:
+    except (OSError, ValueError, mujoco.FatalError) as error:
         logger.warning("the scene cannot be written as MJCF, so the handshake goes without: %s", error)
 
 
