@@ -23,9 +23,9 @@ from urlab_client.aio.deadline import DEFAULT, Timeout, shared
 from urlab_client.aio.live.live_state import LatestPicture, LiveState
 from urlab_client.aio.live.publishers import Publishers
 from urlab_client.aio.model.articulation_state import MirroredArticulation, MirroredEntity, Wrenches
-from urlab_client.aio.model.handshake import Examined, examine
 from urlab_client.aio.model.mirror import Mirror, write_options
 from urlab_client.aio.session import Session
+from urlab_client.aio.state.handshake import Examined, examine
 from urlab_client.aio.state.recovery import PendingOutcomes
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.enums import CameraMode, StepMode
