@@ -15,20 +15,41 @@ ALLOWED: dict[str, frozenset[str]] = {
     "protocol": frozenset(),
     "keys": frozenset({"protocol"}),
     "aio": frozenset(
-        {"_children", "_confined", "_landlock", "_mjcf_files", "_mujoco", "_processors", "keys", "protocol"}
+        {
+            "_children",
+            "_confined",
+            "_landlock",
+            "_mjcf_files",
+            "_mujoco",
+            "_processors",
+            "_uninterrupted",
+            "keys",
+            "protocol",
+        }
     ),
     "sync": frozenset({"aio", "protocol"}),
     "server": frozenset(
-        {"_children", "_confined", "_landlock", "_mjcf_files", "_mujoco", "_processors", "keys", "protocol"}
+        {
+            "_children",
+            "_confined",
+            "_landlock",
+            "_mjcf_files",
+            "_mujoco",
+            "_processors",
+            "_uninterrupted",
+            "keys",
+            "protocol",
+        }
     ),
     "enums": frozenset({"protocol"}),
     "_children": frozenset(),
     "_confined": frozenset(),
-    "_mujoco": frozenset(),
     "_landlock": frozenset(),
     "_mjcf_files": frozenset(),
+    "_mujoco": frozenset(),
     "_installation": frozenset(),
     "_processors": frozenset(),
+    "_uninterrupted": frozenset(),
     "": frozenset({"_installation", "sync", "enums", "protocol"}),
     "integrations": frozenset({"", "_mujoco", "aio", "enums", "keys", "protocol", "server", "sync"}),
     "cluster": frozenset({"integrations", "protocol", "sync"}),

@@ -69,8 +69,7 @@ def named_files(text: bytes) -> NamedFiles:
     """
     found = NamedFiles()
     end, elements = 0, 0
-    scanner = _TOKEN.scanner(text)
-    while token := scanner.match():
+    while token := _TOKEN.match(text, end):
         end = token.end()
         if token["element"] is not None:
             elements += 1

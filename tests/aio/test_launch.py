@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from waiting import DEADLINE_S, until
+from waiting import DEADLINE_S, pass_time, until
 
 import urlab_client
 from urlab_client import ClientClosed, OutcomeUnknown, ServerUnreachable
@@ -52,6 +52,15 @@ def test_the_facade_does_the_same() -> None:
         client.step(10)
         assert set(client.articulations) == {"ball", "pallet"}
     assert children() == set()
+
+
+async def test_the_start_of_the_server_counts_for_no_deadline() -> None:
+    async with URLabClient("sim://ball") as client:
+        calling = asyncio.create_task(client.discover())
+        await until(children)
+        pass_time(40)  # that is longer than a call may take, or wait for a connection
+        await calling
+        assert client.session_id
 
 
 async def test_options_of_serve_go_into_the_address(tmp_path: Path) -> None:
@@ -155,7 +164,7 @@ def test_a_blocking_client_starts_servers_under_uvloops_policy() -> None:
         "    client.discover()\n"
         "    process = client._aio._transport._process\n"
         "    os.kill(process.pid, signal.SIGKILL)\n"
-        "    client._portal.call(process.wait())\n"
+        "    client._portal.call(process.wait)\n"
         "    client.discover()\n"
         "    print(process.returncode, client.step().step)\n"
         "    process = client._aio._transport._process\n"

@@ -6,6 +6,7 @@ left out, defaults that do not rebind, a sticky observation level.
 
 from __future__ import annotations
 
+import asyncio
 import json
 import pickle
 from collections.abc import Callable
@@ -16,6 +17,7 @@ import mujoco
 import numpy as np
 import pytest
 from hello import hello_ok
+from waiting import DEADLINE_S, until
 
 import urlab_client
 from urlab_client import (
@@ -233,6 +235,25 @@ async def test_a_wrench_on_a_plain_entity_travels_under_its_compiled_name(plugin
         assert "crate_MjBody" not in second["per_articulation"]
 
 
+async def test_a_wrench_applied_while_a_step_travels_goes_with_the_next(plugin: Any, connect: Any) -> None:
+    async with connect() as client:
+        await client.discover()
+        body = "crate_MjBody"
+        crate = client.entities[body]
+        plugin.scripted.on("step", None)
+        crate.apply_xfrc(force=(1, 0, 0))
+        travelling = asyncio.create_task(client.step())
+        await until(plugin.scripted.held.qsize)
+        crate.apply_xfrc(force=(2, 0, 0))
+        plugin.scripted.on("step", plugin.step)
+        plugin.scripted.release(plugin.step({}))
+        await travelling
+        await client.step()
+        await client.step()
+        sent = [request.get("per_articulation", {}).get(body) for request in plugin.requests]
+        assert sent == [None, {"xfrc_applied": {body: [2, 0, 0, 0, 0, 0]}}, None]
+
+
 async def test_engine_names_are_found_by_what_users_know(plugin: Any, connect: Any) -> None:
     async with connect() as client:
         await client.discover()
@@ -359,7 +380,7 @@ async def test_a_frame_of_the_wrong_size_spoils_the_whole_reply(plugin: Any, con
 async def test_an_unknown_camera_is_told_before_sending(plugin: Any, connect: Any) -> None:
     async with connect() as client:
         await client.discover()
-        with pytest.raises(KeyError, match="no camera 'c2'; there are: robot/c1, robot/c10"):
+        with pytest.raises(KeyError, match=r"no camera 'c2'. Known: 'robot/c1' and 'robot/c10'"):
             await client.step(include_cameras={"c2": "sync"})
         assert plugin.requests == []
 
@@ -394,6 +415,21 @@ async def test_the_level_of_one_step_does_not_stick(plugin: Any, connect: Any) -
         await client.step(observations="full")
         reply = await client.step()
         assert [request.get("observations") for request in plugin.requests] == [None, "full", "minimal"]
+        assert reply.per_articulation["robot"].sensors is None
+
+
+async def test_the_level_of_a_step_that_failed_does_not_stick(plugin: Any, connect: Any) -> None:
+    async with connect() as client:
+        await client.discover(observations="minimal")
+        plugin.scripted.on("step", None)
+        lost = asyncio.create_task(client.step(observations="full", timeout=DEADLINE_S))
+        await until(plugin.scripted.held.qsize)
+        lost.cancel()
+        await asyncio.wait((lost,))
+        plugin.step({"observations": "full"})  # it was executed all the same
+        plugin.scripted.on("step", plugin.step)
+        reply = await client.step()
+        assert plugin.requests[-1]["observations"] == "minimal"
         assert reply.per_articulation["robot"].sensors is None
 
 

@@ -11,7 +11,7 @@ import os, sys, threading
 import msgspec
 from urlab_client.protocol.codec import decode_reply
 from urlab_client.protocol.errors import ProtocolError
-from urlab_client.protocol.registry import OPS
+from urlab_client.protocol.dialects import ALPHA
 from urlab_client.server.rpc.requests import RequestReader
 
 HELLO = {"op": "hello_ok", "session_id": "", "urlab_version": "", "mujoco_version": "", "articulations": [{}]}
@@ -22,7 +22,7 @@ def first_use(together, number):
     together.wait()
     if number == 0:
         RequestReader()
-    for op in OPS.values():
+    for op in ALPHA.ops.values():
         try:
             decode_reply(op, op.reply, frame)
         except ProtocolError:

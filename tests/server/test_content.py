@@ -1,8 +1,13 @@
 from __future__ import annotations
 
+import contextlib
+import errno
 import json
 import os
+import resource
+import shutil
 import threading
+from collections.abc import Generator
 from pathlib import Path
 
 import mujoco
@@ -12,9 +17,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from worlds import BALL_BODY, BOT, GYMNASIUM, Workspace, mjcf, write_obj, write_stl
 
+from urlab_client.server.assets import content, sandbox
 from urlab_client.server.assets.bundled_robots import bundled_models
 from urlab_client.server.assets.content import Blueprint, ContentRoot, level_package, mujoco_messages, write_atomic
+from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
+from urlab_client.server.system.temporary_folder import working_in
 
 BALL = mjcf(BALL_BODY, model="ball")
 
@@ -298,10 +306,97 @@ def test_a_removed_blueprint_stays_away(workspace: Workspace) -> None:
 
 def test_a_content_root_that_cannot_be_written_refuses_imports(tmp_path: Path) -> None:
     (tmp_path / "saved").write_text("a file where the folder should be")
-    content = ContentRoot(tmp_path / "saved")
+    blocked = ContentRoot(tmp_path / "saved")
 
     with pytest.raises(Refusal, match="import_failed: cannot store"):
-        content.import_xml("ball")
+        blocked.import_xml("ball")
+
+
+@contextlib.contextmanager
+def files_of_at_most(size: int) -> Generator[None]:
+    """Let no file of this process grow beyond a size: to a program that is much like a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+@pytest.mark.parametrize("size", [0, 100, 1000])  # the archive, the model in it, or the record does not fit
+def test_an_import_onto_a_full_disk_is_refused_and_leaves_nothing(workspace: Workspace, size: int) -> None:
+    workspace.content.import_xml(str(workspace.write("bot.xml", BOT)))
+    before = tree(workspace.saved)
+    text = "".join(f'<geom name="more{n}" pos="{n} 0 0" size="0.1"/>' for n in range(200))
+    workspace.write("bot.xml", BOT.replace("</worldbody>", f"{text}</worldbody>"))
+    other = workspace.write("other.xml", mjcf(f'<body name="b"><joint/>{text}</body>'))
+
+    with files_of_at_most(size):
+        for path in (str(other), "arm", str(workspace.models / "bot.xml")):
+            with pytest.raises(Refusal, match="import_failed: cannot store the snapshot"):
+                workspace.content.import_xml(path, force_reimport=True, trusted=True)
+        (workspace.saved / "snapshot").mkdir()
+        order = sandbox._SandboxJob(
+            str(other), str(workspace.saved / "snapshot" / "s"), [str(workspace.models)], Limits()
+        )
+        outcome = sandbox._work(order)  # of a child, whose files have a limit of their own
+        shutil.rmtree(workspace.saved / "snapshot")
+
+    assert outcome.done is None
+    assert outcome.subject.startswith("cannot store the snapshot")
+    assert tree(workspace.saved) == before
+    assert list(workspace.content.blueprints) == list(ContentRoot(workspace.saved).blueprints) == ["bot"]
+    assert workspace.content.import_xml("arm")[1]
+
+
+def test_a_snapshot_whose_record_cannot_be_written_does_not_stay(
+    workspace: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, data: bytes) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    monkeypatch.setattr(content, "write_atomic", full)
+    with pytest.raises(Refusal, match=r"import_failed: cannot store .* No space left"):
+        workspace.content.import_xml("arm")
+    assert tree(workspace.saved) == {}
+    assert not workspace.content.blueprints
+
+
+def test_what_a_killed_server_left_is_swept_at_the_start(workspace: Workspace) -> None:
+    workspace.content.import_xml("ball")
+    before = tree(workspace.saved)
+    imports = workspace.saved / "MuJoCoImports"
+    for left in ("ball/.import-abc", "arm/.import-def", ".import-gone"):
+        (imports / left / "snapshot").mkdir(parents=True)
+        (imports / left / "snapshot" / "model.xml").write_text("<mujoco/>")
+
+    with working_in(imports):  # another server imports
+        ContentRoot(workspace.saved)
+    assert (imports / "arm/.import-def").exists()
+    assert list(ContentRoot(workspace.saved).blueprints) == ["ball"]
+
+    assert tree(workspace.saved) == before
+    assert [folder.name for folder in imports.iterdir()] == ["ball"]
+    assert not [*imports.rglob(".import-*")]
+
+
+@pytest.mark.parametrize("field", ["digest", "stem"])
+@pytest.mark.parametrize("name", ["../../elsewhere", "..", "/elsewhere", ""])
+def test_records_name_no_folders_elsewhere(
+    workspace: Workspace, field: str, name: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    blueprint, _ = workspace.content.import_xml("ball")
+    (workspace.saved / "elsewhere").mkdir()
+    shutil.copy(blueprint.folder / "model.xml", workspace.saved / "elsewhere")
+    record = workspace.content.snapshot_record(blueprint)
+    record.write_text(json.dumps(json.loads(record.read_text()) | {field: name}))
+
+    assert not ContentRoot(workspace.saved).blueprints
+    assert "cannot be the names of folders" in caplog.text
 
 
 # Names and keyframes

@@ -89,6 +89,15 @@ def test_a_wrong_key_is_said_before_any_deadline(
                 client.discover()
 
 
+@pytest.mark.parametrize("mode", [0o640, 0o620, 0o610, 0o604, 0o602, 0o601])
+def test_a_secret_that_others_could_read_is_refused(tmp_path: Path, mode: int) -> None:
+    _, secret = KeyPair.new().write(tmp_path, "me")
+    assert read_pair(secret)
+    secret.chmod(mode)
+    with pytest.raises(KeyFileError, match="chmod 600"):
+        read_pair(secret)
+
+
 def test_keys_for_a_server_without(keys: Path) -> None:
     with (
         SimulatedServer() as server,

@@ -703,6 +703,16 @@ def test_a_wrench_holds_for_its_request_and_no_longer(start: Start, way: InlineO
     assert sim.data.body("PB_ball").xpos[2] < 0.999
 
 
+def test_a_wrench_finds_the_body_of_its_articulation_before_one_that_is_called_so_in_full(start: Start) -> None:
+    """`crane_hook` is the hook of `crane`, and a body of `big`, where it is compiled as `big_crane_hook`."""
+    body = '<mujoco><worldbody><body name="{}"><freejoint/><geom size=".1" mass="1"/></body></worldbody></mujoco>'
+    sim = start(big=body.format("crane_hook"), crane=body.format("hook"))
+    before = {name: sim.data.body(name).xpos[0] for name in ("big_crane_hook", "crane_hook")}
+    sim.command("big", 10, xfrc_applied={"crane_hook": [100, 0, 0, 0, 0, 0]})
+    assert sim.data.body("big_crane_hook").xpos[0] > before["big_crane_hook"]
+    assert sim.data.body("crane_hook").xpos[0] == before["crane_hook"]
+
+
 @given(st.lists(st.floats(-10, 10), max_size=8).filter(lambda wrench: len(wrench) != 6))
 @settings(max_examples=10)
 def test_a_wrench_that_is_not_six_numbers_or_on_an_unknown_body_is_ignored(wrench: list[float]) -> None:

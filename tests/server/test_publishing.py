@@ -494,6 +494,17 @@ def test_info_describes_every_articulation_in_one_frame_each(play: Play) -> None
     assert (limited["robot"], limited["ids"], limited["mins"], limited["maxs"]) == ("bot_1", [1], [-100.0], [100.0])
 
 
+def test_info_tells_the_range_of_the_first_input_behind_an_actuator_of_several(play: Play, tmp_path: Path) -> None:
+    path = tmp_path / "multi.xml"
+    path.write_text(MULTI.replace('name="last"', 'name="last" ctrlrange="-2 3" ctrllimited="true"'))
+    bench = play(path)
+    bench.hurry()
+    socket = bench.open(zmq.SUB, bench.server.info_port)
+    socket.subscribe(b"")
+    info = json.loads(socket.recv())
+    assert (info["ids"], info["mins"], info["maxs"]) == ([0, 1, 2], [-100.0, -100.0, -2.0], [100.0, 100.0, 3.0])
+
+
 def test_info_pauses_outside_live_mode(play: Play) -> None:
     bench = play()
     bench.wire.ask("set_mode", mode="direct")

@@ -74,6 +74,23 @@ def test_steps_play_a_file_in_a_loop(bot: Wire, mode: str) -> None:
     assert "replay" not in bot.ask("step")
 
 
+def test_a_free_body_turns_the_short_way(bot: Wire, replays: Path) -> None:
+    """A quaternion and its negative are one orientation: between frames of either sign nothing spins."""
+    half = np.sqrt(0.5)
+    turns = [[1, 0, 0, 0], [-half, 0, 0, -half]]  # from none to a quarter about z, which is written with the other sign
+    frames = [
+        {"timestamp": 0.004 * i, "jointStates": {"root": {"qPos": [0, 0, 0, *turn]}, "j": {"qPos": [0]}}}
+        for i, turn in enumerate(turns)
+    ]
+    (replays / "turn.json").write_text(json.dumps({"Frames": frames}))
+    bot.ask("set_mode", mode="direct")
+    bot.ask("replay_load", path="turn.json")
+    bot.ask("replay_start")
+    quaternion = np.array(state(bot.ask("step"))["qpos"][3:7])
+    eighth = np.array([np.cos(np.pi / 8), 0, 0, np.sin(np.pi / 8)])
+    assert abs(quaternion @ eighth) == pytest.approx(1.0, abs=1e-6)
+
+
 def test_a_live_recording_comes_back_exactly(bot: Wire) -> None:
     bot.ask("set_mode", mode="direct")
     bot.ask("recording_start")

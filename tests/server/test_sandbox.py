@@ -222,7 +222,7 @@ def test_mujoco_s_own_leniency_is_understood(wire: Wire, folder: Path) -> None:
 @pytest.mark.skipif(not is_available(), reason="the kernel has no Landlock")
 def test_the_kernel_keeps_mujoco_from_files_that_a_check_missed(folder: Path, tmp_path: Path) -> None:
     program = (
-        "from urlab_client.server import sandbox\n"
+        "from urlab_client.server.assets import sandbox\n"
         "sandbox.check_references = lambda *arguments: None\n"
         "sandbox._serve()\n"
     )
@@ -231,7 +231,7 @@ def test_the_kernel_keeps_mujoco_from_files_that_a_check_missed(folder: Path, tm
         model = folder / "root" / f"{name}.xml"
         model.write_text(FIGURE.format(file=file))
         (tmp_path / name).mkdir()
-        order = sandbox._Order(str(model), str(tmp_path / name / "snapshot"), [str(folder / "root")], LIMITS)
+        order = sandbox._SandboxJob(str(model), str(tmp_path / name / "snapshot"), [str(folder / "root")], LIMITS)
         orders += msgspec.json.encode(order) + b"\n"
     child = subprocess.run([sys.executable, "-c", program], input=orders, stdout=subprocess.PIPE, check=True)
     inside, outside = map(msgspec.json.decode, child.stdout.splitlines())
@@ -346,6 +346,33 @@ def test_a_level_that_a_client_opens_names_no_files_elsewhere(folder: Path, tmp_
             code, message = wire.refusal("load_level", level_path=name)
             assert code == "load_level_failed"
             assert "outside the folders" in message
+
+
+def test_a_record_that_a_client_may_have_written_is_not_adopted(folder: Path, tmp_path: Path) -> None:
+    """What it says was compiled, in a snapshot that never was, would be read with nothing in the way."""
+    home = folder / "root" / "forged"
+    (home / "0123456789abcdef").mkdir(parents=True)
+    (home / "0123456789abcdef" / "model.xml").write_text(FIGURE.format(file=folder / "secret.obj"))
+    record = {"stem": "b", "source": "b.xml", "source_digest": "", "digest": "0123456789abcdef", "model_name": "b"}
+    record |= {"imported_at": "2026-01-01T00:00:00Z", "joints": [], "actuators": [], "actuator_types": {}}
+    (home / "blueprint.json").write_bytes(msgspec.json.encode(record | {"sensors": [], "cameras": []}))
+    (home / "b.xml").write_text(FIGURE.format(file=folder / "secret.obj"))
+    level = {
+        "format": "urlab-level",
+        "version": 1,
+        "blueprints": {
+            "b": {"source": f"{home}/b.xml", "digest": "0123456789abcdef", "record": f"{home}/blueprint.json"}
+        },
+        "actors": [{"name": "b", "kind": "articulation", "blueprint": "b"}],
+    }
+    (tmp_path / "Levels").mkdir()
+    (tmp_path / "Levels" / "forged.json").write_bytes(msgspec.json.encode(level))
+    with SimulatedServer(saved_dir=tmp_path, model_roots=[folder / "root"]) as server, Wire(server) as wire:
+        wire.hello()
+        code, message = wire.refusal("load_level", level_path="forged")
+    assert code == "load_level_failed"
+    assert "secret.obj, which lies outside the folders" in message
+    assert not [*tmp_path.rglob("*.obj")]
 
 
 def test_whoever_runs_the_server_may_name_any_file(folder: Path) -> None:

@@ -21,6 +21,7 @@ from urlab_client.aio.launch import SCHEME, LaunchedTransport
 from urlab_client.aio.live.publishers import Publishers
 from urlab_client.aio.model.mirror import model_names
 from urlab_client.aio.namespaces.debug import DebugNamespace
+from urlab_client.aio.namespaces.farm import FarmNamespace
 from urlab_client.aio.namespaces.outliner import OutlinerNamespace
 from urlab_client.aio.namespaces.recording import RecordingNamespace, ReplayNamespace
 from urlab_client.aio.namespaces.runtime import RuntimeNamespace
@@ -187,6 +188,7 @@ class URLabClient:
         self._outliner = OutlinerNamespace(self._session)
         self._debug = DebugNamespace(self._session)
         self._viewport = ViewportNamespace(self._session)
+        self._farm = FarmNamespace(self._session)
         self._recording = RecordingNamespace(self._session)
         self._replay = ReplayNamespace(self._session)
 
@@ -221,6 +223,11 @@ class URLabClient:
     def viewport(self) -> ViewportNamespace:
         """The editor's perspective viewport."""
         return self._viewport
+
+    @property
+    def farm(self) -> FarmNamespace:
+        """Sharing servers among clients."""
+        return self._farm
 
     @property
     def recording(self) -> RecordingNamespace:

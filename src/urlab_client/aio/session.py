@@ -12,6 +12,7 @@ from urlab_client.aio.transport.base import RequestTransport
 from urlab_client.protocol.base import Needs, Op, Reply, Request
 from urlab_client.protocol.codec import check_request, decode_reply, encode_request, op_of
 from urlab_client.protocol.errors import ConnectionLost, ServerUnreachable, UnknownOp, URLabRPCError, URLabTimeoutError
+from urlab_client.protocol.features import Features
 from urlab_client.protocol.messages.session import Hello, HelloOk, Meta
 
 __all__ = ["Session"]
@@ -19,6 +20,8 @@ __all__ = ["Session"]
 log = logging.getLogger("urlab_client.session")
 
 R = TypeVar("R", bound=Reply)
+
+_UNLISTED = frozenset({"hello", "meta"})  # every server has them, none lists them
 
 
 class Session:
@@ -29,7 +32,7 @@ class Session:
 
     Attributes:
         session_id: Id of the open session; empty without one.
-        offered: Ops the server lists, or None before it was asked.
+        features: What the server can do, as far as its answers have shown.
         on_refusal: Told of each refusal before it is raised.
         confirmed: Whether the server has answered within this session since the connection was made. It may be another
             server after that was lost, which only a refused or accepted session id shows.
@@ -37,7 +40,7 @@ class Session:
 
     def __init__(self, transport: RequestTransport, *, default_timeout: float | None, json: bool = False) -> None:
         self.session_id = ""
-        self.offered: frozenset[str] | None = None
+        self.features = Features()
         self.on_refusal: Callable[[URLabRPCError], None] | None = None
         self.confirmed = False
         self._transport = transport
@@ -66,7 +69,7 @@ class Session:
             TypeError, ValueError: The request is malformed; nothing was sent.
         """
         op = op_of(request)
-        if self.offered is not None and op.needs is not Needs.NOTHING and op.name not in self.offered:
+        if op.name not in _UNLISTED and not self.features.offers(op.name):
             raise UnknownOp("unknown_op", "this server does not offer it. Nothing was sent.", op=op.name)
         loop = asyncio.get_running_loop()
         now = loop.time()
@@ -129,7 +132,11 @@ class Session:
         self.session_id = reply.session_id
         self.confirmed = True
         # A packaged build lacks the editor's ops, an older server lacks newer ones.
-        self.offered = frozenset(op.name for op in (await self.call(Meta(), timeout=left())).ops)
+        try:
+            listed = [op.name for op in (await self.call(Meta(), timeout=left())).ops]
+        except UnknownOp:
+            listed = None
+        self.features = self.features.with_ops(listed).with_hello(reply)
         return reply
 
     async def aclose(self) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
-from typing import Annotated, Any, Generic, Literal, TypeAlias, TypeVar
+from typing import Annotated, Any, Final, Generic, Literal, TypeAlias, TypeVar
 
 import msgspec
 import numpy as np
@@ -17,9 +17,12 @@ from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
 __all__ = [
+    "EDITOR_TIMEOUT_S",
     "ActorId",
     "ActorTarget",
     "Color",
+    "ControlRequest",
+    "DialectName",
     "Effect",
     "EulerDeg",
     "Floats",
@@ -41,6 +44,10 @@ Floats: TypeAlias = NDArray[np.float64]
 
 Vec3: TypeAlias = tuple[float, float, float]
 Quat: TypeAlias = tuple[float, float, float, float]
+
+
+DialectName: TypeAlias = Literal["alpha", "beta"]
+"""The generations of the plugin whose whole wire is known; see `protocol.dialects`."""
 
 
 def doc(text: str) -> Meta:
@@ -74,6 +81,18 @@ class Request(Struct, Generic[R_co], tag_field="op", kw_only=True, omit_defaults
     """A question whose answer is an `R_co`. The session stamps `session_id` when it sends it."""
 
     session_id: Annotated[str, doc("Session id from the latest `hello_ok`.")] = ""
+
+
+class ControlRequest(Request[R_co], Generic[R_co], kw_only=True, omit_defaults=True):
+    """A request that writes to a robot, which some servers accept only from the robot's owner."""
+
+    control_owner: Annotated[
+        str | None, doc("Name of the client that writes; absent stands for the session. Not known to the alpha.")
+    ] = None
+
+
+EDITOR_TIMEOUT_S: Final = 30.0
+"""Seconds to wait for an editor op: it waits for the game thread, which level or mesh work can hold for long."""
 
 
 class Needs(StrEnum):
@@ -113,6 +132,8 @@ class Op:
         positional: For a generated method: how many leading parameters are positional.
         undeclared: Required fields that only the op's handler checks, so that `meta` does not list them.
         declares: Reply fields as `meta` lists them, where the plugin's list differs from what it sends.
+        dialects: Generations of the plugin that offer it.
+        job: Whether the beta answers `op_started` and delivers the reply through `op_status`.
     """
 
     request: type[Request[Any]]
@@ -128,6 +149,8 @@ class Op:
     positional: int = 0
     undeclared: tuple[str, ...] = ()
     declares: tuple[str, ...] | None = None
+    dialects: tuple[DialectName, ...] = ("alpha", "beta")
+    job: bool = False
     name: str = field(init=False)
     reply: type[Reply] = field(init=False)
 

@@ -17,6 +17,7 @@ import mujoco
 from urlab_client._mujoco import copy_options
 from urlab_client.protocol.base import Request
 from urlab_client.protocol.codec import encode_reply
+from urlab_client.protocol.dialects import ALPHA, Dialect
 from urlab_client.protocol.enums import CameraMode, PIEState, StepMode
 from urlab_client.protocol.messages.session import ErrorReply, Hello, Step
 from urlab_client.server.assets.actors import Actor
@@ -24,7 +25,6 @@ from urlab_client.server.compile.scene import ArticulationIndex, CompiledScene, 
 from urlab_client.server.editor.markers import Drawings
 from urlab_client.server.editor.viewport import Viewport
 from urlab_client.server.editor.world import EditorWorld
-from urlab_client.server.health import Health
 from urlab_client.server.limits import Limits
 from urlab_client.server.physics.controllers import ControllerConfig
 from urlab_client.server.physics.engine import Engine
@@ -34,6 +34,7 @@ from urlab_client.server.physics.replay import recordings, replay_folder
 from urlab_client.server.render.camera_renderer import CameraRenderer, RenderQuality
 from urlab_client.server.session import ServerSession
 from urlab_client.server.system.allocator import trim
+from urlab_client.server.system.health import Health
 
 __all__ = ["PhysicsConfig", "ServerCore", "unmatched_names"]
 
@@ -86,6 +87,7 @@ class ServerCore:
         world: The level being edited.
         physics: How play sessions are set up.
         camera_endpoint: Returns where a camera publishes, from articulation key and camera name.
+        dialect: What the generation of the plugin that it speaks for says differently.
         shm_directory: Directory of the shared-memory regions; None without.
         session: The client's session.
         play: The play session.
@@ -98,6 +100,7 @@ class ServerCore:
     world: EditorWorld
     physics: PhysicsConfig
     camera_endpoint: Callable[[str, str], str]
+    dialect: Dialect = ALPHA
     shm_directory: str | None = None
     session: ServerSession = field(default_factory=ServerSession)
     play: Play = field(default_factory=Play)

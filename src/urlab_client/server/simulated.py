@@ -33,7 +33,6 @@ from urlab_client.server.editor.viewport import Viewport
 from urlab_client.server.editor.world import EditorWorld
 from urlab_client.server.faults import Faults, FaultyEndpoint, Injector
 from urlab_client.server.handlers import HANDLERS
-from urlab_client.server.health import Health
 from urlab_client.server.limits import Limits
 from urlab_client.server.physics.controllers import ControllerConfig
 from urlab_client.server.refusal import Refusal
@@ -43,6 +42,7 @@ from urlab_client.server.session import ServerSession
 from urlab_client.server.snapshot import LARGEST_PIXELS, take_snapshot
 from urlab_client.server.streams.camera_streams import CameraStreams
 from urlab_client.server.streams.publishing import StreamServer
+from urlab_client.server.system.health import Health
 from urlab_client.server.system.temporary_folder import TemporaryFolder
 from urlab_client.server.transport.curve_authentication import CurveKeys, CurveServer, UnprotectedServer, is_loopback
 from urlab_client.server.transport.endpoint import RpcEndpoint, connect_host, numeric_host, tcp

@@ -13,6 +13,7 @@ For `World`, which knows what is placed where. Nothing here places, compiles sce
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import logging
 import os
@@ -36,6 +37,7 @@ from urlab_client._mujoco import actuator_count, actuator_kind, check_copy, writ
 from urlab_client.server.assets.bundled_robots import BUNDLED_PREFIX, bundled_models, bundled_root
 from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
+from urlab_client.server.system.temporary_folder import sweep, working_in
 
 __all__ = [
     "PARENT_CLASS",
@@ -46,6 +48,7 @@ __all__ = [
     "level_package",
     "mujoco_messages",
     "one_line",
+    "open_archive",
     "sanitized",
     "write_atomic",
 ]
@@ -54,6 +57,9 @@ logger = logging.getLogger("urlab_client.server")
 
 IMPORTS: Final = "MuJoCoImports"
 PARENT_CLASS: Final = "MjArticulation"
+
+_UNDER_WAY: Final = ".import-"
+"""What the folders begin with that are not finished yet, or are being removed."""
 
 DEFAULT_MODEL_NAMES: Final = frozenset({"", "MuJoCo Model"})
 """What MuJoCo calls a model whose file gives no name."""
@@ -150,6 +156,7 @@ class _Record(msgspec.Struct, frozen=True, kw_only=True):
 
 
 _RECORD: Final = msgspec.json.Decoder(_Record)
+_DIGEST: Final = re.compile(r"[0-9a-f]{16}")
 
 
 class Compiled(msgspec.Struct, frozen=True, kw_only=True):
@@ -265,6 +272,7 @@ class ContentRoot:
         self.root = saved_dir.resolve()
         self.model_roots = tuple(root.resolve() for root in model_roots)
         self._blueprints: dict[str, Blueprint] = {}
+        sweep(self.root / IMPORTS, f"*/{_UNDER_WAY}*", f"{_UNDER_WAY}*")
         for record in sorted(self.root.glob(f"{IMPORTS}/*/blueprint.json")):
             try:
                 blueprint = _load(record)
@@ -351,7 +359,10 @@ class ContentRoot:
         folder = home / other.digest
         if not folder.exists():
             home.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(dir=home, prefix=".import-") as temporary_folder:
+            with (
+                working_in(self.root / IMPORTS),
+                tempfile.TemporaryDirectory(dir=home, prefix=_UNDER_WAY) as temporary_folder,
+            ):
                 copy = Path(temporary_folder) / "snapshot"
                 shutil.copytree(other.folder, copy)
                 os.replace(copy, folder)
@@ -363,8 +374,11 @@ class ContentRoot:
         Raises:
             OSError: It cannot be deleted.
         """
+        removed = self.root / IMPORTS / f"{_UNDER_WAY}{stem}"
+        shutil.rmtree(removed, ignore_errors=True)
+        os.replace(self.root / IMPORTS / stem, removed)  # whole, or not at all
         del self._blueprints[stem]
-        shutil.rmtree(self.root / IMPORTS / stem)
+        shutil.rmtree(removed, ignore_errors=True)
 
     def open_to_clients(self, path: Path) -> bool:
         """Whether a resolved path lies where clients may read: below the content root, a model root, or bundled."""
@@ -421,14 +435,18 @@ class ContentRoot:
     def _import(self, file: Path, stem: str, source: str, source_digest: str, *, trusted: bool) -> Blueprint:
         home = self.root / IMPORTS / stem
         home.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=home, prefix=".import-") as temporary_folder:
+        with (
+            working_in(self.root / IMPORTS),
+            tempfile.TemporaryDirectory(dir=home, prefix=_UNDER_WAY) as temporary_folder,
+        ):
             snapshot = Path(temporary_folder) / "snapshot"
             compiled = self._build(file, snapshot, trusted=trusted)
             for message in compiled.messages:
                 logger.warning("%s: %s", file, one_line(message))
             digest = _digest(snapshot)
             folder = home / digest
-            if not folder.exists():
+            is_new = not folder.exists()
+            if is_new:
                 os.replace(snapshot, folder)
         record = _Record(
             stem=stem,
@@ -444,7 +462,12 @@ class ContentRoot:
             cameras=compiled.cameras,
             n_bytes=compiled.n_bytes,
         )
-        return self._register(home, folder, record)
+        try:
+            return self._register(home, folder, record)
+        except OSError:
+            if is_new:
+                shutil.rmtree(folder, ignore_errors=True)
+            raise
 
     def _build(self, file: Path, snapshot: Path, *, trusted: bool) -> Compiled:
         if trusted or file.is_relative_to(bundled_root()):
@@ -533,6 +556,8 @@ def mujoco_messages() -> Generator[list[str]]:
 
 def _load(record: Path) -> Blueprint:
     decoded = _RECORD.decode(record.read_bytes())
+    if not decoded.stem or decoded.stem != sanitized(decoded.stem) or not _DIGEST.fullmatch(decoded.digest):
+        raise ValueError(f"'{decoded.stem}' and '{decoded.digest}' cannot be the names of folders")
     folder = record.parent / decoded.digest
     if not (folder / "model.xml").is_file():
         raise ValueError(f"its snapshot {folder} is gone")
@@ -601,7 +626,26 @@ def _write_snapshot(spec: mujoco.MjSpec, folder: Path, messages: list[str]) -> N
         # A model made of attached parts is written only once compilation has assembled its keyframes.
         del messages[before:]
         spec.compile()
+<<<<<<< HEAD
         write_model(spec, folder)
+=======
+        spec.encode(str(archive))
+    with open_archive(archive) as content:
+        content.extractall(folder)
+    archive.unlink()
+>>>>>>> main
+
+
+def open_archive(archive: Path) -> zipfile.ZipFile:
+    """Open an archive that MuJoCo has written; it does not notice when it cannot write all of it.
+
+    Raises:
+        OSError: It is incomplete.
+    """
+    try:
+        return zipfile.ZipFile(archive)
+    except zipfile.BadZipFile:
+        raise OSError(errno.ENOSPC, "MuJoCo could not write all of it; is the disk full?", str(archive)) from None
 
 
 def _digest(folder: Path) -> str:

@@ -193,7 +193,9 @@ def _resolve(stem: str, entry: _Blueprint | None, folder: Path, content: Content
     if known is not None and (not trusted or known.digest == entry.digest or record == content.snapshot_record(known)):
         return known
     try:
-        found = _from_record(record, entry.digest, content) if entry.record else None
+        # A record that a client may have written could stand for anything: its model is imported again, confined.
+        adopt = entry.record and (trusted or record.is_relative_to(content.root))
+        found = _from_record(record, entry.digest, content) if adopt else None
         if found is None:
             found = _from_source(entry.source, folder, content, trusted=trusted)
     except Refusal as error:

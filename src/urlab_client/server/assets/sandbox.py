@@ -203,10 +203,10 @@ def _read(descriptor: int, deadline: float) -> tuple[bytes, bool]:
 
 
 def _work(order: _SandboxJob) -> _Outcome:
-    limits = order.limits
+    limits, stage = order.limits, f"cannot read {order.file}"
     try:
         check_references(Path(order.file), tuple(map(Path, order.roots)), limits)
-        snapshot = Path(order.snapshot)
+        snapshot, stage = Path(order.snapshot), f"cannot store the snapshot of {order.file}"
         compiled = build_snapshot(Path(order.file), snapshot)
         check_references(snapshot / "model.xml", (snapshot,), limits)  # the server reads it with nothing in its way
     except (Outside, Refusal) as refusal:
@@ -215,17 +215,21 @@ def _work(order: _SandboxJob) -> _Outcome:
         return _Outcome(
             refused=f"compilation needs more than the limit model_memory_bytes, {limits.model_memory_bytes}"
         )
+    except OSError as error:
+        return _Outcome(refused=one_line(error), subject=stage)
     except Exception as error:  # noqa: BLE001 - whatever it was, the server must hear of it
         return _Outcome(refused=one_line(error), subject=f"MuJoCo rejects {order.file}")
+    exceeded = _exceeded(compiled, limits)
+    return _Outcome(refused=exceeded) if exceeded else _Outcome(done=compiled)
+
+
+def _exceeded(compiled: Compiled, limits: Limits) -> str:
+    """Return which limit a compiled model exceeds, or nothing."""
     if compiled.n_bytes > limits.model_bytes:
-        return _Outcome(
-            refused=f"compiled it takes {compiled.n_bytes} bytes, more than the limit model_bytes, {limits.model_bytes}"
-        )
+        return f"compiled it takes {compiled.n_bytes} bytes, more than the limit model_bytes, {limits.model_bytes}"
     if compiled.largest_image > limits.camera_side:
-        return _Outcome(
-            refused=f"a camera of {compiled.largest_image} pixels exceeds the limit camera_side, {limits.camera_side}"
-        )
-    return _Outcome(done=compiled)
+        return f"a camera of {compiled.largest_image} pixels exceeds the limit camera_side, {limits.camera_side}"
+    return ""
 
 
 if __name__ == "__main__":

@@ -24,10 +24,10 @@ from urlab_client._mujoco import reset_controls
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.messages.session import ArticulationCommand, Step
 from urlab_client.server.compile.scene import CompiledScene
-from urlab_client.server.health import Health
 from urlab_client.server.physics.controllers import ArticulationControl, ControllerConfig, ControlSource, Twist, float32
 from urlab_client.server.physics.replay import Player
 from urlab_client.server.refusal import Refusal
+from urlab_client.server.system.health import Health
 from urlab_client.server.system.thread_join import ended, within
 
 __all__ = ["DataLock", "Engine", "parse_control_source", "parse_mode"]

@@ -39,10 +39,9 @@ from numpy.typing import NDArray
 from urlab_client._children import APART
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.errors import URLabError
-from urlab_client.protocol.messages.session import CameraFrame
+from urlab_client.protocol.messages.session import CameraChoice, CameraFrame
 from urlab_client.server.compile.scene import CompiledScene, SceneCamera
 from urlab_client.server.editor.viewport import ViewMode
-from urlab_client.server.health import Health
 from urlab_client.server.render.viewport_picture import (
     ViewportPicture,
     add_primitives,
@@ -53,6 +52,7 @@ from urlab_client.server.render.viewport_picture import (
     outline,
     showing,
 )
+from urlab_client.server.system.health import Health
 from urlab_client.server.system.thread_join import ended
 
 __all__ = [
@@ -341,7 +341,7 @@ class CameraRenderer:
         """All cameras as `ARTICULATION/CAMERA`."""
         return list(self._by_name)
 
-    def shots(self, include_cameras: bool | Mapping[str, str | None]) -> list[Shot]:
+    def shots(self, include_cameras: CameraChoice) -> list[Shot]:
         """Return what a request's `include_cameras` asks for; unknown names are left out."""
         if isinstance(include_cameras, bool):
             return [Shot(key, camera, sync=False) for key, camera in self._bare.items()] if include_cameras else []
@@ -349,10 +349,10 @@ class CameraRenderer:
         for key, kind in include_cameras.items():
             camera = self._by_name.get(key) or self._bare.get(key)
             if camera is not None and kind is not None:
-                shots.append(Shot(key, camera, sync=kind.lower() == "sync"))
+                shots.append(Shot(key, camera, sync=isinstance(kind, str) and kind.lower() == "sync"))
         return shots
 
-    def frame_bytes(self, include_cameras: bool | Mapping[str, str | None]) -> int:
+    def frame_bytes(self, include_cameras: CameraChoice) -> int:
         """Return the size of the pixels that a request's `include_cameras` asks for."""
         sizes = (shot.camera.info.resolution for shot in self.shots(include_cameras))
         return sum(4 * width * height for width, height in sizes)

@@ -93,7 +93,7 @@ class Dispatcher:
         """
         self._core = core
         self._handlers: Mapping[str, Handler] = table.handlers
-        self._reader = RequestReader(structs=table.structs, limits=core.world.content.limits)
+        self._reader = RequestReader(ops=core.dialect.ops, structs=table.structs, limits=core.world.content.limits)
         self._lock = threading.Lock()
 
     def answer(

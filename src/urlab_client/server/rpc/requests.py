@@ -22,7 +22,7 @@ from msgspec import NODEFAULT, UNSET, Struct, inspect
 
 from urlab_client.protocol.base import Op, Request
 from urlab_client.protocol.codec import building
-from urlab_client.protocol.registry import OPS
+from urlab_client.protocol.dialects import ALPHA
 from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
 
@@ -86,12 +86,14 @@ class RequestReader:
     def __init__(
         self,
         *,
+        ops: Mapping[str, Op] = ALPHA.ops,
         structs: Mapping[str, type[Request[Any]]] = types.MappingProxyType({}),
         limits: Limits = _DEFAULT_LIMITS,
     ) -> None:
         """Prepare the decoders.
 
         Args:
+            ops: The ops that there are, by name.
             structs: By op name, a struct that reads more than the declared one, which it must derive from.
             limits: What a request may be.
         """
@@ -99,7 +101,7 @@ class RequestReader:
         self._exact: dict[type, Op] = {}
         self._loose: dict[str, _LooseOp] = {}
         strict: list[type[Request[Any]]] = []
-        for op in OPS.values():
+        for op in ops.values():
             struct = structs.get(op.name, op.request)
             if not issubclass(struct, op.request):
                 raise TypeError(f"{struct.__name__} does not derive from {op.request.__name__}")

@@ -22,7 +22,11 @@ import zmq
 from msgspec import Struct
 from numpy.typing import NDArray
 
+<<<<<<< HEAD
 from urlab_client._mujoco import actuator_count, control_counts, control_starts
+=======
+from urlab_client._uninterrupted import uninterrupted
+>>>>>>> main
 from urlab_client.protocol.codec import encode_reply
 from urlab_client.protocol.enums import ObservationLevel, StepMode
 from urlab_client.protocol.errors import ProtocolError
@@ -45,11 +49,11 @@ from urlab_client.protocol.rows import (
     gains_by_parameter,
 )
 from urlab_client.server.compile.scene import CompiledScene
-from urlab_client.server.health import Health
 from urlab_client.server.physics.controllers import ArticulationControl, Twist
 from urlab_client.server.physics.observe import Observer, sim_clock, wall_clock
 from urlab_client.server.physics.play import Running
 from urlab_client.server.refusal import Refusal
+from urlab_client.server.system.health import Health
 from urlab_client.server.system.thread_join import ended
 from urlab_client.server.transport.curve_authentication import CurveKeys, ZapAuthenticator
 from urlab_client.server.transport.endpoint import bind_tcp, bound_peers
@@ -509,7 +513,8 @@ class StreamServer:
             self.info_port = bind_tcp(self._info, host, info_port, "info_port")
         except BaseException:
             self._authenticator.close()
-            self._context.destroy(linger=0)
+            with uninterrupted():
+                self._context.destroy(linger=0)
             raise
         self._wake = self._context.socket(zmq.PAIR)
         self._wake.bind(_WAKE)
@@ -691,7 +696,8 @@ class StreamServer:
         with self._waking:
             self._waker.close()
         self._authenticator.close()
-        self._context.destroy(linger=0)
+        with uninterrupted():
+            self._context.destroy(linger=0)
 
 
 def _waiting(socket: zmq.Socket[bytes]) -> Iterator[list[bytes]]:

@@ -1,7 +1,7 @@
 """Temporary folders that do not outlive their process for long, not even one that was killed.
 
 A folder holds a lock that ends with the process, however that dies. Whoever makes a folder removes those whose lock
-nobody holds.
+nobody holds. Likewise `working_in` and `sweep`, for folders that several processes work in.
 """
 
 from __future__ import annotations
@@ -11,11 +11,12 @@ import os
 import shutil
 import sys
 import tempfile
+from collections.abc import Generator
 from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
-__all__ = ["TemporaryFolder"]
+__all__ = ["TemporaryFolder", "sweep", "working_in"]
 
 _PREFIX: Final = "urlab-"
 _LOCK: Final = ".alive"
@@ -85,3 +86,59 @@ def _remove_if_left(folder: Path) -> None:
             shutil.rmtree(folder, ignore_errors=True)
         finally:
             os.close(descriptor)
+
+
+@contextlib.contextmanager
+def working_in(folder: Path) -> Generator[None]:
+    """Keep `sweep` in other processes from removing what is under way below a folder.
+
+    Raises:
+        OSError: The folder cannot be opened.
+    """
+    if sys.platform == "win32":
+        yield
+        return
+    import fcntl  # noqa: PLC0415
+
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        with contextlib.suppress(OSError):  # a file system without locks
+            fcntl.flock(descriptor, fcntl.LOCK_SH)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def sweep(folder: Path, *patterns: str) -> None:
+    """Remove what killed processes have left below a folder, unless another process works in it.
+
+    Args:
+        folder: The folder; it need not exist.
+        patterns: What such things are called, relative to it.
+    """
+    with contextlib.suppress(OSError), _alone_in(folder):
+        for pattern in patterns:
+            for left in folder.glob(pattern):
+                shutil.rmtree(left, ignore_errors=True)
+                with contextlib.suppress(OSError):
+                    left.parent.rmdir()  # if it held nothing else
+
+
+@contextlib.contextmanager
+def _alone_in(folder: Path) -> Generator[None]:
+    """Lock a folder that nobody works in.
+
+    Raises:
+        OSError: Somebody does, or there is no such folder.
+    """
+    if sys.platform == "win32":
+        yield
+        return
+    import fcntl  # noqa: PLC0415
+
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(descriptor)

@@ -20,7 +20,7 @@ import zmq.utils.z85
 
 from urlab_client.keys import KeyFileError, KeyPair, public_keys, read_pair
 from urlab_client.protocol.errors import URLabError
-from urlab_client.server.health import Health
+from urlab_client.server.system.health import Health
 
 __all__ = ["CurveKeys", "CurveServer", "UnprotectedServer", "ZapAuthenticator", "is_loopback"]
 

@@ -30,7 +30,7 @@ from urlab_client.protocol.shm import (
     camera_stride,
     state_stride,
 )
-from urlab_client.server.health import Health
+from urlab_client.server.system.health import Health
 from urlab_client.server.system.thread_join import ended
 from urlab_client.server.transport.region_files import InstanceDirectory, RegionFile, RequestFile
 
