@@ -9,6 +9,7 @@ The client's import of this module must not import MuJoCo: that takes longer tha
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import tempfile
 import zipfile
@@ -136,6 +137,7 @@ def write_model(spec: mujoco.MjSpec, folder: Path) -> None:
     Raises:
         mujoco.FatalError: It must be compiled first: before 3.16 always.
         ValueError: One of its files is not where this MuJoCo looks; see `check_copy`.
+        OSError: There is no room.
     """
     compiler: Any = spec.compiler
     if _writes_archives(spec):
@@ -169,7 +171,11 @@ def _writes_archives(spec: mujoco.MjSpec) -> bool:
 @contextlib.contextmanager
 def _archive(spec: mujoco.MjSpec, path: Path) -> Generator[zipfile.ZipFile]:
     spec.encode(str(path))
-    with zipfile.ZipFile(path) as content:
+    try:
+        content = zipfile.ZipFile(path)
+    except zipfile.BadZipFile:  # MuJoCo does not notice when it cannot write all of it
+        raise OSError(errno.ENOSPC, "MuJoCo could not write all of it; is the disk full?", str(path)) from None
+    with content:
         yield content
     path.unlink()
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client._mujoco import control_counts, control_starts
+from urlab_client._mujoco import control_counts, control_starts, force_counts
 from urlab_client.aio.model.mirror import model_names
 from urlab_client.protocol.names import split_prefix
 
@@ -105,7 +105,7 @@ def _layout(
         ctrl_adr=ctrl_adr,
         act_from=act_from,
         act_adr=act_adr[act_from],
-        n_out=int(model.actuator_outnum[actuator_ids].sum()),
+        n_out=int(force_counts(model)[actuator_ids].sum()),
         root_body=root,
         free_joint=free,
     )

@@ -13,7 +13,6 @@ For `World`, which knows what is placed where. Nothing here places, compiles sce
 from __future__ import annotations
 
 import contextlib
-import errno
 import hashlib
 import logging
 import os
@@ -48,7 +47,6 @@ __all__ = [
     "level_package",
     "mujoco_messages",
     "one_line",
-    "open_archive",
     "sanitized",
     "write_atomic",
 ]
@@ -626,26 +624,7 @@ def _write_snapshot(spec: mujoco.MjSpec, folder: Path, messages: list[str]) -> N
         # A model made of attached parts is written only once compilation has assembled its keyframes.
         del messages[before:]
         spec.compile()
-<<<<<<< HEAD
         write_model(spec, folder)
-=======
-        spec.encode(str(archive))
-    with open_archive(archive) as content:
-        content.extractall(folder)
-    archive.unlink()
->>>>>>> main
-
-
-def open_archive(archive: Path) -> zipfile.ZipFile:
-    """Open an archive that MuJoCo has written; it does not notice when it cannot write all of it.
-
-    Raises:
-        OSError: It is incomplete.
-    """
-    try:
-        return zipfile.ZipFile(archive)
-    except zipfile.BadZipFile:
-        raise OSError(errno.ENOSPC, "MuJoCo could not write all of it; is the disk full?", str(archive)) from None
 
 
 def _digest(folder: Path) -> str:

@@ -8,10 +8,6 @@ from __future__ import annotations
 
 import logging
 import re
-<<<<<<< HEAD
-=======
-import tempfile
->>>>>>> main
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property, lru_cache
@@ -35,7 +31,7 @@ from urlab_client.protocol.base import Vec3
 from urlab_client.protocol.controller_text import CUSTOM_TEXT, ControllerText
 from urlab_client.protocol.rotation import rotate, wxyz
 from urlab_client.server.assets.actors import Actor, Mesh
-from urlab_client.server.assets.content import Blueprint, mujoco_messages, one_line, open_archive
+from urlab_client.server.assets.content import Blueprint, mujoco_messages, one_line
 from urlab_client.server.assets.decomposition import convex_parts
 
 __all__ = [
@@ -209,17 +205,8 @@ class CompiledScene:
 
     @cached_property
     def _export(self) -> tuple[str, dict[str, bytes]]:
-<<<<<<< HEAD
         with mujoco_messages():
             xml, files = export_model(self.spec)
-=======
-        with tempfile.TemporaryDirectory() as folder, mujoco_messages():
-            archive = Path(folder) / "model.mjz"
-            self.spec.encode(str(archive))
-            with open_archive(archive) as content:
-                files = {name: content.read(name) for name in content.namelist() if not name.endswith("/")}
-        xml = files.pop("model.xml").decode()
->>>>>>> main
         names: dict[str, str] = {}
         for path in sorted(files):
             names[path] = _unique(path.rpartition("/")[2], set(names.values()))

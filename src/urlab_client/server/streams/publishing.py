@@ -22,11 +22,8 @@ import zmq
 from msgspec import Struct
 from numpy.typing import NDArray
 
-<<<<<<< HEAD
 from urlab_client._mujoco import actuator_count, control_counts, control_starts
-=======
 from urlab_client._uninterrupted import uninterrupted
->>>>>>> main
 from urlab_client.protocol.codec import encode_reply
 from urlab_client.protocol.enums import ObservationLevel, StepMode
 from urlab_client.protocol.errors import ProtocolError
