@@ -14,9 +14,13 @@ PACKAGE = Path(__file__).resolve().parents[1] / "src" / "urlab_client"
 ALLOWED: dict[str, frozenset[str]] = {
     "protocol": frozenset(),
     "keys": frozenset({"protocol"}),
-    "aio": frozenset({"_children", "_confined", "_landlock", "_mjcf_files", "_processors", "keys", "protocol"}),
+    "aio": frozenset(
+        {"_children", "_confined", "_landlock", "_mjcf_files", "_processors", "_uninterrupted", "keys", "protocol"}
+    ),
     "sync": frozenset({"aio", "protocol"}),
-    "server": frozenset({"_children", "_confined", "_landlock", "_mjcf_files", "_processors", "keys", "protocol"}),
+    "server": frozenset(
+        {"_children", "_confined", "_landlock", "_mjcf_files", "_processors", "_uninterrupted", "keys", "protocol"}
+    ),
     "enums": frozenset({"protocol"}),
     "_children": frozenset(),
     "_confined": frozenset(),
@@ -24,6 +28,7 @@ ALLOWED: dict[str, frozenset[str]] = {
     "_mjcf_files": frozenset(),
     "_installation": frozenset(),
     "_processors": frozenset(),
+    "_uninterrupted": frozenset(),
     "": frozenset({"_installation", "sync", "enums", "protocol"}),
     "integrations": frozenset({"", "aio", "enums", "keys", "protocol", "server", "sync"}),
     "cluster": frozenset({"integrations", "protocol", "sync"}),

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
-from typing import Annotated, Any, Generic, Literal, TypeAlias, TypeVar
+from typing import Annotated, Any, Final, Generic, Literal, TypeAlias, TypeVar
 
 import msgspec
 import numpy as np
@@ -17,6 +17,7 @@ from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
 __all__ = [
+    "EDITOR_TIMEOUT_S",
     "ActorId",
     "ActorTarget",
     "Color",
@@ -88,6 +89,10 @@ class ControlRequest(Request[R_co], Generic[R_co], kw_only=True, omit_defaults=T
     control_owner: Annotated[
         str | None, doc("Name of the client that writes; absent stands for the session. Not known to the alpha.")
     ] = None
+
+
+EDITOR_TIMEOUT_S: Final = 30.0
+"""Seconds to wait for an editor op: it waits for the game thread, which level or mesh work can hold for long."""
 
 
 class Needs(StrEnum):

@@ -338,40 +338,6 @@ class SceneOps(Namespace):
         return (await self._call(ActorHierarchy(target=target, target_by=target_by(by_name)), timeout)).root
 
 
-class FarmOps(Namespace):
-    """Generated part of `client.farm`."""
-
-    async def acquire_lease(self, owner: str = "", *, ttl_s: float = 60.0, timeout: Timeout = DEFAULT) -> str:
-        """Take the server's one driver lease and return its id.
-
-            The server enforces nothing by it: it tells other clients that the server is in use. Every request keeps it
-            alive.
-
-        Args:
-            owner: Who takes it, for people.
-            ttl_s: Seconds without a request after which it ends; 0 or less ends it at once.
-            timeout: Seconds to wait; None waits without limit.
-
-        Raises:
-            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            LeaseBusy: Somebody holds the server's driver lease.
-        """
-        return (await self._call(AcquireLease(owner=owner, ttl_s=ttl_s), timeout)).lease_id
-
-    async def release_lease(self, lease_id: str, *, timeout: Timeout = DEFAULT) -> None:
-        """Give the driver lease back.
-
-        Args:
-            lease_id: What `acquire_lease` returned.
-            timeout: Seconds to wait; None waits without limit.
-
-        Raises:
-            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            BadRequest: The frame is neither a msgpack map nor a JSON object.
-        """
-        await self._call(ReleaseLease(lease_id=lease_id), timeout)
-
-
 class OutlinerOps(Namespace):
     """Generated part of `client.outliner`."""
 
@@ -813,3 +779,37 @@ class ViewportOps(Namespace):
             timeout: Seconds to wait; None waits without limit.
         """
         return (await self._call(Untrack(), timeout)).was_tracking
+
+
+class FarmOps(Namespace):
+    """Generated part of `client.farm`."""
+
+    async def acquire_lease(self, owner: str = "", *, ttl_s: float = 60.0, timeout: Timeout = DEFAULT) -> str:
+        """Take the server's one driver lease and return its id.
+
+            The server enforces nothing by it: it tells other clients that the server is in use. Every request keeps it
+            alive.
+
+        Args:
+            owner: Who takes it, for people.
+            ttl_s: Seconds without a request after which it ends; 0 or less ends it at once.
+            timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
+            LeaseBusy: Somebody holds the server's driver lease.
+        """
+        return (await self._call(AcquireLease(owner=owner, ttl_s=ttl_s), timeout)).lease_id
+
+    async def release_lease(self, lease_id: str, *, timeout: Timeout = DEFAULT) -> None:
+        """Give the driver lease back.
+
+        Args:
+            lease_id: What `acquire_lease` returned.
+            timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
+            BadRequest: The frame is neither a msgpack map nor a JSON object.
+        """
+        await self._call(ReleaseLease(lease_id=lease_id), timeout)

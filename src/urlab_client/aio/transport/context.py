@@ -12,6 +12,8 @@ from typing import Final
 
 import zmq
 
+from urlab_client._uninterrupted import uninterrupted
+
 __all__ = ["borrow", "give_back"]
 
 Context = zmq.Context[zmq.Socket[bytes]]
@@ -42,7 +44,8 @@ class _SharedContext:
             if self._users:
                 return
             self._context = None
-        context.term()
+        with uninterrupted():
+            context.term()
 
 
 _shared = _SharedContext()

@@ -21,6 +21,7 @@ import zmq
 from msgspec import Struct
 from zmq.utils.monitor import recv_monitor_message
 
+from urlab_client._uninterrupted import uninterrupted
 from urlab_client.aio.transport import connection_status
 from urlab_client.aio.transport.curve import SERVER_KEY_HINT, ClientKeys
 from urlab_client.aio.transport.readiness import Readiness, watch_socket
@@ -358,7 +359,8 @@ class Subscriptions:
             subscriber.close()
         self._subscribers.clear()
         if self._context is not None:
-            self._context.term()
+            with uninterrupted():
+                self._context.term()
             _contexts.discard(self._context)
         for handler in handlers:
             handler.on_end(client_closed)

@@ -198,8 +198,8 @@ def run_blocking(
     on_action: OnAction | None = None,
 ) -> PolicyRun:
     """Do what `run` does with a blocking client."""
-    coro = run(aio_of(client), policy, articulation=articulation, seconds=seconds, on_action=on_action)
-    return portal_of(client).call(coro)
+    portal = portal_of(client)
+    return portal.call(run, aio_of(client), policy, articulation=articulation, seconds=seconds, on_action=on_action)
 
 
 class _PolicyLoop:

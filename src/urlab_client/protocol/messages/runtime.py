@@ -2,14 +2,29 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 from msgspec import Struct
 
-from urlab_client.protocol.base import ActorId, ControlRequest, Floats, QuatWXYZ, Reply, Request, TargetBy, Vec3, doc
-from urlab_client.protocol.types import Contact, KeyframeInfo, SimOptions
+from urlab_client.protocol.base import (
+    ActorId,
+    ControlRequest,
+    Effect,
+    Floats,
+    Needs,
+    Op,
+    QuatWXYZ,
+    Reply,
+    Request,
+    TargetBy,
+    Vec3,
+    doc,
+)
+from urlab_client.protocol.enums import StepMode
+from urlab_client.protocol.types import Contact, KeyframeInfo, MocapPose, SimOptions
 
 __all__ = [
+    "OPS",
     "ConfigureController",
     "ConfigureControllerOk",
     "ContactFilter",
@@ -43,8 +58,8 @@ __all__ = [
 class SetModeOk(Reply, tag="set_mode_ok", kw_only=True):
     """The mode before and after."""
 
-    previous_mode: Annotated[str, doc("Step mode before the call.")]
-    current_mode: Annotated[str, doc("Step mode now.")]
+    previous_mode: Annotated[StepMode, doc("Step mode before the call.")]
+    current_mode: Annotated[StepMode, doc("Step mode now.")]
 
 
 class SetMode(Request[SetModeOk], tag="set_mode", kw_only=True):
@@ -240,3 +255,122 @@ class SetSimOptions(Request[SetSimOptionsOk], tag="set_sim_options", kw_only=Tru
     """Change fields of `mjOption`; effective from the next step."""
 
     options: Annotated[SimOptions, doc("Fields to change; None leaves a field alone.")]
+
+
+OPS: Final = (
+    Op(
+        request=SetMode,
+        ns="runtime",
+        needs=Needs.MANAGER,
+        errors=("not_ready", "mode_locked_by_server", "missing_field", "bad_mode"),
+        undeclared=("mode",),
+    ),
+    Op(
+        request=SetPaused,
+        ns="runtime",
+        needs=Needs.MANAGER,
+        errors=("not_ready", "missing_field"),
+        generated=True,
+        returns="paused",
+        positional=1,
+    ),
+    Op(
+        request=ConfigureController,
+        ns="runtime",
+        needs=Needs.MANAGER,
+        errors=(
+            "not_ready",
+            "missing_field",
+            "unknown_articulation",
+            "no_controller",
+            "controller_schema_violation",
+        ),
+    ),
+    Op(
+        request=SetSimOptions,
+        ns="runtime",
+        needs=Needs.MANAGER,
+        errors=("not_ready", "missing_field", "bad_value"),
+        undeclared=("options",),
+        declares=("op:string",),
+    ),
+    Op(
+        request=SetSimSpeed,
+        ns="runtime",
+        needs=Needs.MANAGER,
+        errors=("not_ready", "missing_field"),
+        generated=True,
+        returns="percent",
+        positional=1,
+    ),
+    Op(
+        request=SetControlSource,
+        ns="runtime",
+        needs=Needs.MANAGER,
+        errors=("not_ready", "missing_field", "bad_value", "unknown_articulation", "not_control_owner"),
+        generated=True,
+        positional=1,
+        undeclared=("source",),
+        declares=("op:string",),
+    ),
+    Op(
+        request=SetTwist,
+        ns="runtime",
+        needs=Needs.MANAGER,
+        errors=("not_ready", "missing_field", "unknown_articulation", "not_control_owner", "no_twist_controller"),
+        generated=True,
+        positional=1,
+        undeclared=("articulation",),
+        declares=("op:string",),
+    ),
+    Op(
+        request=SetQpos,
+        ns="runtime",
+        needs=Needs.MANAGER,
+        errors=("not_ready", "missing_field", "unknown_articulation", "not_control_owner", "no_joints", "dim_mismatch"),
+        declares=(
+            "op:string",
+            "target:string",
+            "actor_id:string?",
+            "actor_name:string?",
+            "qpos:array",
+            "free_base_shortcut:bool",
+        ),
+    ),
+    Op(
+        request=SetMocapPose,
+        ns="runtime",
+        needs=Needs.MANAGER,
+        errors=("not_ready", "missing_field", "unknown_body", "not_mocap_body"),
+        generated=True,
+        returns=MocapPose,
+        positional=1,
+    ),
+    Op(
+        request=ReadMocapPose,
+        ns="runtime",
+        needs=Needs.MANAGER,
+        effect=Effect.READ,
+        errors=("not_ready", "missing_field", "unknown_body", "not_mocap_body"),
+        generated=True,
+        returns=MocapPose,
+        positional=1,
+    ),
+    Op(request=GetContacts, ns="runtime", needs=Needs.MANAGER, effect=Effect.READ, errors=("not_ready",)),
+    Op(
+        request=ListKeyframes,
+        ns="runtime",
+        needs=Needs.MANAGER,
+        effect=Effect.READ,
+        errors=("not_ready",),
+        generated=True,
+        returns="keyframes",
+    ),
+    Op(
+        request=SetUserChannels,
+        ns="runtime",
+        needs=Needs.MANAGER,
+        errors=("not_ready",),
+        dialects=("beta",),
+    ),
+)

@@ -8,10 +8,11 @@ from typing import Annotated, Any, Final, TypeAlias
 import msgspec
 from msgspec import Struct, field
 
-from urlab_client.protocol.base import ControlRequest, Floats, QuatWXYZ, Reply, Request, Vec3, doc
+from urlab_client.protocol.base import ControlRequest, Effect, Floats, Needs, Op, QuatWXYZ, Reply, Request, Vec3, doc
 
 __all__ = [
     "NOT_SENT",
+    "OPS",
     "ArticulationCommand",
     "ArticulationInfo",
     "ArticulationState",
@@ -95,8 +96,17 @@ class ArticulationState(Struct, kw_only=True, omit_defaults=True):
 
     qpos: Annotated[Floats, doc("Joint positions, shape (nq of the articulation,).")]
     qvel: Annotated[Floats, doc("Joint velocities, shape (nv of the articulation,).")]
-    ctrl: Annotated[Floats | None, doc("`mjData.ctrl`, what was applied after any controller. Level standard.")] = None
-    act: Annotated[Floats | None, doc("First activation per actuator, 0 where stateless. Level standard.")] = None
+    ctrl: Annotated[
+        Floats | None,
+        doc(
+            "`mjData.ctrl`, what was applied after any controller: the inputs of each actuator, nearly always one, in "
+            "actuator order. Level standard."
+        ),
+    ] = None
+    act: Annotated[
+        Floats | None,
+        doc("First activation of the actuator of each input, 0 where stateless; ordered as `ctrl`. Level standard."),
+    ] = None
     sensors: Annotated[
         dict[str, list[float]] | None, doc("Raw `sensordata` by unprefixed sensor name. Level standard.")
     ] = None
@@ -104,7 +114,10 @@ class ArticulationState(Struct, kw_only=True, omit_defaults=True):
         dict[str, Any] | None, doc("User channels that the robot declares, by name. Level standard, from the beta on.")
     ] = None
     bodies: Annotated[dict[str, BodyPose] | None, doc("World pose by unprefixed body name. Level full.")] = None
-    actuator_force: Annotated[Floats | None, doc("`mjData.actuator_force`, ordered as `ctrl`. Level full.")] = None
+    actuator_force: Annotated[
+        Floats | None,
+        doc("`mjData.actuator_force`: the outputs of each actuator, nearly always one, in actuator order. Level full."),
+    ] = None
     twist: Annotated[TwistState | None, doc("Commanded twist, at every level.")] = None
     actions: Annotated[int | None, doc("Bit field of pressed action keys, bits 0 to 9.")] = None
 
@@ -189,7 +202,7 @@ class StepOk(StateReply, tag="step_ok", kw_only=True, omit_defaults=True):
 class ArticulationCommand(Struct, kw_only=True, omit_defaults=True):
     """What a direct or live step tells one articulation."""
 
-    ctrl: Annotated[list[float] | None, doc("Set-points in actuator order.")] = None
+    ctrl: Annotated[list[float] | None, doc("Set-points, in the order of the state's `ctrl`.")] = None
     ctrl_map: Annotated[dict[str, float] | None, doc("Set-points by actuator name; wins over `ctrl`. Direct only.")] = (
         None
     )
@@ -251,7 +264,7 @@ class ControllerInfo(Struct, kw_only=True):
 
     kind: Annotated[str, doc("`pd`; the plugin's passthrough controller says `base`.")]
     params: Annotated[dict[str, Any], doc("Current parameters.")]
-    schema: Annotated[dict[str, Any], doc("Parameter name to `{type, dtype, min}`.")]
+    schema: Annotated[dict[str, dict[str, Any]], doc("Parameter name to `{type, dtype, min}`.")]
 
 
 class CameraInfo(Struct, kw_only=True):
@@ -417,3 +430,40 @@ class MetaOk(Reply, tag="meta_ok", kw_only=True):
 
 class Meta(Request[MetaOk], tag="meta", kw_only=True):
     """List the ops this server offers; needs no session."""
+
+
+OPS: Final = (
+    Op(request=Hello, method="discover", needs=Needs.NOTHING, effect=Effect.READ, timeout=30.0),
+    Op(request=Meta, needs=Needs.NOTHING, effect=Effect.READ),
+    Op(
+        request=Step,
+        needs=Needs.MANAGER,
+        # Above the server's own limit of 5 s, or its step_timeout would arrive too late.
+        timeout=6.5,
+        hot=True,
+        errors=("not_ready", "not_control_owner", "step_timeout", "shutting_down"),
+        declares=(
+            "op:string",
+            "time:float",
+            "step:int",
+            "per_articulation:object",
+            "sim_time:object?",
+            "wall_time:object?",
+        ),
+    ),
+    Op(
+        request=Reset,
+        needs=Needs.MANAGER,
+        errors=("not_ready", "unknown_keyframe"),
+        declares=("op:string", "time:float", "step:int"),
+    ),
+    Op(
+        request=Forward,
+        ns="runtime",
+        needs=Needs.MANAGER,
+        # Computes what follows from the state, which it leaves as it is: the same the second time.
+        effect=Effect.READ,
+        errors=("not_ready",),
+        declares=("op:string", "time:float", "step:int", "per_articulation:object"),
+    ),
+)

@@ -16,6 +16,7 @@ from typing import Final
 
 import zmq
 
+from urlab_client._uninterrupted import uninterrupted
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.rows import camera_filter
 from urlab_client.server.physics.play import Running
@@ -123,7 +124,8 @@ class CameraStreams:
             self._streams.append(_Stream(self._context, self._authenticator, host, port))
         except BaseException:
             self._authenticator.close()
-            self._context.term()
+            with uninterrupted():
+                self._context.term()
             raise
         self.port = self._streams[0].port
 
@@ -178,7 +180,8 @@ class CameraStreams:
                 stream.socket.close()
             self._streams.clear()
         self._authenticator.close()
-        self._context.term()
+        with uninterrupted():
+            self._context.term()
         return not self._thread.is_alive()
 
     def _next_free(self) -> _Stream | None:

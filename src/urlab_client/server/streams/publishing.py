@@ -22,6 +22,7 @@ import zmq
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from urlab_client._uninterrupted import uninterrupted
 from urlab_client.protocol.codec import encode_reply
 from urlab_client.protocol.enums import ObservationLevel, StepMode
 from urlab_client.protocol.errors import ProtocolError
@@ -508,7 +509,8 @@ class StreamServer:
             self.info_port = bind_tcp(self._info, host, info_port, "info_port")
         except BaseException:
             self._authenticator.close()
-            self._context.destroy(linger=0)
+            with uninterrupted():
+                self._context.destroy(linger=0)
             raise
         self._wake = self._context.socket(zmq.PAIR)
         self._wake.bind(_WAKE)
@@ -690,7 +692,8 @@ class StreamServer:
         with self._waking:
             self._waker.close()
         self._authenticator.close()
-        self._context.destroy(linger=0)
+        with uninterrupted():
+            self._context.destroy(linger=0)
 
 
 def _waiting(socket: zmq.Socket[bytes]) -> Iterator[list[bytes]]:

@@ -16,6 +16,7 @@ from typing import ClassVar, Final
 
 import zmq
 
+from urlab_client._uninterrupted import uninterrupted
 from urlab_client.server.limits import Limits
 from urlab_client.server.system.health import Health
 from urlab_client.server.system.thread_join import ended
@@ -193,7 +194,8 @@ class RpcEndpoint:
             self.port = bind_tcp(self._socket, host, port, "step_port")
         except BaseException:
             self._authenticator.close()
-            self._context.destroy(linger=0)
+            with uninterrupted():
+                self._context.destroy(linger=0)
             raise
         self._socket.bind(_WAKE)
         self._waker = self._context.socket(zmq.DEALER)
@@ -273,4 +275,5 @@ class RpcEndpoint:
     def _close(self) -> None:
         self._socket.close()
         self._authenticator.close()
-        self._context.term()
+        with uninterrupted():
+            self._context.term()

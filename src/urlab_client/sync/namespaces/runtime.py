@@ -39,7 +39,7 @@ class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
             UnknownArticulation: No articulation has this key or actor id.
             DimMismatch: The number of values does not fit.
         """
-        self._portal.call(self._aio.set_qpos(target, qpos, by_name=by_name, timeout=timeout))
+        self._portal.call(self._aio.set_qpos, target, qpos, by_name=by_name, timeout=timeout)
 
     def get_contacts(
         self,
@@ -65,9 +65,13 @@ class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
             timeout: Seconds to wait; None waits without limit.
         """
         return self._portal.call(
-            self._aio.get_contacts(
-                body1=body1, body2=body2, geom1=geom1, geom2=geom2, max_contacts=max_contacts, timeout=timeout
-            )
+            self._aio.get_contacts,
+            body1=body1,
+            body2=body2,
+            geom1=geom1,
+            geom2=geom2,
+            max_contacts=max_contacts,
+            timeout=timeout,
         )
 
     def set_sim_options(self, *, timeout: Timeout = DEFAULT, **opts: Any) -> SimOptions:
@@ -81,7 +85,7 @@ class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
             TypeError: An unknown option, or one of the wrong type; nothing was sent.
             BadValue: Unknown integrator, cone or solver.
         """
-        return self._portal.call(self._aio.set_sim_options(timeout=timeout, **opts))
+        return self._portal.call(self._aio.set_sim_options, timeout=timeout, **opts)
 
     def set_user_channels(
         self,
@@ -104,7 +108,7 @@ class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
             KeyError: Unknown articulation; nothing was sent.
             UnknownOp: The server has no such channels.
         """
-        return self._portal.call(self._aio.set_user_channels(arts, scene=scene, timeout=timeout))
+        return self._portal.call(self._aio.set_user_channels, arts, scene=scene, timeout=timeout)
 
     def set_mode(self, mode: StepMode | str, *, timeout: Timeout = DEFAULT) -> StepMode:
         """Switch the step mode and return the one in force. Any mode but live un-pauses physics.
@@ -117,7 +121,7 @@ class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
             ValueError: Unknown mode; nothing was sent.
             ModeLocked: The project pins the mode.
         """
-        return self._portal.call(self._aio.set_mode(mode, timeout=timeout))
+        return self._portal.call(self._aio.set_mode, mode, timeout=timeout)
 
     def forward(self, *, timeout: Timeout = DEFAULT) -> ForwardOk:
         """Run `mj_forward` on the server and take over the state: kinematics and dynamics, no integration.
@@ -125,4 +129,4 @@ class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
         Returns:
             The state; time and step counter are unchanged.
         """
-        return self._portal.call(self._aio.forward(timeout=timeout))
+        return self._portal.call(self._aio.forward, timeout=timeout)
