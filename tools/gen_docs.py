@@ -14,6 +14,7 @@ import json
 import sys
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from enum import StrEnum
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -230,6 +231,8 @@ def wire_type(hint: Any, structs: list[type[Any]]) -> str:
         if hint not in structs:
             structs.append(hint)
         name = f"[{hint.__name__}](#{hint.__name__.lower()})"
+    elif isinstance(hint, type) and issubclass(hint, StrEnum):
+        name = PLAIN[str]
     else:
         name = "anything" if hint is msgspec.Raw else PLAIN[hint]
     return name

@@ -60,7 +60,6 @@ R = TypeVar("R", bound=Reply)
 
 _SYNC_CAMERA_S = 3.0  # the server waits up to 2 s + 1 s for each
 _REVERT_S = 1.0
-_STATE_PORT = 5555
 
 _HOST = re.compile(r"(\[[^\[\]\s]+\]|[^:\[\]\s]+)(:(?P<port>[0-9]+))?")
 _LAST_PORT = 65535
@@ -119,7 +118,7 @@ class URLabClient:
         *,
         step_mode: str | StepMode = "auto",
         step_port: int = 5559,
-        state_port: int = _STATE_PORT,
+        state_port: int = 5555,
         ctrl_port: int = 5556,
         info_port: int = 5557,
         mujoco_version_check: bool = True,
@@ -712,7 +711,7 @@ class URLabClient:
         told = None if hello is None or hello.instance is None else hello.instance.state_port
         # What the user has chosen goes before what the server says: there may be a tunnel between.
         chosen = self._config.state_port
-        return self._transport.state_port or (told if told and chosen == _STATE_PORT else chosen)
+        return self._transport.state_port or (told if told and chosen == ClientConfig().state_port else chosen)
 
     def _joint_values(self, key: str, values: Mapping[str, float]) -> dict[str, float]:
         joints = self.articulations[key].joints

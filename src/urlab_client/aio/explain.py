@@ -139,7 +139,7 @@ async def _play(session: Session, state: SimState) -> tuple[Finding, bool]:
             PIEState.OFF: "Call sim.start().",
             PIEState.COMPILING: "Wait, or check that the level has a manager: scene.ensure_manager().",
             PIEState.COMPILE_FAILED: f"MuJoCo says: {second.compile_error}",
-        }.get(PIEState(second.state), "")
+        }.get(second.state, "")
         return Finding(Verdict.PROBLEM, "play", f"Play is {second.state}. {advice}".strip()), False
     runs = second.sim_time != first.sim_time
     if state.mode is StepMode.LIVE and not runs:

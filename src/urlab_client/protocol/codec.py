@@ -80,7 +80,10 @@ def op_of(request: Request[Any] | type[Request[Any]]) -> Op:
 
 def from_wire_array(kind: type, value: Any) -> Any:
     """Decoding hook: a list of numbers becomes a float64 array of shape (n,)."""
-    array: np.ndarray[Any, np.dtype[np.float64]] = np.array(value, dtype=np.float64)
+    try:
+        array: np.ndarray[Any, np.dtype[np.float64]] = np.array(value, dtype=np.float64)
+    except OverflowError as error:  # integers have no limit in JSON; msgspec expects ValueError
+        raise ValueError(str(error)) from None
     if array.ndim != 1:
         raise ValueError(f"expected a flat array of numbers, got {array.ndim} dimensions")
     return array

@@ -44,6 +44,7 @@ __all__ = [
     "TwistRow",
     "articulation_filter",
     "camera_filter",
+    "check_picture_size",
     "decode_camera",
     "decode_gains",
     "decode_row",
@@ -672,6 +673,7 @@ class ActuatorInfo(Struct, frozen=True, eq=False):
 _FRAME_MAGIC = 0x314D4355
 _FRAME_HEADERS = {1: Layout("<IIQdII"), 2: Layout("<IIQdIId")}
 _OPAQUE = np.uint32(0xFF000000)
+_MAX_SIDE = 16_384  # what graphics cards render at most
 _CENTIMETRES = np.float32(100)
 
 
@@ -690,6 +692,16 @@ class CameraImage(Struct, frozen=True, eq=False):
     frame_id: int | None = None
     sim_time: float | None = None
     capture_time: float | None = None
+
+
+def check_picture_size(width: int, height: int) -> None:
+    """Check the size of a picture as a peer gives it.
+
+    Raises:
+        ValueError: No camera has pictures of this size.
+    """
+    if not (0 < width <= _MAX_SIDE and 0 < height <= _MAX_SIDE):
+        raise ValueError(f"pictures of {width}x{height} pixels; each side has 1 to {_MAX_SIDE}")
 
 
 def decode_camera(
@@ -715,21 +727,24 @@ def decode_camera(
         where: Names the camera in errors.
 
     Raises:
-        ProtocolError: If the payload does not have the size of such a picture.
+        ProtocolError: If the payload does not have the size of such a picture, or there is no picture of this size.
         ValueError: If `out` does not fit.
     """
+    try:
+        check_picture_size(width, height)
+    except ValueError as problem:
+        raise _error("camera frame", where, str(problem), payload) from None
     size = width * height * 4
     header = _frame_header(payload, width, height, where)
     if header is None and len(payload) != size:
         problem = f"{len(payload)} bytes, expected {size} ({width}x{height} pixels of 4 bytes)"
         raise _error("camera frame", where, problem, payload)
     start = header.size if header else 0
-    if out is None and mode == CameraMode.REAL and size:
+    if out is None and mode == CameraMode.REAL:
         pixels: Pixels = _rgba(np.frombuffer(payload, np.uint8, size, start), width, height)
     else:
         pixels = _target(mode, width, height, out)
-        if size:
-            _convert(np.frombuffer(payload, np.uint8, size, start), mode, pixels)
+        _convert(np.frombuffer(payload, np.uint8, size, start), mode, pixels)
     if header is None:
         return CameraImage(pixels)
     _, _, frame_id, sim_time, _, _, *capture_time = header.unpack_from(payload)

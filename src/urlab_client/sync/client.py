@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from urlab_client.aio import client as aio
-from urlab_client.aio.client import _STATE_PORT, SESSION_LEVEL, SessionLevel
+from urlab_client.aio.client import SESSION_LEVEL, SessionLevel
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS
 from urlab_client.aio.transport.base import TransportStats
@@ -89,7 +89,7 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
         *,
         step_mode: str | StepMode = "auto",
         step_port: int = 5559,
-        state_port: int = _STATE_PORT,
+        state_port: int = 5555,
         ctrl_port: int = 5556,
         info_port: int = 5557,
         mujoco_version_check: bool = True,

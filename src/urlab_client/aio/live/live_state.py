@@ -158,7 +158,11 @@ class LatestPicture(MessageHandler):
     def start(self) -> None:
         """Receive from now on; from the event loop. Idempotent."""
         if not self._running:
-            self._source.attach(self)
+            try:
+                self._source.attach(self)
+            except (ProtocolError, ValueError) as error:  # the server says that they come from where nothing can
+                log.warning("pictures of a camera are not received by themselves: %s", error)
+                return
             self._running = True
 
     def stop(self) -> None:

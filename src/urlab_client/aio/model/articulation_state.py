@@ -79,11 +79,11 @@ class MirroredEntity:
                     f"{op}: {what} of entity {self.name!r} has {len(array)} values, not {expected}.", op=op
                 )
 
-    def absorb_pose(self, state: EntityState) -> None:
-        """Take over a checked state, here and in the mirror. Call under the mirror's lock."""
+    def absorb_pose(self, state: EntityState, *, into_mirror: bool) -> None:
+        """Take over a checked state, here and where asked for in the mirror. Call under the mirror's lock."""
         self.pose = state
         data = self.mirror.data
-        if data is None or self.qpos_offset is None or self.qvel_offset is None:
+        if not into_mirror or data is None or self.qpos_offset is None or self.qvel_offset is None:
             return
         if state.qpos is not None and state.qvel is not None:
             data.qpos[self.qpos_offset : self.qpos_offset + 7] = state.qpos
@@ -153,6 +153,8 @@ class MirroredArticulation(MirroredEntity):
         """Take over what a handshake says; set-points and control mode are kept when they still fit."""
         n_ctrl = len(info.actuator_types) if self.mirror.model is None else len(layout.ctrl_adr)
         self.info, self.layout = info, layout
+        self._sensor_names = [*layout.sensor_dims]
+        self._sensor_dims = [*layout.sensor_dims.values()]
         if len(self.ctrl) != n_ctrl:
             self.ctrl = np.zeros(n_ctrl)
             self._written_ctrl = np.zeros(n_ctrl)
@@ -215,8 +217,23 @@ class MirroredArticulation(MirroredEntity):
         self._fits(op, "qvel", state.qvel, len(layout.qvel_adr))
         self._fits(op, "ctrl", state.ctrl, n_ctrl)
         self._fits(op, "act", state.act, n_ctrl)
+        self._fits(op, "actuator_force", state.actuator_force, layout.n_out)
+        sensors = state.sensors
+        # Every reply has these: two comparisons of lists, and a look at each sensor only where they differ.
+        if sensors and ([*sensors] != self._sensor_names or [*map(len, sensors.values())] != self._sensor_dims):
+            for name, reading in sensors.items():
+                self._fits(op, f"sensor {name!r}", reading, layout.sensor_dims.get(name, len(reading)))
 
-    def _fits(self, op: str, what: str, array: Floats | None, expected: int) -> None:
+    def check_written(self, qpos: Floats) -> None:
+        """Refuse positions that `set_qpos` cannot have written.
+
+        Raises:
+            ProtocolError: They are neither all of the articulation's positions nor those of its free base.
+        """
+        if self.mirror.model is not None and not (self.has_free_base and len(qpos) == 7):
+            self._fits("set_qpos", "qpos", qpos, len(self.layout.qpos_adr))
+
+    def _fits(self, op: str, what: str, array: Floats | list[float] | None, expected: int) -> None:
         if array is not None and len(array) != expected:
             raise ProtocolError(
                 f"{op}: {what} of articulation {self.name!r} has {len(array)} values, its model has {expected}.",

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
+from urlab_client._mujoco import control_counts, control_starts, force_counts
 from urlab_client.aio.model.articulation_state import MirroredArticulation
 from urlab_client.aio.model.layout import QPOS_WIDTH, QVEL_WIDTH
 from urlab_client.protocol.base import Floats
@@ -37,7 +38,19 @@ class Actuator:
         ctrl_local: Slice of the articulation's `ctrl_array` that holds its inputs; length 1 for ordinary actuators.
     """
 
-    __slots__ = ("_record", "ctrl_local", "ctrlrange", "forcerange", "id", "joint", "kp", "kv", "name", "type")
+    __slots__ = (
+        "_first_out",
+        "_record",
+        "ctrl_local",
+        "ctrlrange",
+        "forcerange",
+        "id",
+        "joint",
+        "kp",
+        "kv",
+        "name",
+        "type",
+    )
 
     def __init__(
         self,
@@ -47,6 +60,7 @@ class Actuator:
         id: int,  # noqa: A002
         type: ActuatorType | str | None,  # noqa: A002
         ctrl_local: slice,
+        first_out: int,
         joint: str | None = None,
         ctrlrange: tuple[float, float] | None = None,
         forcerange: tuple[float, float] | None = None,
@@ -58,6 +72,7 @@ class Actuator:
         self.id = id
         self.type = type
         self.ctrl_local = ctrl_local
+        self._first_out = first_out
         self.joint = joint
         self.ctrlrange = ctrlrange
         self.forcerange = forcerange
@@ -66,9 +81,14 @@ class Actuator:
 
     @property
     def force(self) -> float | None:
-        """Force in N or N m from the last reply, or None below observation level `full`."""
+        """Force in N or N m from the last reply: the first output, of an actuator that has several.
+
+        None below observation level `full`, and when it cannot be told without a local model which output is whose.
+        """
         force = self._record.force
-        return None if force is None else float(force[self.ctrl_local.start])
+        if force is None or (self.id < 0 and len(force) != len(self._record.ctrl)):
+            return None
+        return float(force[self._first_out])
 
     @property
     def value(self) -> float:
@@ -256,17 +276,17 @@ def _actuators(record: MirroredArticulation, model: mujoco.MjModel | None) -> li
     types = record.info.actuator_types
     if model is None:
         return [
-            Actuator(record, name=name, id=-1, type=known(ActuatorType, kind), ctrl_local=slice(i, i + 1))
+            Actuator(record, name=name, id=-1, type=known(ActuatorType, kind), ctrl_local=slice(i, i + 1), first_out=i)
             for i, (name, kind) in enumerate(types.items())
         ]
     joint_of = {joint_id: name for name, joint_id in record.layout.joints.items()}
     actuators: list[Actuator] = []
-    start = 0
+    start = first_out = 0
+    controls, starts, forces = control_counts(model), control_starts(model), force_counts(model)
     for name, i in record.layout.actuators.items():
         kind = types.get(name)
         driven = int(model.actuator_trnid[i][0]) if model.actuator_trntype[i] in _JOINT_TRANSMISSIONS else -1
-        width = int(model.actuator_ctrlnum[i])
-        first = int(model.actuator_ctrladr[i])
+        width, first = int(controls[i]), int(starts[i])
         actuators.append(
             Actuator(
                 record,
@@ -274,6 +294,7 @@ def _actuators(record: MirroredArticulation, model: mujoco.MjModel | None) -> li
                 id=i,
                 type=None if kind is None else known(ActuatorType, kind),
                 ctrl_local=slice(start, start + width),
+                first_out=first_out,
                 joint=joint_of.get(driven),
                 ctrlrange=_interval(model.actuator_ctrlrange[first]) if model.actuator_ctrllimited[first] else None,
                 forcerange=_interval(model.actuator_forcerange[i]) if model.actuator_forcelimited[i] else None,
@@ -282,6 +303,7 @@ def _actuators(record: MirroredArticulation, model: mujoco.MjModel | None) -> li
             )
         )
         start += width
+        first_out += int(forces[i])
     return actuators
 
 

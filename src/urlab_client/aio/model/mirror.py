@@ -6,9 +6,10 @@ For the client's own use. MuJoCo is imported when a model is loaded, not before.
 from __future__ import annotations
 
 import logging
+import math
 import threading
 from functools import cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -60,24 +61,41 @@ def _mjb_header() -> bytes:
 
 
 def write_options(opt: mujoco.MjOption, options: SimOptions) -> None:
-    """Write the options that are not None into a model's `mjOption`.
+    """Write the options that are not None into a model's `mjOption`, all or none.
 
     The raw masks come first, so that the named switches win, as on the server.
+
+    Raises:
+        ValueError: An integrator, cone or solver is unknown.
     """
     import mujoco  # noqa: PLC0415
 
+    values: dict[str, Any] = {}
     for name in SimOptions.__struct_fields__:
         value = getattr(options, name)
         if value is None or name in _NOT_IN_MJOPTION:
             continue
-        if name in _CHOICES:
-            value = getattr(getattr(mujoco, _CHOICES[name][0]), f"{_CHOICES[name][1]}{value.upper()}")
+        values[name] = _choice(name, value) if name in _CHOICES else value
+    for name, value in values.items():
         setattr(opt, name, value)
     if options.enable_sleep is not None:
         opt.enableflags = _switched(opt.enableflags, int(mujoco.mjtEnableBit.mjENBL_SLEEP), options.enable_sleep)
     if options.enable_multiccd is not None:
         bit = int(mujoco.mjtDisableBit.mjDSBL_MULTICCD)
         opt.disableflags = _switched(opt.disableflags, bit, not options.enable_multiccd)
+
+
+def _choice(name: str, value: str) -> int:
+    """Return the number of an integrator, cone or solver. One without a name on the wire comes as its number."""
+    import mujoco  # noqa: PLC0415
+
+    enum, prefix = _CHOICES[name]
+    members = getattr(mujoco, enum).__members__
+    known = {key.removeprefix(prefix).lower(): int(member) for key, member in members.items()}
+    found = known.get(value.lower(), next((number for number in known.values() if str(number) == value), None))
+    if found is None:
+        raise ValueError(f"{name} is {value!r}; MuJoCo knows {', '.join(known)}")
+    return found
 
 
 def _from_binary(mjb: bytes) -> mujoco.MjModel:
@@ -171,6 +189,8 @@ class Mirror:
                 return None
         except (ValueError, mujoco.FatalError) as error:
             raise ProtocolError(f"hello: the server's model cannot be loaded: {error}", op="hello") from error
+        if not 0 < model.opt.timestep < math.inf:
+            raise ProtocolError(f"hello: the timestep of the server's model is {model.opt.timestep}.", op="hello")
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
         return Loaded(model, data, not binary)

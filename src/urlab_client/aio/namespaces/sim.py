@@ -70,7 +70,7 @@ class SimNamespace(Namespace):
                 break
             else:
                 reply = await self._begin(None, min(max(0.0, deadline - loop.time()), _SLICE_S), timeout)
-        state = PIEState(reply.state)
+        state = reply.state
         payload = reply.handshake_payload
         result = PIEStartResult(state=state, compile_error=reply.compile_error)
         if payload is not None:
@@ -116,4 +116,4 @@ class SimNamespace(Namespace):
     async def status(self, *, timeout: Timeout = DEFAULT) -> PIEStatus:
         """Read the state of play."""
         reply = await self._call(PieStatus(), timeout)
-        return PIEStatus(state=PIEState(reply.state), compile_error=reply.compile_error, sim_time=reply.sim_time)
+        return PIEStatus(state=reply.state, compile_error=reply.compile_error, sim_time=reply.sim_time)

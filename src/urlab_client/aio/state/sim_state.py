@@ -6,12 +6,13 @@ The client and its namespaces share one `SimState`; users see it through the att
 from __future__ import annotations
 
 import logging
+import math
 import re
 import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import anyio.to_thread
 import numpy as np
@@ -22,12 +23,12 @@ from urlab_client.aio.deadline import DEFAULT, Timeout, shared
 from urlab_client.aio.live.live_state import LatestPicture, LiveState
 from urlab_client.aio.live.publishers import Publishers
 from urlab_client.aio.model.articulation_state import MirroredArticulation, MirroredEntity, Wrenches
-from urlab_client.aio.model.layout import FREE, ArticulationLayout, articulation_layouts
-from urlab_client.aio.model.mirror import Mirror, model_names, write_options
+from urlab_client.aio.model.mirror import Mirror, write_options
 from urlab_client.aio.session import Session
+from urlab_client.aio.state.handshake import Examined, examine
 from urlab_client.aio.state.recovery import PendingOutcomes
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.enums import LATER_MODE_NAMES, StepMode
+from urlab_client.protocol.enums import LATER_MODE_NAMES, CameraMode, StepMode
 from urlab_client.protocol.errors import (
     BadMode,
     NoActiveManager,
@@ -40,23 +41,21 @@ from urlab_client.protocol.messages.runtime import SetMode, SetPaused
 from urlab_client.protocol.messages.session import (
     NOT_SENT,
     ArticulationCommand,
-    ArticulationInfo,
+    ArticulationState,
     CameraFrame,
     CameraInfo,
-    EntityInfo,
     EntityState,
     Hello,
     HelloOk,
+    Perturbation,
     StateReply,
     StepOk,
 )
 from urlab_client.protocol.messages.streams import PlayEnded, PlayStarted, SessionLost, SessionOpened, StateSnapshot
-from urlab_client.protocol.names import NameMap, owner_of
+from urlab_client.protocol.names import NameMap
 from urlab_client.protocol.rows import Pixels, decode_camera
+from urlab_client.protocol.sim_options import check_sim_options
 from urlab_client.protocol.types import SimOptions
-
-if TYPE_CHECKING:
-    import mujoco
 
 __all__ = ["SimState", "StateObserver"]
 
@@ -67,6 +66,15 @@ _OVERTAKEN_S = 1.0
 
 # Unreal's actor names: class, then a number or a generated id.
 _ENGINE_NAME = re.compile(r"(?P<stem>.+)_C_(?:\d+|UAID_\w+)")
+
+
+class _Checked(NamedTuple):
+    """A state that fits, and what each part of it is about."""
+
+    reply: StateReply | StateSnapshot
+    articulations: list[tuple[MirroredArticulation, ArticulationState]]
+    entities: list[tuple[MirroredEntity, EntityState]]
+    pictures: list[tuple[URLabCameraView, Pixels]]
 
 
 class StateObserver(Protocol):
@@ -292,6 +300,7 @@ class SimState:
                 hello = await self._loadable(hello, timeout)
             load = partial(self.mirror.load, hello, trusted=self._trusted)
             loaded = await anyio.to_thread.run_sync(load, abandon_on_cancel=True)
+        examined = examine(hello, None if loaded is None else loaded.model)
         self.publishers.check_open()
         # From here on nothing waits until all is taken over: cancelled or not, model and wrappers belong together.
         # The model's bytes, several times its size, are not needed any more.
@@ -301,8 +310,8 @@ class SimState:
             if self._local_model:
                 self.mirror.use(loaded)
             self.hello = hello
-            self._bind_articulations(hello.articulations)
-            self._bind_entities(hello.plain_entities)
+            self._bind_articulations(hello, examined)
+            self._bind_entities(examined)
             cameras = hello.global_cameras or {}
             self.global_cameras = NameMap(
                 {n: self._global_camera(n, info) for n, info in cameras.items()}, kind="camera"
@@ -336,13 +345,12 @@ class SimState:
             except BadMode:
                 # Servers after the beta call the modes by other names.
                 reply = await self.session.call(SetMode(mode=LATER_MODE_NAMES.get(mode, mode)), timeout=left())
-        previous, current = StepMode(reply.previous_mode), StepMode(reply.current_mode)
         try:
             if self.session.features.idles_in_puppet:
-                await self._still_puppet(previous, current, left())
+                await self._still_puppet(reply.previous_mode, reply.current_mode, left())
         finally:
-            self.mode = current
-        return previous
+            self.mode = reply.current_mode
+        return reply.previous_mode
 
     async def _still_puppet(self, previous: StepMode, current: StepMode, timeout: Timeout) -> None:
         """Keep physics from taking steps of its own between the pushes of puppet mode, and undo that afterwards."""
@@ -362,15 +370,12 @@ class SimState:
         own = [view for art in self.articulations.values() for view in art.cameras.values()]
         return [*own, *self.global_cameras.values()]
 
-    def _bind_articulations(self, infos: list[ArticulationInfo]) -> None:
-        model = self.mirror.model
-        keys = [info.prefix for info in infos]
-        layouts = articulation_layouts(model, [info.compiled_prefix for info in infos]) if model is not None else {}
+    def _bind_articulations(self, hello: HelloOk, examined: Examined) -> None:
         wrappers: dict[str, URLabArticulation] = {}
         aliases: dict[str, list[str]] = {}
-        for info in infos:
+        for info in hello.articulations:
             key = info.prefix
-            layout = layouts.get(info.compiled_prefix) or ArticulationLayout()
+            layout = examined.layouts[key]
             record = self._records.get(key)
             if record is None:
                 record = self._records[key] = MirroredArticulation(self.mirror, info, layout)
@@ -380,17 +385,14 @@ class SimState:
             found = _ENGINE_NAME.fullmatch(info.compiled_prefix)
             for alias in {info.actor_id, info.compiled_prefix, found["stem"] if found else ""} - {"", key}:
                 aliases.setdefault(alias, []).append(key)
-        self._records = {key: self._records[key] for key in keys}
+        self._records = {key: self._records[key] for key in wrappers}
         self.articulations = NameMap(wrappers, aliases, kind="articulation")
         self.articulations_by_id = {art.actor_id: art for art in wrappers.values() if art.actor_id}
 
-    def _bind_entities(self, infos: dict[str, EntityInfo]) -> None:
-        model = self.mirror.model
-        if not infos and model is not None:
-            infos = _entities_of(model, frozenset(record.info.compiled_prefix for record in self._records.values()))
+    def _bind_entities(self, examined: Examined) -> None:
         plain: dict[str, URLabEntity] = {}
         records: dict[str, MirroredEntity] = {}
-        for name, info in infos.items():
+        for name, info in examined.entities.items():
             record = self._entity_records.get(name) or MirroredEntity(self.mirror, name)
             record.bind_entity(info)
             records[name] = record
@@ -400,23 +402,21 @@ class SimState:
         self.entities = NameMap({**self.articulations, **plain}, kind="entity")
 
     def absorb_reset(self, reply: StateReply, keyframe: str | None) -> None:
-        """Take over the state after a reset, whole or not at all."""
-        for key, state in reply.per_articulation.items():
-            if key in self._records:
-                self._records[key].check(state, "reset")
+        """Take over the state after a reset, whole or not at all; raises as `absorb` does."""
+        received = time.time_ns()
+        checked = self._checked(reply, "reset")
         with self.mirror.lock:
             self.mirror.reset(keyframe)
             for record in self._entity_records.values():
                 record.pose = None
-            self.absorb(reply, "reset")
+            self._take_over(checked, received, into_mirror=True)
 
     def matches(self, snapshot: StateSnapshot) -> bool:
         """Whether a published state is of the world that the handshake described, as far as that can be seen."""
         if not self.session.confirmed or snapshot.per_articulation.keys() != self._records.keys():
             return False
         try:
-            for key, state in snapshot.per_articulation.items():
-                self._records[key].check(state, "state/full")
+            self._checked(snapshot, "state/full")
         except ProtocolError:
             return False
         return True
@@ -440,34 +440,47 @@ class SimState:
         Args:
             reply: The reply.
             op: Op that it answers, for messages.
-            into_mirror: Also write it into the local data; not after a puppet step, whose state came from there.
+            into_mirror: Also write it into the local data; not in puppet mode, whose state comes from there.
 
         Raises:
             ProtocolError: Something in it does not fit the model or the cameras; nothing was taken over.
         """
         received = time.time_ns()
-        pairs = [(self._records[key], s) for key, s in reply.per_articulation.items() if key in self._records]
-        for record, state in pairs:
+        self._take_over(self._checked(reply, op), received, into_mirror=into_mirror)
+
+    def _checked(self, reply: StateReply | StateSnapshot, op: str) -> _Checked:
+        """Compare a state with the model and the cameras, and return it with what each part of it is about.
+
+        Raises:
+            ProtocolError: Something in it does not fit.
+        """
+        if not math.isfinite(reply.time):
+            raise ProtocolError(f"{op}: the simulation time is {reply.time}.", op=op)
+        articulations = [(self._records[key], s) for key, s in reply.per_articulation.items() if key in self._records]
+        for record, state in articulations:
             record.check(state, op)
-        self._check_perturbation(reply, op)
-        entities: Mapping[str, EntityState] = {}
-        frames: list[tuple[URLabCameraView, Pixels]] = []
-        if isinstance(reply, (StepOk, StateSnapshot)):
-            entities = reply.entities or {}
-            for name, entity in entities.items():
-                if name in self._entity_records:
-                    self._entity_records[name].check_pose(entity, op)
+        entities: list[tuple[MirroredEntity, EntityState]] = []
+        if isinstance(reply, (StepOk, StateSnapshot)) and reply.entities:
+            known = self._entity_records
+            entities = [(known[name], state) for name, state in reply.entities.items() if name in known]
+            for record, state in entities:
+                record.check_pose(state, op)
+        pictures: list[tuple[URLabCameraView, Pixels]] = []
         if isinstance(reply, StepOk):
-            frames = [(view, _pixels(view, frame)) for view, frame in self._frames(reply.cameras or {})]
+            self._check_perturbation(reply.perturbation, op)
+            pictures = [(view, _pixels(view, frame)) for view, frame in self._frames(reply.cameras or {})]
+        return _Checked(reply, articulations, entities, pictures)
+
+    def _take_over(self, checked: _Checked, received: int, *, into_mirror: bool) -> None:
+        reply = checked.reply
         with self.mirror.lock:
-            for record, state in pairs:
+            for record, state in checked.articulations:
                 record.absorb(state)
                 if into_mirror:
                     record.write_mirror(state)
-            for name, entity in entities.items():
-                if name in self._entity_records:
-                    self._entity_records[name].absorb_pose(entity)
-            for view, pixels in frames:
+            for record, state in checked.entities:
+                record.absorb_pose(state, into_mirror=into_mirror)
+            for view, pixels in checked.pictures:
                 view.pictures.deliver(pixels, reply.time)
             if into_mirror and self.mirror.data is not None:
                 self.mirror.data.time = reply.time
@@ -476,11 +489,16 @@ class SimState:
         for observer in self.observers:
             observer.on_state(reply)
 
-    def _check_perturbation(self, reply: StateReply | StateSnapshot, op: str) -> None:
-        drag = reply.perturbation if isinstance(reply, StepOk) else None
+    def _check_perturbation(self, drag: Perturbation | None, op: str) -> None:
         model = self.mirror.model
-        if drag is not None and model is not None and not (0 < drag.body_id < model.nbody and len(drag.xfrc) == 6):
-            raise ProtocolError(f"{op}: a perturbation of body {drag.body_id} with {len(drag.xfrc)} values.", op=op)
+        if drag is None or model is None:
+            return
+        if not (0 < drag.body_id < model.nbody and len(drag.xfrc) == 6 and np.isfinite(drag.xfrc).all()):
+            raise ProtocolError(
+                f"{op}: a perturbation of body {drag.body_id} by {drag.xfrc.tolist()}: "
+                f"bodies are 1 to {model.nbody - 1}, a wrench is six numbers.",
+                op=op,
+            )
 
     def _absorb_clocks(self, reply: StateReply | StateSnapshot, received: int) -> None:
         self.step_count = reply.step
@@ -494,11 +512,16 @@ class SimState:
             self.wall_time_sec, self.wall_time_nsec = reply.wall_time.sec, reply.wall_time.nsec
 
     def mirror_qpos(self, key: str, qpos: Floats) -> None:
-        """Take over the leading joint positions of an articulation that `set_qpos` wrote, by any of its names."""
+        """Take over the leading joint positions of an articulation that `set_qpos` wrote, by any of its names.
+
+        Raises:
+            ProtocolError: They are neither all of its positions nor those of its free base.
+        """
         articulation = self.articulations.get(key)
         if articulation is None:
             return
         record = self._records[articulation.prefix]
+        record.check_written(qpos)
         with self.mirror.lock:
             record.qpos = np.concatenate([qpos, record.qpos[len(qpos) :]])
             if self.mirror.data is not None:
@@ -506,11 +529,18 @@ class SimState:
             self.mirror.mark_stale()
 
     def mirror_options(self, options: SimOptions) -> None:
-        """Take over the options that `set_sim_options` echoed."""
-        if self.mirror.model is None:
-            return
-        with self.mirror.lock:
-            write_options(self.mirror.model.opt, options)
+        """Take over the options that `set_sim_options` echoed, all or none.
+
+        Raises:
+            ProtocolError: One of them cannot be right.
+        """
+        try:
+            check_sim_options(options)
+            if self.mirror.model is not None:
+                with self.mirror.lock:
+                    write_options(self.mirror.model.opt, options)
+        except ValueError as error:
+            raise ProtocolError(f"set_sim_options: the server says that {error}.", op="set_sim_options") from None
 
     def _note_refusal(self, refusal: URLabRPCError) -> None:
         if isinstance(refusal, NoActiveManager):
@@ -569,26 +599,7 @@ def _listed(keys: Iterable[str]) -> str:
 
 
 def _pixels(view: URLabCameraView, frame: CameraFrame) -> Pixels:
+    mode = view.mode
+    if isinstance(mode, CameraMode) and frame.dtype != ("float32" if mode is CameraMode.DEPTH else "bgra8"):
+        raise ProtocolError(f"step: a frame of {mode} camera {view.name!r} has dtype {frame.dtype!r}.", op="step")
     return decode_camera(frame.data, view.mode, frame.width, frame.height, where=view.name).pixels
-
-
-def _entities_of(model: mujoco.MjModel, keys: frozenset[str]) -> dict[str, EntityInfo]:
-    """Find the dynamic bodies of no articulation: the plugin lists none, but they are in the model."""
-    bodies, joints = model_names(model, "body"), model_names(model, "joint")
-    found: dict[str, EntityInfo] = {}
-    for body_id, name in enumerate(bodies):
-        if body_id == 0 or not name or owner_of(name, keys) is not None:
-            continue
-        joint = int(model.body_jntadr[body_id])
-        if joint >= 0 and model.jnt_type[joint] == FREE:
-            found[name] = EntityInfo(
-                id=body_id,
-                has_free_base=True,
-                free_joint=joints[joint] or None,
-                free_joint_id=joint,
-                qpos_offset=int(model.jnt_qposadr[joint]),
-                qvel_offset=int(model.jnt_dofadr[joint]),
-            )
-        elif model.body_mocapid[body_id] >= 0:
-            found[name] = EntityInfo(id=body_id, has_free_base=False)
-    return found

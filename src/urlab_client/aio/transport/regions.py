@@ -363,7 +363,7 @@ class Regions:
         """Take the handlers that had to do without back to a region that has come to life again."""
         reader.silent = False
         for handler, source in self._sources.items():
-            if source.place().file == reader.place.file:
+            if _file_of(source) == reader.place.file:
                 self._subscriptions.detach(handler)
                 reader.handlers[handler] = None
 
@@ -410,3 +410,10 @@ class Regions:
 
     def _now(self) -> float:
         return 0.0 if self._loop is None else self._loop.time()
+
+
+def _file_of(source: RegionSource) -> str | None:
+    try:
+        return source.place().file
+    except ProtocolError:  # what a server calls its cameras may be anything
+        return None

@@ -96,8 +96,17 @@ class ArticulationState(Struct, kw_only=True, omit_defaults=True):
 
     qpos: Annotated[Floats, doc("Joint positions, shape (nq of the articulation,).")]
     qvel: Annotated[Floats, doc("Joint velocities, shape (nv of the articulation,).")]
-    ctrl: Annotated[Floats | None, doc("`mjData.ctrl`, what was applied after any controller. Level standard.")] = None
-    act: Annotated[Floats | None, doc("First activation per actuator, 0 where stateless. Level standard.")] = None
+    ctrl: Annotated[
+        Floats | None,
+        doc(
+            "`mjData.ctrl`, what was applied after any controller: the inputs of each actuator, nearly always one, in "
+            "actuator order. Level standard."
+        ),
+    ] = None
+    act: Annotated[
+        Floats | None,
+        doc("First activation of the actuator of each input, 0 where stateless; ordered as `ctrl`. Level standard."),
+    ] = None
     sensors: Annotated[
         dict[str, list[float]] | None, doc("Raw `sensordata` by unprefixed sensor name. Level standard.")
     ] = None
@@ -105,7 +114,10 @@ class ArticulationState(Struct, kw_only=True, omit_defaults=True):
         dict[str, Any] | None, doc("User channels that the robot declares, by name. Level standard, from the beta on.")
     ] = None
     bodies: Annotated[dict[str, BodyPose] | None, doc("World pose by unprefixed body name. Level full.")] = None
-    actuator_force: Annotated[Floats | None, doc("`mjData.actuator_force`, ordered as `ctrl`. Level full.")] = None
+    actuator_force: Annotated[
+        Floats | None,
+        doc("`mjData.actuator_force`: the outputs of each actuator, nearly always one, in actuator order. Level full."),
+    ] = None
     twist: Annotated[TwistState | None, doc("Commanded twist, at every level.")] = None
     actions: Annotated[int | None, doc("Bit field of pressed action keys, bits 0 to 9.")] = None
 
@@ -190,7 +202,7 @@ class StepOk(StateReply, tag="step_ok", kw_only=True, omit_defaults=True):
 class ArticulationCommand(Struct, kw_only=True, omit_defaults=True):
     """What a direct or live step tells one articulation."""
 
-    ctrl: Annotated[list[float] | None, doc("Set-points in actuator order.")] = None
+    ctrl: Annotated[list[float] | None, doc("Set-points, in the order of the state's `ctrl`.")] = None
     ctrl_map: Annotated[dict[str, float] | None, doc("Set-points by actuator name; wins over `ctrl`. Direct only.")] = (
         None
     )
@@ -252,7 +264,7 @@ class ControllerInfo(Struct, kw_only=True):
 
     kind: Annotated[str, doc("`pd`; the plugin's passthrough controller says `base`.")]
     params: Annotated[dict[str, Any], doc("Current parameters.")]
-    schema: Annotated[dict[str, Any], doc("Parameter name to `{type, dtype, min}`.")]
+    schema: Annotated[dict[str, dict[str, Any]], doc("Parameter name to `{type, dtype, min}`.")]
 
 
 class CameraInfo(Struct, kw_only=True):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Final
 
 from urlab_client.protocol.base import EDITOR_TIMEOUT_S, Effect, Op, Reply, Request, doc
+from urlab_client.protocol.enums import PIEState
 from urlab_client.protocol.messages.session import HelloOk
 
 __all__ = ["OPS", "BeginPie", "BeginPieOk", "PieStatus", "PieStatusOk", "StopPie", "StopPieOk"]
@@ -13,7 +14,7 @@ __all__ = ["OPS", "BeginPie", "BeginPieOk", "PieStatus", "PieStatusOk", "StopPie
 class BeginPieOk(Reply, tag="begin_pie_ok", kw_only=True, omit_defaults=True):
     """How the start ended."""
 
-    state: Annotated[str, doc("`ready`, `compile_failed` or `timeout`.")]
+    state: Annotated[PIEState, doc("`ready`, `compile_failed` or `timeout`.")]
     compile_error: Annotated[str, doc("MuJoCo's message when the model was rejected.")]
     handshake_payload: Annotated[HelloOk | None, doc("The handshake of the new play world, when ready.")] = None
 
@@ -36,7 +37,7 @@ class StopPie(Request[StopPieOk], tag="stop_pie", kw_only=True):
 class PieStatusOk(Reply, tag="pie_status_ok", kw_only=True, omit_defaults=True):
     """Where Play-In-Editor stands."""
 
-    state: Annotated[str, doc("`off`, `compiling`, `compile_failed` or `ready`.")]
+    state: Annotated[PIEState, doc("`off`, `compiling`, `compile_failed` or `ready`.")]
     compile_error: Annotated[str, doc("MuJoCo's message after a failed compile, else empty.")]
     sim_time: Annotated[float | None, doc("`mjData.time`, seconds, when data exist.")] = None
 
