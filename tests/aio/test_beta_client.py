@@ -444,7 +444,7 @@ async def test_another_mujoco_is_worked_with(mode: str) -> None:
             assert client.model.nq == 9
             client.articulations["arm_a"].set_ctrl({"m": 0.5})
             await client.step(2)
-            assert client.entities["crate"].root_pos_w.tolist() == [0.0, 2.0, 0.0]
+            assert client.entities["crate"].root_pos_w[:2].tolist() == [0.0, 2.0]
     finally:
         beta.close()
 
