@@ -144,7 +144,7 @@ def test_a_wider_interface_needs_protection_or_the_word(keys: Path, caplog: pyte
         assert server.open_to == "any program on this machine"
     with pytest.raises(ValueError, match="exclude each other"):
         SimulatedServer(curve=CurveServer(server_key="x", allow_any=True), insecure_no_auth=True)
-    with pytest.raises(ValueError, match="whom to let in"):
+    with pytest.raises(ValueError, match="who may connect"):
         CurveServer(server_key="x")
 
 

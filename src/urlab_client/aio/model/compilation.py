@@ -80,7 +80,7 @@ def compile_confined(xml: str, assets: Mapping[str, bytes]) -> bytes:
 
 def _main(folder: str) -> None:
     answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what libraries print is no answer
+    os.dup2(2, 1)  # what libraries print is not an answer
     order = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=_CompileJob)
     try:
         answer = _DONE + _compile(order, folder)

@@ -50,7 +50,7 @@ class Follower:
         buffer: int,
     ) -> None:
         if isinstance(cameras, str) and cameras != "all":
-            raise ValueError(f"cameras is a sequence of names or 'all', not {cameras!r}")
+            raise ValueError(f"cameras must be a sequence of names or 'all', not {cameras!r}")
         self._client = client
         self._state: SimState = client._state  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
         self._name = name
@@ -80,7 +80,7 @@ class Follower:
             )
         if self._needs_model is not None and self._state.mirror.model is None:
             raise URLabError(
-                f"{self._name}: poses are computed with the local model, and there is none.",
+                f"{self._name}: poses are computed with the local model, which this client does not have.",
                 hint=f"Call discover() during play, with local_model=True{self._needs_model}.",
             )
         unknown = self._unknown_cameras()
@@ -148,7 +148,7 @@ class Follower:
         hello = self._state.hello
         if self._scene is None or hello is not self._described:
             if self._scene is not None and (unknown := self._unknown_cameras()):
-                log.warning("%s: in the new scene there is %s", self._name, unknown)
+                log.warning("%s: the new scene has %s", self._name, unknown)
             self._described = hello
             self._scene = SceneMessages.of(self._state, self._views())
             if self._live:
@@ -215,7 +215,7 @@ class Follower:
     def _on_end(self, task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)
         if not task.cancelled() and (error := task.exception()) is not None:
-            log.warning("%s: a stream was not followed to its end: %s", self._name, error)
+            log.warning("%s: a stream was not read to its end: %s", self._name, error)
 
     def _ignore(self) -> None:
         self._live = False
