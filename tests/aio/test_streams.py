@@ -788,7 +788,7 @@ class TestEvents:
         dropped = bus.stream(3)
         del dropped
         gc.collect()
-        assert not bus._sinks
+        assert not bus._handlers
 
 
 class TestBackground:

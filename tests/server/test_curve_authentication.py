@@ -202,7 +202,7 @@ def test_what_is_no_key(text: str, tmp_path: Path) -> None:
     with pytest.raises((KeyFileError, ValueError)):
         public_key(text)
     (tmp_path / "bad.key").write_text(f'curve\n public-key = "{text}"')
-    with pytest.raises(KeyFileError, match="no key file"):
+    with pytest.raises(KeyFileError, match="not a key file"):
         public_key(tmp_path / "bad.key")
 
 
