@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
+import importlib
 import tempfile
 import zipfile
 from collections.abc import Generator, Iterable
@@ -27,6 +28,7 @@ __all__ = [
     "MODEL_FILE",
     "actuator_count",
     "actuator_kind",
+    "batch_class",
     "check_copy",
     "control_counts",
     "control_starts",
@@ -246,6 +248,14 @@ def copy_options(options: mujoco.MjOption, model: mujoco.MjModel) -> None:
         value = getattr(options, name)
         if not name.startswith("_") and not callable(value):
             setattr(model.opt, name, value)
+
+
+def batch_class() -> Any:
+    """Return `mujoco.batch.Batch`, None before 3.17."""
+    try:
+        return importlib.import_module("mujoco.batch").Batch
+    except ImportError:
+        return None
 
 
 def merge_assets(spec: mujoco.MjSpec, folders: Iterable[Path]) -> None:
