@@ -46,16 +46,16 @@ def environments() -> dict[str, list[str]]:
 
 def make(folder: Path, requirements: list[str]) -> Path:
     """Make an environment; return its interpreter."""
-    subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
+    subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)  # noqa: S603
     python = folder / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
     command = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
-    subprocess.run([*command, "-e", f"{ROOT}[test]", *requirements], check=True)
+    subprocess.run([*command, "-e", f"{ROOT}[test]", *requirements], check=True)  # noqa: S603
     return python
 
 
 def versions(python: Path) -> str:
     """Return what is installed there of the core dependencies."""
-    listed = subprocess.run(
+    listed = subprocess.run(  # noqa: S603
         [str(python), "-m", "pip", "list", "--format", "json", "--disable-pip-version-check"],
         capture_output=True,
         text=True,
@@ -81,7 +81,7 @@ def main() -> int:
             started = time.monotonic()
             python = make(folder / name, known[name])
             print(f"=== {name}: {versions(python)}", flush=True)
-            done = subprocess.run(
+            done = subprocess.run(  # noqa: S603
                 [str(python), "-m", "pytest", "-q", "-p", "no:cacheprovider", *(pytest or CORE)], cwd=ROOT, check=False
             )
             print(f"=== {name}: exit code {done.returncode}, {time.monotonic() - started:.0f} s", flush=True)
