@@ -12,11 +12,12 @@ import contextlib
 import errno
 import hashlib
 import importlib
+import re
 import tempfile
 import zipfile
-from collections.abc import Generator, Iterable
+from collections.abc import Callable, Generator, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,9 +42,11 @@ __all__ = [
     "reset_controls",
     "set_threads",
     "thread_limit",
+    "without_newer_attributes",
     "write_model",
 ]
 
+T = TypeVar("T")
 Indices = NDArray[np.int32]
 
 MODEL_FILE = "model.xml"
@@ -233,6 +236,30 @@ def _unwritable() -> ValueError:
         f"MuJoCo {mujoco_version()} cannot write a model whose attached parts have files in folders of their own. "
         "Put the files beside the model, or use MuJoCo 3.16 or later."
     )
+
+
+def without_newer_attributes(xml: str, compiled: Callable[[str], T]) -> tuple[T, list[str]]:
+    """Compile an MJCF that a newer MuJoCo has written; return the result and which attributes were left out for that.
+
+    Raises:
+        ValueError: It cannot be compiled, for any other reason than attributes that this MuJoCo does not know.
+    """
+    left_out: list[str] = []
+    while True:
+        try:
+            return compiled(xml), left_out
+        except ValueError as error:
+            found = _UNKNOWN_ATTRIBUTE.search(str(error))
+            if found is None:
+                raise
+            attribute, element = found.groups()
+            xml, count = re.subn(rf'(<{element}\b[^<>]*?)\s{attribute}="[^"]*"', r"\1", xml)
+            if not count:
+                raise
+            left_out.append(f"{element}.{attribute}")
+
+
+_UNKNOWN_ATTRIBUTE = re.compile(r"unrecognized attribute: '([\w:-]+)'\s+Element '([\w:-]+)'")
 
 
 def mujoco_version() -> str:
