@@ -79,7 +79,7 @@ class StateObserver(Protocol):
     """Looks on while the client works. Called on the event loop, so it must be quick; it must not raise."""
 
     def on_state(self, reply: StateReply | StateSnapshot) -> None:
-        """Take note of a state that was taken over. Its arrays are replaced by later ones, never written."""
+        """Take note of a state that was taken over. Its arrays go on to the caller of `step()`: copy what is kept."""
         ...
 
     def wanted_pictures(self, asked: bool | dict[str, str | None], n_steps: int) -> bool | dict[str, str | None]:

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import copy
 import logging
 from collections.abc import Callable, Coroutine, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+from msgspec import Struct
 
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
@@ -22,6 +26,8 @@ __all__ = ["Follower"]
 log = logging.getLogger("urlab_client.feed")
 
 _NS = 1_000_000_000
+
+S = TypeVar("S", bound=Struct)
 
 
 class Follower:
@@ -121,7 +127,7 @@ class Follower:
             else:
                 self._ignore()
         if not live:
-            self._hand_on(reply)
+            self._hand_on(_detached(reply))
 
     def wanted_pictures(self, asked: bool | dict[str, str | None], n_steps: int) -> bool | dict[str, str | None]:
         """Add the cameras to a step when their next picture is due; see `StateObserver`."""
@@ -251,3 +257,21 @@ class Follower:
                 nanoseconds = round((self._state.sim_time if sample.sim_time is None else sample.sim_time) * _NS)
                 if self._put is not None and schedule.due(nanoseconds):
                     self._put(CameraPicture(camera, sample.pixels, nanoseconds, sample.recv_wall_time_ns))
+
+
+def _detached(reply: StateReply | StateSnapshot) -> StateReply | StateSnapshot:
+    """Return a state with arrays of its own: the caller of `step()` may write to those it came with."""
+    own = copy.copy(reply)
+    own.per_articulation = {key: _with_own_arrays(state) for key, state in reply.per_articulation.items()}
+    if isinstance(own, (StepOk, StateSnapshot)) and own.entities is not None:
+        own.entities = {name: _with_own_arrays(state) for name, state in own.entities.items()}
+    return own
+
+
+def _with_own_arrays(struct: S) -> S:
+    own = copy.copy(struct)
+    for name in own.__struct_fields__:
+        value = getattr(own, name)
+        if isinstance(value, np.ndarray):
+            setattr(own, name, value.copy())
+    return own
