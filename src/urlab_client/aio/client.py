@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, NoReturn, Self, TypeVar
 from urlab_client.aio.articulation import URLabArticulation, URLabEntity
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.explain import diagnose
 from urlab_client.aio.launch import SCHEME, LaunchedTransport
 from urlab_client.aio.live.publishers import Publishers
@@ -632,6 +633,7 @@ class URLabClient:
             await self._session.aclose()
 
     async def __aenter__(self) -> Self:
+        running_loop()
         return self
 
     async def __aexit__(
