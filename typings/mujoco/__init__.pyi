@@ -37,6 +37,8 @@ class MjOption:
 
 class MjModel:
     nq: int
+    narena: int
+    nsensordata: int
     nv: int
     nu: int
     na: int
@@ -109,6 +111,8 @@ class MjModel:
     def __getattr__(self, name: str) -> Any: ...
 
 class MjData:
+    nbuffer: int
+    narena: int
     time: float
     qpos: _Floats
     qvel: _Floats
