@@ -19,6 +19,7 @@ import warnings
 import weakref
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import pytest
 from waiting import DEADLINE_S
@@ -352,7 +353,10 @@ class TestClose:
         portal = Portal()
         entered = threading.Event()
 
+        tasks: list[weakref.ref[Any]] = []
+
         async def stubborn() -> None:
+            tasks.append(weakref.ref(asyncio.current_task()))
             entered.set()
             while True:
                 with contextlib.suppress(asyncio.CancelledError):
@@ -366,6 +370,7 @@ class TestClose:
                 future.result()
         with caplog.at_level("CRITICAL", logger="asyncio"):  # it says, rightly, that a pending task was destroyed
             gc.collect()
+            assert tasks[0]() is None, "not even the error that the caller got keeps the call"
 
     def test_from_two_threads(self) -> None:
         portal = Portal()

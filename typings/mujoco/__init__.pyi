@@ -38,7 +38,6 @@ class MjOption:
 class MjModel:
     nq: int
     narena: int
-    nsensordata: int
     nv: int
     nu: int
     na: int

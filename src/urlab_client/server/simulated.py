@@ -682,11 +682,11 @@ def _place(world: EditorWorld, model: str, sources: dict[str, str], edge: float 
     other = sources.setdefault(blueprint.stem, path)
     if other != path:
         raise ModelError(f"{model} and {other} would both become blueprint '{blueprint.stem}': rename one of the files")
-    placed = world.spawn_actor(blueprint.class_path, _free_id(world, Path(path).stem))
-    bounds = world.get_actor_bounds(placed.actor_name, components_only=True)
+    actor = world.spawn_actor(blueprint.class_path, _free_id(world, Path(path).stem)).actor
+    bounds = world.get_actor_bounds(actor.name, components_only=True)
     if bounds.extents != (0.0, 0.0, 0.0) and edge is not None:
-        world.set_actor_transform(placed.actor_name, location=(0.0, edge + GAP_M - bounds.min[1], 0.0))
-    return _beyond(world, placed.actor_name, edge)
+        world.set_actor_transform(actor.name, location=(0.0, edge + GAP_M - bounds.min[1], 0.0))
+    return _beyond(world, actor.name, edge)
 
 
 def _free_id(world: EditorWorld, stem: str) -> str:

@@ -179,6 +179,7 @@ class CallerDrivenLoop:
             signals.on_arrival = None
             self._abandon(job)
             raise
+        signals.on_arrival = None  # which refers to the job
 
     def stop(self) -> None:
         """Wind the loop down and join the thread, in bounded time, from any thread."""
