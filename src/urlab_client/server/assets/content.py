@@ -417,7 +417,7 @@ class ContentRoot:
             candidates = self._candidates(path, trusted=trusted)
             file = next((candidate for candidate in candidates if candidate.is_file()), None)
         except (OSError, ValueError) as error:  # too long, a null byte, a loop of links
-            raise Refusal("import_failed", f"{path!r} is no usable path: {error}") from None
+            raise Refusal("import_failed", f"{path!r} is not a usable path: {error}") from None
         if file is not None:
             packaged = {location.resolve(): name for name, location in bundled.items()}
             return file, f"{BUNDLED_PREFIX}{packaged[file]}" if file in packaged else str(file)

@@ -265,7 +265,7 @@ class EditorWorld:
             scale: Must be 1.
 
         Raises:
-            Refusal: `missing_field`; `spawn_failed` for an unknown blueprint, a scale, a pose that is none, or an id
+            Refusal: `missing_field`; `spawn_failed` for an unknown blueprint, a scale, an invalid pose, or an id
                 that belongs to an actor of another class.
         """
         checks.require(blueprint, "blueprint")
@@ -397,7 +397,7 @@ class EditorWorld:
             rotation_euler: (roll, pitch, yaw), degrees, as `spawn_actor`.
 
         Raises:
-            Refusal: `missing_field`; `set_actor_transform_failed` for an unknown actor or a pose that is none.
+            Refusal: `missing_field`; `set_actor_transform_failed` for an unknown actor or an invalid pose.
         """
         code = "set_actor_transform_failed"
         actor = self._find(target, code)
