@@ -17,6 +17,7 @@ from urlab_client.aio.articulation import URLabArticulation, URLabEntity
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.control import Control
 from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.explain import diagnose
 from urlab_client.aio.launch import SCHEME, LaunchedTransport
 from urlab_client.aio.live.publishers import Publishers
@@ -657,6 +658,7 @@ class URLabClient:
             await self._session.aclose()
 
     async def __aenter__(self) -> Self:
+        running_loop()
         return self
 
     async def __aexit__(

@@ -9,6 +9,7 @@ from typing import NamedTuple, TypeVar
 
 from urlab_client.aio.control import Control
 from urlab_client.aio.deadline import DEFAULT, Timeout, shared
+from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.jobs import OnProgress, finish
 from urlab_client.aio.transport.base import RequestTransport
 from urlab_client.protocol.base import ControlRequest, Needs, Op, Reply, Request
@@ -65,6 +66,7 @@ class Session:
         self._default_timeout = default_timeout
         self._json = json
         self.control = Control(self)
+        self._loop: asyncio.AbstractEventLoop | None = None
         self._turn = asyncio.Lock()
         self._editing = asyncio.Lock()
         self._queued = 0
@@ -94,6 +96,7 @@ class Session:
         op = op_of(request)
         if op.name not in _UNLISTED and not self.features.offers(op.name):
             raise UnknownOp("unknown_op", "this server does not offer it. Nothing was sent.", op=op.name)
+        self._loop = running_loop(self._loop)
         limits = self._limits(op, timeout)
         if op.needs is not Needs.EDITOR:
             return await self._in_turn(request, op, limits)
