@@ -66,17 +66,18 @@ INLINE_SHARE: Final = 0.02
 """A direct step expected to take less than this share of the step timeout runs on the calling thread."""
 
 
-def parse_mode(text: str) -> StepMode:
-    """Return the step mode called `text`, in any case; `streaming` is another name of live.
+def parse_mode(text: str, dialect: Dialect = ALPHA) -> StepMode:
+    """Return the step mode called `text`, in any case; `streaming` is another name of live, `auto` in newer dialects.
 
     Raises:
         Refusal: `bad_mode`.
     """
     name = text.casefold()
     try:
-        return StepMode.LIVE if name == "streaming" else StepMode(name)
+        mode = StepMode.LIVE if name == "streaming" else StepMode(name)
     except ValueError:
         raise Refusal("bad_mode", f"unknown step mode '{text}': use live, direct, puppet or auto") from None
+    return StepMode.LIVE if mode is StepMode.AUTO and not dialect.auto_mode else mode
 
 
 def parse_control_source(text: str) -> ControlSource:
@@ -153,7 +154,13 @@ class Engine:
         everyone = controllers.get("*")
         self.controls: Mapping[str, ArticulationControl] = MappingProxyType(
             {
-                name: ArticulationControl(self._model, index, neutral, controllers.get(index.key, everyone))
+                name: ArticulationControl(
+                    self._model,
+                    index,
+                    neutral,
+                    controllers.get(index.key, everyone),
+                    exact=not dialect.controls_float32,
+                )
                 for name, index in _named(scene, dialect)
             }
         )
