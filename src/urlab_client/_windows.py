@@ -1,6 +1,6 @@
-"""Windows' named events and locks, with which the plugin's shared memory saves itself from polling.
+"""Windows' named events and locks, with which shared memory saves itself from polling.
 
-Only what the client needs, and nothing on other systems. Everything works without the events, only slower.
+Only what clients and servers need, and nothing on other systems. Everything works without the events, only slower.
 """
 
 from __future__ import annotations
@@ -14,13 +14,14 @@ __all__ = ["NamedEvent", "NamedLock"]
 _SYNCHRONIZE = 0x00100000
 _EVENT_MODIFY_STATE = 0x0002
 _ALREADY_EXISTS = 183
+_SIGNALLED = 0
 
 
 def _kernel() -> Any:
     if sys.platform != "win32":
         return None
     kernel = ctypes.WinDLL("kernel32", use_last_error=True)
-    kernel.OpenEventW.restype = kernel.CreateMutexW.restype = ctypes.c_void_p
+    kernel.OpenEventW.restype = kernel.CreateEventW.restype = kernel.CreateMutexW.restype = ctypes.c_void_p
     for function in (kernel.SetEvent, kernel.CloseHandle):
         function.argtypes = [ctypes.c_void_p]
     kernel.WaitForSingleObject.argtypes = [ctypes.c_void_p, ctypes.c_uint32]
@@ -28,20 +29,24 @@ def _kernel() -> Any:
 
 
 class NamedEvent:
-    """An auto-reset event of the server. Without one of that name, as on other systems, it does nothing.
+    """An auto-reset event. Without one of that name, as on other systems, it does nothing.
 
     Args:
         name: Its name.
+        create: Make it, as servers do.
 
     Attributes:
         exists: Whether the server made it.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, *, create: bool = False) -> None:
         self._handle: int | None = None
         self._kernel = _kernel()
         if sys.platform == "win32":
-            self._handle = self._kernel.OpenEventW(_SYNCHRONIZE | _EVENT_MODIFY_STATE, 0, name)
+            if create:
+                self._handle = self._kernel.CreateEventW(None, 0, 0, name)
+            else:
+                self._handle = self._kernel.OpenEventW(_SYNCHRONIZE | _EVENT_MODIFY_STATE, 0, name)
         self.exists = bool(self._handle)
 
     def set(self) -> None:
@@ -49,10 +54,11 @@ class NamedEvent:
         if self._handle:
             self._kernel.SetEvent(self._handle)
 
-    def wait(self, seconds: float) -> None:
-        """Wait until it is set, at most so long; other threads go on."""
-        if self._handle:
-            self._kernel.WaitForSingleObject(self._handle, max(1, int(seconds * 1000)))
+    def wait(self, seconds: float) -> bool:
+        """Wait until it is set, at most so long; other threads go on. Return whether it was."""
+        if not self._handle:
+            return False
+        return self._kernel.WaitForSingleObject(self._handle, max(1, int(seconds * 1000))) == _SIGNALLED
 
     def close(self) -> None:
         """Let go of it."""
