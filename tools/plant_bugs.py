@@ -20,7 +20,7 @@ import subprocess
 import sys
 import tempfile
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -56,25 +56,30 @@ def read(table: Path = TABLE) -> list[Bug]:
     return [Bug(**entry) for entry in tomllib.loads(table.read_text(encoding="utf-8"))["bug"]]
 
 
-def located(bug: Bug, sources: Path) -> Path:
+def sources(root: Path) -> dict[Path, str]:
+    """Return the sources of a tree by their files."""
+    return {path: path.read_text("utf-8") for path in sorted((root / "src").rglob("*.py"))}
+
+
+def located(bug: Bug, texts: Mapping[Path, str]) -> Path:
     """Return the file that holds a bug's text.
 
     Raises:
         LookupError: None does, or it occurs more than once.
     """
-    found = [path for path in sorted(sources.rglob("*.py")) for _ in range(path.read_text("utf-8").count(bug.old))]
+    found = [path for path, text in texts.items() for _ in range(text.count(bug.old))]
     if len(found) != 1:
-        raise LookupError(f"its text occurs {len(found)} times in {sources.name}, not once")
+        raise LookupError(f"its text occurs {len(found)} times in src, not once")
     return found[0]
 
 
 def problems(bugs: Sequence[Bug], root: Path) -> list[str]:
     """Return what is wrong with the entries of a table, for the tree below `root`."""
     found: list[str] = []
-    ids = named_tests(root / "tests")
+    ids, texts = named_tests(root / "tests"), sources(root)
     for bug in bugs:
         try:
-            located(bug, root / "src")
+            located(bug, texts)
         except LookupError as error:
             found.append(f"{bug.name}: {error}")
         if bug.old == bug.new:
@@ -99,8 +104,9 @@ def run(tree: Path, ids: Sequence[str], *, stop: bool) -> subprocess.CompletedPr
 
 def verdict(bug: Bug, tree: Path) -> str:
     """Plant a bug, run its tests, take it out again; return `caught`, `SURVIVES`, or why it cannot be told."""
-    path = located(bug, tree / "src")
-    text = path.read_text("utf-8")
+    texts = sources(tree)
+    path = located(bug, texts)
+    text = texts[path]
     ids = named_tests(tree / "tests")
     try:
         path.write_text(text.replace(bug.old, bug.new), "utf-8")
