@@ -59,7 +59,7 @@ def render(pages: Mapping[str, Sequence[Mapping[str, Any]]], ids: Mapping[str, S
 
 
 def shown(test: str) -> str:
-    """Return a test's id as short as it is still found: a module with its whole path, as the page's links are checked."""
+    """Return a test's id as short as it is still found; a module keeps its path, as links of pages are checked."""
     return test.removeprefix("tests/") if "::" in test else test
 
 

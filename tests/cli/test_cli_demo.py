@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 import pytest
 from commands import GYMNASIUM_MODELS, urlab
-from matplotlib.image import imread
+from PIL import Image
 
 from urlab_client import URLabClient
 from urlab_client.cli import main
@@ -90,7 +90,7 @@ def test_plots_the_joints(demonstration: tuple[Path, str]) -> None:
     width, height = png_size(folder / "joints.png")
     assert width >= 1200
     assert height >= 900
-    pixels = (imread(folder / "joints.png")[..., :3] * 255).astype(np.uint32)
+    pixels = np.asarray(Image.open(folder / "joints.png"))[..., :3].astype(np.uint32)
     assert len(np.unique(pixels @ np.array([1, 256, 65536], np.uint32))) > 50  # a dozen lines and their soft edges
 
 
@@ -102,7 +102,7 @@ def test_draws_the_last_state_or_says_what_is_missing(demonstration: tuple[Path,
         assert not picture.exists()
         return
     assert png_size(picture) == (1280, 960)
-    red, green, blue = np.moveaxis(imread(picture)[..., :3], -1, 0)
+    red, green, blue = np.moveaxis(np.asarray(Image.open(picture)) / 255, -1, 0)
     shell = (red > 0.6) & (green < 0.75 * red) & (blue < 0.5 * red)  # the quadruped's orange
     rows, columns = np.nonzero(shell)
     assert shell.mean() > 0.005

@@ -16,9 +16,11 @@ from commands import DEADLINE_S, child, refusal, urlab
 from urlab_client.cli import main
 
 
-def test_help_needs_no_heavy_library(tmp_path: Path) -> None:
+def test_help_needs_no_heavy_library_and_a_command_none_of_the_others(tmp_path: Path) -> None:
     program = (
         "import sys; from urlab_client.cli import main\n"
+        "try: main(['serve', '--help'])\n"
+        "except SystemExit: print('urlab_client.aio' in sys.modules)\n"
         "try: main(['--help'])\n"
         "except SystemExit: print(sorted({'mujoco', 'rich', 'matplotlib'} & set(sys.modules)))"
     )
@@ -28,6 +30,7 @@ def test_help_needs_no_heavy_library(tmp_path: Path) -> None:
     *text, imported = done.stdout.splitlines()
     assert set(COMMANDS) <= set(" ".join(text).split())
     assert imported == "[]"
+    assert "False" in text, "a server loads the clients"
 
 
 COMMANDS = (
@@ -105,7 +108,7 @@ def test_an_address_that_is_none_is_one_line_that_says_so(
     assert main([name, "gopher://lab", *others]) == 2
     out, err = capsys.readouterr()
     assert (out, err.count("\n")) == ("", 1)
-    assert err.startswith(f"urlab {name}: 'gopher://lab' is no address; write tcp://HOST")
+    assert err.startswith(f"urlab {name}: 'gopher://lab' is not a valid address; write tcp://HOST")
 
 
 def test_the_package_runs_as_the_command(tmp_path: Path) -> None:

@@ -87,7 +87,7 @@ def run(arguments: DemoArguments) -> int:
         MissingExtra: A library is missing.
         URLabError: The server refused something.
     """
-    need("matplotlib", "rich", extra="demo")
+    need("matplotlib", "PIL", "rich", extra="demo")
     import_mujoco()
 
     from urlab_client.cli.demo_runs import drive_one, drive_two  # noqa: PLC0415

@@ -117,16 +117,14 @@ def _draw_in_child(folder: Path, platform: str) -> str | None:
 
 def _main(folder: Path) -> None:
     import mujoco  # noqa: PLC0415
-
-    # matplotlib leaves the type of a path open.
-    from matplotlib.image import imsave  # noqa: PLC0415  # pyright: ignore[reportUnknownVariableType]
+    from PIL import Image  # noqa: PLC0415
 
     model = mujoco.MjModel.from_binary_path(str(folder / "model.mjb"))
     data = mujoco.MjData(model)
     with np.load(folder / "state.npz") as state:
         data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = state["qpos"], state["mocap_pos"], state["mocap_quat"]
     mujoco.mj_forward(model, data)
-    imsave(folder / "picture.png", _render(model, data))
+    Image.fromarray(_render(model, data)).save(folder / "picture.png")
 
 
 def _render(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.uint8]:

@@ -14,6 +14,7 @@ from typing import Any
 
 import mujoco
 
+from urlab_client._mujoco import copy_options
 from urlab_client.protocol.base import Request
 from urlab_client.protocol.codec import encode_reply
 from urlab_client.protocol.dialects import ALPHA, Dialect
@@ -160,7 +161,7 @@ class ServerCore:
         if running is not None and not running.close(timeout):
             return False
         model = compiled.scene.model
-        model.opt = compiled.options
+        copy_options(compiled.options, model)
 
         def build() -> Running:
             data = mujoco.MjData(model)

@@ -13,7 +13,6 @@ For `World`, which knows what is placed where. Nothing here places, compiles sce
 from __future__ import annotations
 
 import contextlib
-import errno
 import hashlib
 import logging
 import os
@@ -22,7 +21,6 @@ import shutil
 import sys
 import tempfile
 import threading
-import zipfile
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -34,6 +32,7 @@ from typing import Any, Final, Literal
 import msgspec
 import mujoco
 
+from urlab_client._mujoco import actuator_count, actuator_kind, check_copy, write_model
 from urlab_client.server.assets.bundled_robots import BUNDLED_PREFIX, bundled_models, bundled_root
 from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
@@ -48,7 +47,6 @@ __all__ = [
     "level_package",
     "mujoco_messages",
     "one_line",
-    "open_archive",
     "sanitized",
     "write_atomic",
 ]
@@ -404,7 +402,7 @@ class ContentRoot:
             candidates = self._candidates(path, trusted=trusted)
             file = next((candidate for candidate in candidates if candidate.is_file()), None)
         except (OSError, ValueError) as error:  # too long, a null byte, a loop of links
-            raise Refusal("import_failed", f"{path!r} is no usable path: {error}") from None
+            raise Refusal("import_failed", f"{path!r} is not a usable path: {error}") from None
         if file is not None:
             packaged = {location.resolve(): name for name, location in bundled.items()}
             return file, f"{BUNDLED_PREFIX}{packaged[file]}" if file in packaged else str(file)
@@ -505,15 +503,16 @@ def build_snapshot(file: Path, snapshot: Path) -> Compiled:
     with mujoco_messages() as messages:
         spec = mujoco.MjSpec.from_file(str(file))
         # Compiles the file itself, so that an error names the source's own line.
-        mujoco.MjModel.from_xml_path(str(file))
+        original = mujoco.MjModel.from_xml_path(str(file))
         prepared = _prepared(spec)
         kinds = {actuator.name: _actuator_kind(actuator) for actuator in prepared.actuators}
         _write_snapshot(prepared, snapshot, messages)
         model = mujoco.MjModel.from_xml_path(str(snapshot / "model.xml"))
+        check_copy(original, model)
     return Compiled(
         model_name="" if spec.modelname in DEFAULT_MODEL_NAMES else spec.modelname,
         joints=_names(model.njnt, model.joint),
-        actuators=_names(model.nactuator, model.actuator),
+        actuators=_names(actuator_count(model), model.actuator),
         actuator_types=kinds,
         sensors=_names(model.nsensor, model.sensor),
         cameras=_names(model.ncam, model.camera),
@@ -618,31 +617,14 @@ def _warn_if_stale(known: Blueprint, source: str, text: bytes) -> None:
 
 def _write_snapshot(spec: mujoco.MjSpec, folder: Path, messages: list[str]) -> None:
     """Write a spec and every file it needs to `folder`, as `model.xml` and what is beside it."""
-    spec.compiler.savecompiled = False  # as authored: compiled values are rounded to six digits
-    archive = folder.with_name("model.mjz")
     before = len(messages)
     try:
-        spec.encode(str(archive))
+        write_model(spec, folder)
     except mujoco.FatalError:
         # A model made of attached parts is written only once compilation has assembled its keyframes.
         del messages[before:]
         spec.compile()
-        spec.encode(str(archive))
-    with open_archive(archive) as content:
-        content.extractall(folder)
-    archive.unlink()
-
-
-def open_archive(archive: Path) -> zipfile.ZipFile:
-    """Open an archive that MuJoCo has written; it does not notice when it cannot write all of it.
-
-    Raises:
-        OSError: It is incomplete.
-    """
-    try:
-        return zipfile.ZipFile(archive)
-    except zipfile.BadZipFile:
-        raise OSError(errno.ENOSPC, "MuJoCo could not write all of it; is the disk full?", str(archive)) from None
+        write_model(spec, folder)
 
 
 def _digest(folder: Path) -> str:
@@ -682,7 +664,7 @@ def _constant(value: Any) -> str:
 
 
 def _actuator_kind(actuator: Any) -> str:
-    kind = _constant(actuator.type).lower()
+    kind = actuator_kind(actuator)
     return "motor" if kind == "general" else kind
 
 
@@ -699,7 +681,7 @@ def _naming(spec: mujoco.MjSpec) -> list[tuple[Sequence[Any], Callable[[Any], st
         (spec.sites, lambda _: "Site"),
         (spec.cameras, lambda _: "Camera"),
         (spec.lights, lambda _: "Light"),
-        (spec.actuators, lambda actuator: f"{_constant(actuator.type).capitalize()}Actuator"),
+        (spec.actuators, lambda actuator: f"{actuator_kind(actuator).capitalize()}Actuator"),
         (
             spec.sensors,
             lambda sensor: f"{_SENSOR_TAGS.get(_constant(sensor.type), _constant(sensor.type).capitalize())}Sensor",

@@ -148,7 +148,7 @@ def build_confined(file: Path, snapshot: Path, roots: tuple[Path, ...], limits: 
 def _serve() -> None:
     """Take orders from standard input until it ends."""
     answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what libraries print is no answer
+    os.dup2(2, 1)  # what libraries print is not an answer
     for signum in (signal.SIGINT, signal.SIGTERM):
         signal.signal(signum, signal.SIG_IGN)  # they are for the server, which ends this process
     for line in sys.stdin.buffer:

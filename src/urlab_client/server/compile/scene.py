@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import re
-import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property, lru_cache
@@ -20,11 +19,19 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client._mujoco import (
+    control_counts,
+    control_starts,
+    export_model,
+    force_counts,
+    force_starts,
+    merge_assets,
+)
 from urlab_client.protocol.base import Vec3
 from urlab_client.protocol.controller_text import CUSTOM_TEXT, ControllerText
 from urlab_client.protocol.rotation import rotate, wxyz
 from urlab_client.server.assets.actors import Actor, Mesh
-from urlab_client.server.assets.content import Blueprint, mujoco_messages, one_line, open_archive
+from urlab_client.server.assets.content import Blueprint, mujoco_messages, one_line
 from urlab_client.server.assets.decomposition import convex_parts
 
 __all__ = [
@@ -198,12 +205,8 @@ class CompiledScene:
 
     @cached_property
     def _export(self) -> tuple[str, dict[str, bytes]]:
-        with tempfile.TemporaryDirectory() as folder, mujoco_messages():
-            archive = Path(folder) / "model.mjz"
-            self.spec.encode(str(archive))
-            with open_archive(archive) as content:
-                files = {name: content.read(name) for name in content.namelist() if not name.endswith("/")}
-        xml = files.pop("model.xml").decode()
+        with mujoco_messages():
+            xml, files = export_model(self.spec)
         names: dict[str, str] = {}
         for path in sorted(files):
             names[path] = _unique(path.rpartition("/")[2], set(names.values()))
@@ -333,7 +336,7 @@ def _compose(
             if converted is not None:
                 bodies.append(converted)
     _restore_world_references(spec, {f"{actor.prefix}world" for actor, _ in articulations})
-    spec.dedup_assets()  # instances of one robot share its meshes and textures
+    merge_assets(spec, children)
     return spec, bodies
 
 
@@ -633,7 +636,7 @@ def _index(
     sensors, sensor_names = find(objects.mjOBJ_SENSOR, blueprint.sensors)
     cameras, camera_names = find(objects.mjOBJ_CAMERA, blueprint.cameras)
     positions, velocities = _joint_widths(model, joints)
-    controls = model.actuator_ctrlnum[actuators]
+    controls = control_counts(model)[actuators]
     return ArticulationIndex(
         key=actor.name,
         prefix=actor.prefix,
@@ -650,9 +653,9 @@ def _index(
         sensor_names=sensor_names,
         qpos_adr=_spans(model.jnt_qposadr[joints], positions),
         qvel_adr=_spans(model.jnt_dofadr[joints], velocities),
-        ctrl_adr=_spans(model.actuator_ctrladr[actuators], controls),
+        ctrl_adr=_spans(control_starts(model)[actuators], controls),
         act_adr=np.repeat(model.actuator_actadr[actuators], controls).astype(np.int32),
-        force_adr=_spans(model.actuator_outadr[actuators], model.actuator_outnum[actuators]),
+        force_adr=_spans(force_starts(model)[actuators], force_counts(model)[actuators]),
         actuator_types=MappingProxyType({name: blueprint.actuator_types[name] for name in actuator_names}),
         cameras=tuple(
             _camera(model, int(index), name, camera_size) for index, name in zip(cameras, camera_names, strict=True)

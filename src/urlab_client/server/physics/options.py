@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from msgspec import Struct
 
+from urlab_client._mujoco import set_threads, thread_limit
 from urlab_client.protocol.base import Vec3
 from urlab_client.protocol.types import SimOptions
 from urlab_client.server.physics.controllers import float32
@@ -150,9 +151,9 @@ class OptionOverrides:
         return self._in_force(model)
 
     def _set_threads(self, data: mujoco.MjData, threads: int) -> None:
-        threads = max(0, min(threads, _cores()))
+        threads = max(0, min(threads, thread_limit(_cores())))
         if threads != self._threads:
-            mujoco.mju_threadpool(data, threads)
+            set_threads(data, threads)
             self._threads = threads
 
     def _in_force(self, model: mujoco.MjModel) -> OptionsInForce:
@@ -160,7 +161,7 @@ class OptionOverrides:
         return OptionsInForce(
             timestep=opt.timestep,
             num_worker_threads=self._threads,
-            max_worker_threads=_cores(),
+            max_worker_threads=thread_limit(_cores()),
             gravity=_vec3(opt.gravity),
             wind=_vec3(opt.wind),
             magnetic=_vec3(opt.magnetic),

@@ -106,7 +106,7 @@ class RequestReader:
             if not issubclass(struct, op.request):
                 raise TypeError(f"{struct.__name__} does not derive from {op.request.__name__}")
             self._loose[op.name] = _LooseOp(op, struct)
-            if not _holds_anything(inspect.type_info(struct)):
+            if not _holds_anything(_type_info(struct)):
                 exact = cast("type[Request[Any]]", _strict_struct(struct))
                 self._exact[exact] = op
                 strict.append(exact)
@@ -115,7 +115,7 @@ class RequestReader:
                 Union[tuple(strict)],  # noqa: UP007 - a union of a run-time list
                 dec_hook=_strict_array,
             )
-        self._collides = {kind: _collision_test(inspect.type_info(kind)) for kind in self._exact}
+        self._collides = {kind: _collision_test(_type_info(kind)) for kind in self._exact}
 
     def read(self, frame: bytes) -> Incoming:
         """Read one frame.
@@ -313,6 +313,10 @@ def _bad_request(why: str) -> Refusal:
 
 
 # The exact way: structs that refuse whatever the field-by-field way would have to interpret.
+
+
+# What a server's start takes longest for, and the same for each.
+_type_info = cache(inspect.type_info)
 
 
 def _strict_array(kind: type, value: object) -> np.ndarray[Any, np.dtype[np.float64]]:
