@@ -1,7 +1,7 @@
 """What differs between the MuJoCo releases that this package runs on: 3.8 and later. Nothing else asks for that.
 
 Each difference is found out where it shows, by asking MuJoCo for what it has; nothing compares version numbers. What an
-older release lacks is done in another way where there is one, and said where there is none.
+older release lacks is done in another way where there is one; otherwise the error says so.
 
 The client's import of this module must not import MuJoCo: that takes longer than the rest of the client.
 """

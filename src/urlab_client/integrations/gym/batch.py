@@ -170,7 +170,7 @@ class URLabBatchEnv(Vectorized):
         found = [full for full in self._keyframes if full in {name, *(f"{key}_{name}" for key in self.mapping.keys)}]
         if len(found) != 1:
             raise UnknownKeyframe(
-                "unknown_keyframe", f"{name!r} is none of, or several of, {', '.join(self._keyframes) or 'none'}"
+                "unknown_keyframe", f"{name!r} does not name exactly one of {', '.join(self._keyframes) or 'none'}"
             )
         return self._keyframes[found[0]]
 
