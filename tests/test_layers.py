@@ -58,7 +58,20 @@ ALLOWED: dict[str, frozenset[str]] = {
     "cluster": frozenset({"integrations", "protocol", "sync"}),
     "web": frozenset({"aio", "protocol"}),
     "cli": frozenset(
-        {"", "_installation", "_mujoco", "aio", "enums", "integrations", "keys", "protocol", "server", "sync", "web"}
+        {
+            "",
+            "_installation",
+            "_mujoco",
+            "_windows",
+            "aio",
+            "enums",
+            "integrations",
+            "keys",
+            "protocol",
+            "server",
+            "sync",
+            "web",
+        }
     ),
     "__main__": frozenset({"cli"}),
 }

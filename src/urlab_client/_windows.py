@@ -1,20 +1,28 @@
-"""Windows' named events and locks, with which shared memory saves itself from polling.
+"""What has to be asked of Windows itself: named events and locks, with which shared memory saves itself from polling,
+and input that does not hold up the rest of the process.
 
-Only what clients and servers need, and nothing on other systems. Everything works without the events, only slower.
+Only what clients and servers need. Other systems have no such events and locks: everything works without, only slower.
 """
 
 from __future__ import annotations
 
 import ctypes
+import os
 import sys
+import time
 from typing import Any
 
-__all__ = ["NamedEvent", "NamedLock"]
+if sys.platform == "win32":
+    import msvcrt
+
+__all__ = ["NamedEvent", "NamedLock", "read_aside"]
 
 _SYNCHRONIZE = 0x00100000
 _EVENT_MODIFY_STATE = 0x0002
 _ALREADY_EXISTS = 183
 _SIGNALLED = 0
+_PIPE = 3
+_LOOK_S = 0.05
 
 
 def _kernel() -> Any:
@@ -24,6 +32,8 @@ def _kernel() -> Any:
     kernel.OpenEventW.restype = kernel.CreateEventW.restype = kernel.CreateMutexW.restype = ctypes.c_void_p
     for function in (kernel.SetEvent, kernel.CloseHandle):
         function.argtypes = [ctypes.c_void_p]
+    kernel.GetFileType.argtypes = [ctypes.c_void_p]
+    kernel.PeekNamedPipe.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint32, *[ctypes.c_void_p] * 3]
     kernel.WaitForSingleObject.argtypes = [ctypes.c_void_p, ctypes.c_uint32]
     return kernel
 
@@ -86,3 +96,20 @@ class NamedLock:
         if self._handle:
             self._kernel.CloseHandle(self._handle)
             self._handle = None
+
+
+def read_aside(descriptor: int, size: int) -> bytes:
+    """`os.read` in a thread beside others that load libraries.
+
+    Windows locks a pipe while somebody waits to read from it, and every C runtime that is loaded asks what standard
+    input is: importing NumPy would wait until input comes.
+    """
+    if sys.platform == "win32":
+        kernel, handle = _kernel(), msvcrt.get_osfhandle(descriptor)
+        waiting = ctypes.c_uint32()
+        while kernel.GetFileType(handle) == _PIPE and not waiting.value:
+            if not kernel.PeekNamedPipe(handle, None, 0, None, ctypes.byref(waiting), None):
+                return b""  # the other end is closed
+            if not waiting.value:
+                time.sleep(_LOOK_S)
+    return os.read(descriptor, size)
