@@ -1,8 +1,12 @@
 """What holds for every test."""
 
+import importlib.metadata
 import importlib.util
 import os
+import sys
+import tomllib
 from collections.abc import Generator
+from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -32,9 +36,54 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> Generator[None, int,
     return 0 if config.option.capture == "no" or not any(map(os.path.isdir, config.args)) else workers + 1
 
 
+MUJOCO = importlib.metadata.version("mujoco")
+
+
+def release(version: str) -> tuple[int, ...]:
+    """Return a version's first two numbers."""
+    return tuple(int(part) for part in version.split(".")[:2])
+
+
+def on_wine() -> bool:
+    """Whether this Windows is Wine."""
+    if sys.platform != "win32":
+        return False
+    import ctypes
+
+    return hasattr(ctypes.WinDLL("ntdll"), "wine_get_version")
+
+
+def impossible_here() -> dict[str, str]:
+    """Return the tests that this system cannot run, and why: `not_on_windows.toml` is the list."""
+    if sys.platform != "win32":
+        return {}
+    listed = tomllib.loads((Path(__file__).parent / "not_on_windows.toml").read_text("utf-8"))
+    groups = [*listed["windows"], *(listed["wine"] if on_wine() else [])]
+    return {test: group["why"] for group in groups for test in group["tests"]}
+
+
+IMPOSSIBLE = impossible_here()
+
+
+def impossible(item: pytest.Item) -> bool:
+    """Whether the list names a test, its file or its folder."""
+    name = item.nodeid.partition("[")[0]
+    return any(name == test or name.startswith((f"{test}::", f"{test}/")) or item.nodeid == test for test in IMPOSSIBLE)
+
+
+def too_new(item: pytest.Item) -> bool:
+    """Whether a test needs a newer MuJoCo than is installed."""
+    marker = item.get_closest_marker("mujoco")
+    return marker is not None and release(MUJOCO) < release(marker.args[0])
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out what needs an extra that is not installed. CI has steps for those tests."""
-    left_out = [item for item in items if any(item.get_closest_marker(marker) for marker in MISSING)]
+    """Leave out what cannot run here: for want of an extra, of a newer MuJoCo, or of something that Windows lacks."""
+    left_out = [
+        item
+        for item in items
+        if any(item.get_closest_marker(marker) for marker in MISSING) or too_new(item) or impossible(item)
+    ]
     if left_out:
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if item not in left_out]
@@ -45,4 +94,6 @@ def pytest_report_header(config: pytest.Config) -> list[str]:
     return [
         *([f"tests are left out by -m {config.option.markexpr!r}"] if config.option.markexpr else []),
         *(f"tests marked `{marker}` need: pip install -e '.[{extras}]'" for marker, extras in MISSING.items()),
+        f"tests marked `mujoco` need the release that they name, or a later one; this is {MUJOCO}",
+        *([f"{len(IMPOSSIBLE)} entries of tests/not_on_windows.toml are left out"] if IMPOSSIBLE else []),
     ]

@@ -4,14 +4,16 @@ A block may carry a directive, an HTML comment on the line above it, which reade
 
     <!-- test -->                        python block: a test file, run by pytest
     <!-- needs: EXTRA -->                python block: run where the extra is installed, apart from the others
-    <!-- as is: REASON -->               text block that is no output: why it does not run
+    <!-- as is: REASON -->               text block that is not an output: why it does not run
 
 and on `docs/adding-an-op.md`, for `test_docs_adding_an_op.py`:
 
     <!-- append: FILE -->                write it at the end of FILE
     <!-- insert: FILE before: LINE -->   write it above the only line of FILE that reads LINE
+    <!-- insert: FILE after: LINE -->    write it below that line
     <!-- shows: FILE -->                 stands in FILE afterwards
     <!-- use -->                         runs afterwards
+    <!-- tests -->                       tests that pass afterwards
 """
 
 from __future__ import annotations

@@ -192,7 +192,7 @@ def test_a_mark_that_cannot_work_says_why(pytester: pytest.Pytester) -> None:
         [
             "*@pytest.mark.urlab does not start: no_such_robot is neither a file nor a bundled model*",
             "*@pytest.mark.urlab does not start: *unexpected keyword argument 'colour'",
-            "*@pytest.mark.urlab does not start: step_port is a number from 0 to 65535, not -1",
+            "*@pytest.mark.urlab does not start: step_port must be a number from 0 to 65535, not -1",
         ]
     )
 
@@ -211,6 +211,26 @@ def test_anyio_runs_the_async_client(pytester: pytest.Pytester) -> None:
         """
     run(pytester, text).assert_outcomes(passed=1)
     pytester.runpytest_inprocess(*PLUGINS, "-p", "no:asyncio").assert_outcomes(passed=1)
+
+
+@pytest.mark.parametrize("scope", ["function", "module"])
+def test_in_its_auto_mode_pytest_asyncio_runs_what_is_marked_with_anyio(pytester: pytest.Pytester, scope: str) -> None:
+    text = """
+        import pytest
+
+        @pytest.fixture
+        def anyio_backend():
+            return "asyncio"
+
+        @pytest.mark.anyio
+        async def test_marked(urlab_aio_client):
+            await urlab_aio_client.runtime.forward()
+
+        async def test_not_marked(urlab_aio_client):
+            await urlab_aio_client.runtime.forward()
+        """
+    result = run(pytester, text, "-o", "asyncio_mode=auto", "-o", f"asyncio_default_test_loop_scope={scope}")
+    result.assert_outcomes(passed=2)
 
 
 def test_without_a_runner_the_async_fixture_says_what_is_missing(pytester: pytest.Pytester) -> None:

@@ -219,6 +219,7 @@ def workshop(workspace: Workspace) -> Path:
     )
 
 
+@pytest.mark.mujoco("3.16")
 def test_a_snapshot_needs_nothing_of_its_source(workspace: Workspace, workshop: Path) -> None:
     original = mujoco.MjModel.from_xml_path(str(workshop))
     blueprint, _ = workspace.content.import_xml(str(workshop))
@@ -234,6 +235,7 @@ def test_a_snapshot_needs_nothing_of_its_source(workspace: Workspace, workshop: 
     assert found.model_name == "robot"
 
 
+@pytest.mark.mujoco("3.16")
 def test_later_edits_of_the_source_change_nothing_until_forced(
     workspace: Workspace, workshop: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -274,6 +276,7 @@ def test_only_the_last_two_snapshots_are_kept(workspace: Workspace) -> None:
     assert blueprint.folder in folders
 
 
+@pytest.mark.mujoco("3.16")
 def test_importing_the_same_content_makes_the_same_snapshot(workspace: Workspace, workshop: Path) -> None:
     first, _ = workspace.content.import_xml(str(workshop))
     second, _ = workspace.content.import_xml(str(workshop), force_reimport=True)
@@ -473,6 +476,7 @@ CHILD = mjcf(
 )
 
 
+@pytest.mark.mujoco("3.10")
 def test_importing_prints_nothing_and_logs_once(
     workspace: Workspace,
     capfd: pytest.CaptureFixture[str],
@@ -491,6 +495,7 @@ def test_importing_prints_nothing_and_logs_once(
     assert "Attach conflict" in caplog.text
 
 
+@pytest.mark.mujoco("3.16")
 def test_a_deprecated_attribute_is_logged_and_not_raised(
     workspace: Workspace, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -502,6 +507,7 @@ def test_a_deprecated_attribute_is_logged_and_not_raised(
     assert compiled(blueprint).nu == 6
 
 
+@pytest.mark.mujoco("3.10")
 def test_warnings_that_other_threads_cause_reach_the_handler_that_was_there() -> None:
     theirs: list[str] = []
     before = mujoco.get_mju_user_warning()

@@ -389,6 +389,7 @@ def test_ids_are_global_whatever_the_topic_says(play: Play, models: Path) -> Non
             break
 
 
+@pytest.mark.mujoco("3.11")
 def test_an_actuator_of_several_inputs_takes_its_first_by_id(play: Play, tmp_path: Path) -> None:
     path = tmp_path / "multi.xml"
     path.write_text(MULTI)
@@ -494,6 +495,7 @@ def test_info_describes_every_articulation_in_one_frame_each(play: Play) -> None
     assert (limited["robot"], limited["ids"], limited["mins"], limited["maxs"]) == ("bot_1", [1], [-100.0], [100.0])
 
 
+@pytest.mark.mujoco("3.11")
 def test_info_tells_the_range_of_the_first_input_behind_an_actuator_of_several(play: Play, tmp_path: Path) -> None:
     path = tmp_path / "multi.xml"
     path.write_text(MULTI.replace('name="last"', 'name="last" ctrlrange="-2 3" ctrllimited="true"'))

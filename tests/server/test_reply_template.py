@@ -22,6 +22,8 @@ from urlab_client.server.physics.engine import Engine
 from urlab_client.server.physics.observe import Observer, sim_clock
 from urlab_client.server.physics.reply_template import StepReplies
 
+pytestmark = pytest.mark.mujoco("3.11")  # its robot has an actuator of several inputs
+
 CRATE = Actor(
     name="Crate",
     label="Crate",

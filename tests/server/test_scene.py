@@ -60,7 +60,7 @@ def test_everything_an_articulation_owns_has_its_prefix(two_bots: CompiledScene)
     kinds = [
         (model.njnt, model.joint),
         (model.ngeom, model.geom),
-        (model.nactuator, model.actuator),
+        (model.nu, model.actuator),
         (model.nsensor, model.sensor),
         (model.nkey, model.key),
         (model.ncam, model.camera),
@@ -235,6 +235,7 @@ KEYED = mjcf(
 )
 
 
+@pytest.mark.mujoco("3.16")
 def test_keyframes_beside_free_objects(scene_of: SceneOf) -> None:
     scene = scene_of(("ball", BALL), ("keyed", KEYED), ("ball", BALL), ("keyed", KEYED))
     model = scene.model
@@ -266,6 +267,7 @@ def test_keyframes_beside_free_objects(scene_of: SceneOf) -> None:
 ROBOTS = ["humanoid.xml", "ant.xml", "walker2d_v5.xml", "pusher_v5.xml"]
 
 
+@pytest.mark.mujoco("3.16")
 @pytest.mark.parametrize("file", ROBOTS)
 def test_real_robots_twice(tmp_path: Path, file: str) -> None:
     world = EditorWorld(ContentRoot(tmp_path, model_roots=[GYMNASIUM]))
@@ -298,6 +300,7 @@ def test_real_robots_twice(tmp_path: Path, file: str) -> None:
     np.testing.assert_array_equal(np.sort(positions), np.arange(model.nq))
 
 
+@pytest.mark.mujoco("3.16")
 @pytest.mark.parametrize("file", ROBOTS)
 def test_a_robot_in_a_scene_moves_as_it_does_alone(tmp_path: Path, file: str) -> None:
     world = EditorWorld(ContentRoot(tmp_path, model_roots=[GYMNASIUM]))
@@ -342,6 +345,7 @@ def test_one_prefix_may_begin_with_another(scene_of: SceneOf) -> None:
     assert [index.sensor_names for index in scene.articulations] == [("1_s",), (), ("1_s",)]
 
 
+@pytest.mark.mujoco("3.16")
 def test_actuators_with_several_inputs_and_outputs(scene_of: SceneOf) -> None:
     text = mjcf(
         '<body name="b"><joint name="turn" type="ball"/><geom size="0.1"/>'
@@ -394,6 +398,7 @@ def meshy(workspace: Workspace, name: str, size: float) -> str:
     return workspace.world.import_xml(f"{name}/{name}.xml")[0].class_path
 
 
+@pytest.mark.mujoco("3.17")
 def test_instances_share_their_meshes(workspace: Workspace) -> None:
     path = meshy(workspace, "part", 0.3)
     workspace.world.spawn_grid(path, "g", 3, 2)
@@ -605,6 +610,7 @@ def test_a_mesh_file_that_vanished_fails_the_compilation(workspace: Workspace) -
         level(workspace, prop("rock", mesh={"shape": "file", "file": "gone.obj"}, quick_convert={}))
 
 
+@pytest.mark.mujoco("3.16")
 def test_a_model_that_needs_its_own_integrator_says_how_to_get_it(scene_of: SceneOf, workspace: Workspace) -> None:
     cloth = mjcf(
         '<flexcomp name="cloth" type="grid" count="3 3 1" spacing="0.1 0.1 0.1" mass="1" dim="2">'

@@ -16,7 +16,8 @@ from worlds import BALL_BODY, BOT, Workspace, mjcf, write_obj
 
 from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.compile.scene import compile_scene
-from urlab_client.server.editor.world import ActorKind, ActorRow, EditorWorld
+from urlab_client.server.editor.world import Actor, ActorKind, EditorWorld
+from urlab_client.server.handlers.scene import _row as snapshot_row
 from urlab_client.server.refusal import Refusal
 
 BALL = mjcf(BALL_BODY, model="ball")
@@ -53,11 +54,11 @@ def refusal(call: Callable[..., object], *args: Any, **kwargs: Any) -> Refusal:
     return refused.value
 
 
-def names(rows: list[ActorRow]) -> list[str]:
+def names(rows: list[Actor]) -> list[str]:
     return [row.name for row in rows]
 
 
-def row(world: EditorWorld, key: str) -> ActorRow:
+def row(world: EditorWorld, key: str) -> Actor:
     return next(row for row in world.list_actors() if key in (row.name, row.actor_id))
 
 
@@ -81,7 +82,7 @@ def test_blueprints_are_listed_by_name(bot: str, ball: str, world: EditorWorld) 
     "path", ["/Game/MuJoCoImports/bot", "/Game/MuJoCoImports/bot.bot_C", "/game/mujocoimports/BOT.bot_c"]
 )
 def test_a_blueprint_is_named_by_package_or_class_path(bot: str, world: EditorWorld, path: str) -> None:
-    assert world.spawn_actor(path, "a").blueprint_class_path == bot
+    assert world.spawn_actor(path, "a").actor.class_path == bot
 
 
 @pytest.mark.parametrize("path", ["bot", "/Game/MuJoCoImports/bot.bot", "/Game/MuJoCoImports/robot", "/Script/Pawn_C"])
@@ -338,8 +339,8 @@ def load(workspace: Workspace, level: object) -> EditorWorld:
 @pytest.mark.parametrize(
     ("level", "text"),
     [
-        ("{", "is no level"),
-        ("[]", "is no level"),
+        ("{", "is not a level"),
+        ("[]", "is not a level"),
         ('{"format": "other"}', 'it lacks "format": "urlab-level"'),
         (HEAD | {"version": 2, "actors": []}, "version 2"),
         (HEAD, "actors"),
@@ -384,7 +385,7 @@ def test_a_level_brings_meshes_which_no_op_can(workspace: Workspace) -> None:
 
     rows = world.list_actors()
     assert [item.class_name for item in rows] == ["StaticMeshActor", "StaticMeshActor"]
-    assert all(item.is_static_mesh_actor and not item.is_articulation and not item.is_light for item in rows)
+    assert {item.kind for item in rows} == {ActorKind.STATIC_MESH}
     assert rows[1].tags == ("URLab.ActorId=rock-1",)
     box = world.get_actor_bounds("crate", components_only=True)
     assert box.center == pytest.approx((1, 2, 3))
@@ -421,13 +422,13 @@ def test_any_level_comes_back_as_it_was(
         world.spawn_actor(bot, f"bot_{actor_id}", location=location, rotation_euler=euler)
     for kind, actor_id, location in lights:
         world.spawn_light(kind, actor_id, location=location)
-    before = world.snapshot()
+    before = [snapshot_row(actor, compiled=False) for actor in world.snapshot()]
     world.save_level()
 
     fresh = EditorWorld(ContentRoot(workspace.saved))
     fresh.load_level("any")
 
-    assert fresh.snapshot() == before
+    assert [snapshot_row(actor, compiled=False) for actor in fresh.snapshot()] == before
 
 
 # Spawning
@@ -437,19 +438,19 @@ def test_the_model_name_names_actors(workspace: Workspace, bot: str, world: Edit
     nameless = workspace.blueprint("my-file", mjcf(BALL_BODY))
     spaced = workspace.blueprint("spaced", mjcf(BALL_BODY, model="my robot!"))
 
-    placed = [world.spawn_actor(path).actor_name for path in (bot, bot, nameless, spaced, bot)]
+    placed = [world.spawn_actor(path).actor.name for path in (bot, bot, nameless, spaced, bot)]
 
     assert placed == ["bot", "bot_1", "my_file", "my_robot_", "bot_2"]
     world.destroy_actor("bot_1")
-    assert world.spawn_actor(bot).actor_name == "bot_1"
+    assert world.spawn_actor(bot).actor.name == "bot_1"
 
 
 def test_actors_can_be_named_as_the_plugin_does(tmp_path: Path) -> None:
     workspace = Workspace(tmp_path, actor_names="plugin")
     bot = workspace.blueprint("robot", BOT)
 
-    assert [workspace.world.spawn_actor(bot).actor_name for _ in range(3)] == ["robot_C_0", "robot_C_1", "robot_C_2"]
-    assert workspace.world.duplicate_actor("robot_C_0", "d").actor_name == "robot_C_3"
+    assert [workspace.world.spawn_actor(bot).actor.name for _ in range(3)] == ["robot_C_0", "robot_C_1", "robot_C_2"]
+    assert workspace.world.duplicate_actor("robot_C_0", "d").actor.name == "robot_C_3"
 
 
 def test_names_whose_compiled_names_would_repeat_are_passed_over(workspace: Workspace, world: EditorWorld) -> None:
@@ -457,7 +458,7 @@ def test_names_whose_compiled_names_would_repeat_are_passed_over(workspace: Work
         "tricky", mjcf('<body name="base"><geom size="0.1"/><body name="1_base"><geom size="0.1"/></body></body>')
     )
 
-    placed = [world.spawn_actor(tricky).actor_name for _ in range(3)]
+    placed = [world.spawn_actor(tricky).actor.name for _ in range(3)]
 
     assert placed == ["tricky", "tricky_2", "tricky_3"]  # tricky_1 + base would be tricky + 1_base
     assert compile_scene(world.freeze()).model.nbody == 7
@@ -468,11 +469,11 @@ def test_an_id_is_placed_once_and_moved_from_then_on(bot: str, world: EditorWorl
     second = world.spawn_actor(bot, "a", location=(4, 5, 6))
 
     assert (first.was_existing, second.was_existing) == (False, True)
-    assert second.actor_name == first.actor_name
-    assert second.location == (4, 5, 6)
+    assert second.actor.name == first.actor.name
+    assert second.actor.location == (4, 5, 6)
     assert [(item.actor_id, item.location) for item in world.list_actors()] == [("a", (4, 5, 6))]
-    assert row(world, "a").rotation_quat == (0, 0, 0, 1)
-    assert first.actor_path == "/Game/Levels/lab.lab:PersistentLevel.bot"
+    assert row(world, "a").rotation == (0, 0, 0, 1)
+    assert world.actor_path(first.actor) == "/Game/Levels/lab.lab:PersistentLevel.bot"
 
 
 def test_an_id_of_another_class_is_refused(bot: str, ball: str, world: EditorWorld) -> None:
@@ -482,7 +483,7 @@ def test_an_id_of_another_class_is_refused(bot: str, ball: str, world: EditorWor
     assert refusal(world.spawn_actor, ball, "a").code == "spawn_failed"
     assert refusal(world.spawn_actor, bot, "LAMP").code == "spawn_failed"  # tags know no letter case
     assert not world.spawn_actor(bot, "A").was_existing  # ids of articulations do
-    assert not world.spawn_actor(ball, "bot").was_existing  # an object name is no id
+    assert not world.spawn_actor(ball, "bot").was_existing  # an object name is not an id
 
 
 def test_rotations_are_understood_in_mujocos_frame(bot: str, world: EditorWorld) -> None:
@@ -491,10 +492,10 @@ def test_rotations_are_understood_in_mujocos_frame(bot: str, world: EditorWorld)
     rolled = world.spawn_actor(bot, "rolled", rotation_euler=(90, 0, 0))
     both = world.spawn_actor(bot, "both", rotation_quat=(0, 0, 0, 1), rotation_euler=(90, 0, 0))
 
-    assert same_rotation(row(world, "quat").rotation_quat, row(world, "euler").rotation_quat)
-    assert same_rotation(row(world, "rolled").rotation_quat, (-HALF, 0, 0, HALF))
+    assert same_rotation(row(world, "quat").rotation, row(world, "euler").rotation)
+    assert same_rotation(row(world, "rolled").rotation, (-HALF, 0, 0, HALF))
     assert same_rotation(rolled.rotation_quat, (-HALF, 0, 0, HALF))
-    assert both.rotation_quat == row(world, "both").rotation_quat == (0, 0, 0, 1)
+    assert both.rotation_quat == row(world, "both").rotation == (0, 0, 0, 1)
 
 
 @pytest.mark.parametrize(
@@ -529,8 +530,8 @@ def test_what_is_missing_is_named(bot: str, world: EditorWorld) -> None:
 def test_a_grid_is_placed_x_first(ball: str, world: EditorWorld) -> None:
     placed = world.spawn_grid(ball, "g", 2, 3, spacing=(1, 2, 9), origin=(10, 20, 30))
 
-    assert [cell.actor_id for cell in placed] == ["g_0_0", "g_1_0", "g_0_1", "g_1_1", "g_0_2", "g_1_2"]
-    assert placed[3].location == (11, 22, 30)
+    assert [cell.actor.actor_id for cell in placed] == ["g_0_0", "g_1_0", "g_0_1", "g_1_1", "g_0_2", "g_1_2"]
+    assert placed[3].actor.location == (11, 22, 30)
     assert names(world.list_actors()) == ["ball", "ball_1", "ball_2", "ball_3", "ball_4", "ball_5"]
     again = world.spawn_grid(ball, "g", 3, 1)
     assert [cell.was_existing for cell in again] == [True, True, False]
@@ -566,13 +567,14 @@ def test_lights_are_added_each_time(world: EditorWorld) -> None:
     first = world.spawn_light("SPOT", "lamp", location=(1, 2, 3), rotation_euler=(1, -30, 45), color=(0.1, 0.2, 0.3))
     second = world.spawn_light("spot", "lamp")
 
-    assert (first.kind, first.actor_name, second.actor_name) == ("spot", "SpotLight_0", "SpotLight_1")
-    assert first.color == pytest.approx((0.1, 0.2, 0.3))
-    assert first.color[0] == 0.10000000149011612  # single precision, as the plugin echoes it
-    assert first.rotation_euler == (1, -30, 45)
+    assert (first.name, second.name) == ("SpotLight_0", "SpotLight_1")
+    assert first.light is not None
+    assert first.light.kind == "spot"
+    assert first.light.color == pytest.approx((0.1, 0.2, 0.3))
+    assert first.light.color[0] == 0.10000000149011612  # single precision, as the plugin echoes it
     listed = world.list_actors()
     assert [item.label for item in listed] == ["SpotLight", "SpotLight2"]
-    assert all(item.is_light and item.tags == ("URLab.ActorId=lamp",) for item in listed)
+    assert all(item.kind is ActorKind.LIGHT and item.tags == ("URLab.ActorId=lamp",) for item in listed)
     assert refusal(world.spawn_light, "sun").code == "spawn_failed"
     assert refusal(world.spawn_light, "point", intensity=math.nan).code == "spawn_failed"
 
@@ -596,10 +598,10 @@ def test_a_transform_changes_the_parts_it_names(bot: str, world: EditorWorld) ->
 
     world.set_actor_transform("a", location=(4, 5, 6))
     assert row(world, "a").location == (4, 5, 6)
-    assert same_rotation(row(world, "a").rotation_quat, (0, 0, HALF, HALF))
+    assert same_rotation(row(world, "a").rotation, (0, 0, HALF, HALF))
     world.set_actor_transform("bot", rotation_quat=(0, 3, 0, 0))
     assert row(world, "a").location == (4, 5, 6)
-    assert row(world, "a").rotation_quat == (0, 1, 0, 0)
+    assert row(world, "a").rotation == (0, 1, 0, 0)
     assert world.set_actor_transform("a").name == "bot"
 
     code = "set_actor_transform_failed"
@@ -624,9 +626,9 @@ def test_a_copy_has_the_rotation_of_its_source_and_stands_beside_it(bot: str, wo
 
     copy = world.duplicate_actor("a", "b")
 
-    assert copy.location == (2, 2, 3)
-    assert same_rotation(row(world, "b").rotation_quat, (0, 0, HALF, HALF))
-    assert copy.blueprint_class_path == bot
+    assert copy.actor.location == (2, 2, 3)
+    assert same_rotation(row(world, "b").rotation, (0, 0, HALF, HALF))
+    assert copy.actor.class_path == bot
     assert world.duplicate_actor("a", "b", location=(9, 9, 9)).was_existing
     assert row(world, "b").location == (9, 9, 9)
     assert len(world.list_actors()) == 2
@@ -639,8 +641,8 @@ def test_lights_can_be_copied_and_managers_cannot(bot: str, world: EditorWorld) 
 
     copy = world.duplicate_actor("lamp", "lamp2")
 
-    assert row(world, "lamp2").is_light
-    assert copy.actor_name == "PointLight_1"
+    assert row(world, "lamp2").kind is ActorKind.LIGHT
+    assert copy.actor.name == "PointLight_1"
     assert refusal(world.duplicate_actor, "lamp", "a").code == "duplicate_failed"
     assert refusal(world.duplicate_actor, manager.name, "m").code == "duplicate_failed"
     assert refusal(world.duplicate_actor, "nobody", "n").code == "duplicate_failed"
@@ -695,8 +697,9 @@ def test_filters_narrow_down_together_and_know_no_letter_case(bot: str, ball: st
 def test_play_shows_the_level_as_it_was_at_its_start(bot: str, ball: str, world: EditorWorld) -> None:
     world.spawn_actor(bot, "a")
     editor = world.snapshot()
-    assert editor[0].names is not None
-    assert editor[0].names.joints == ("root", "j")
+    described = snapshot_row(editor[0], compiled=False).urlab
+    assert described is not None
+    assert described.joints == ["root", "j"]
     world.freeze()
     world.pie_running = True
     world.spawn_actor(ball, "b")
@@ -706,11 +709,12 @@ def test_play_shows_the_level_as_it_was_at_its_start(bot: str, ball: str, world:
 
     assert [item.class_name for item in play] == ["bot_C", "MjReplayManager"]
     assert play[0].location == (0, 0, 0)
-    assert play[0].names is not None
-    assert play[0].names.joints == ("bot_root", "bot_j")
-    assert play[0].names.actuators == ("bot_m",)
-    assert play[0].names.sensors == ("bot_s",)
-    assert play[0].names.cameras == ("cam",)
+    described = snapshot_row(play[0], compiled=True).urlab
+    assert described is not None
+    assert described.joints == ["bot_root", "bot_j"]
+    assert described.actuators == ["bot_m"]
+    assert described.sensors == ["bot_s"]
+    assert described.cameras == ["cam"]
     assert names(world.list_actors()) == ["bot", "ball"]
     rows, in_play = world.find_actors(class_filter="Pawn", in_pie=True)
     assert (names(rows), in_play) == (["bot"], True)

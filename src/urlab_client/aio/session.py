@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from urlab_client.aio.deadline import DEFAULT, Timeout, shared
+from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.transport.base import RequestTransport
 from urlab_client.protocol.base import Needs, Op, Reply, Request
 from urlab_client.protocol.codec import check_request, decode_reply, encode_request, op_of
@@ -46,6 +47,7 @@ class Session:
         self._transport = transport
         self._default_timeout = default_timeout
         self._json = json
+        self._loop: asyncio.AbstractEventLoop | None = None
         self._turn = asyncio.Lock()
         self._queued = 0
         self._aside: asyncio.Task[Reply] | None = None
@@ -71,7 +73,7 @@ class Session:
         op = op_of(request)
         if op.name not in _UNLISTED and not self.features.offers(op.name):
             raise UnknownOp("unknown_op", "this server does not offer it. Nothing was sent.", op=op.name)
-        loop = asyncio.get_running_loop()
+        loop = self._loop = running_loop(self._loop)
         now = loop.time()
         seconds = self._seconds(op) if timeout is DEFAULT else timeout
         deadline = None if seconds is None else now + seconds
@@ -179,7 +181,7 @@ class Session:
             raise URLabTimeoutError(
                 f"{op.name}: another call held {self._transport.endpoint} until the deadline. Nothing was sent.",
                 op=op.name,
-                hint="Calls of one client go one at a time; use a second client or a longer timeout.",
+                hint="A client sends one request at a time; use a second client or a longer timeout.",
             ) from None
         finally:
             self._queued -= 1

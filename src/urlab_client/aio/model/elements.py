@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
+from urlab_client._mujoco import control_counts, control_starts, force_counts
 from urlab_client.aio.model.articulation_state import MirroredArticulation
 from urlab_client.aio.model.layout import QPOS_WIDTH, QVEL_WIDTH
 from urlab_client.protocol.base import Floats
@@ -280,11 +281,11 @@ def _actuators(record: MirroredArticulation, model: mujoco.MjModel | None) -> li
     joint_of = {joint_id: name for name, joint_id in record.layout.joints.items()}
     actuators: list[Actuator] = []
     start = first_out = 0
+    controls, starts, forces = control_counts(model), control_starts(model), force_counts(model)
     for name, i in record.layout.actuators.items():
         kind = types.get(name)
         driven = int(model.actuator_trnid[i][0]) if model.actuator_trntype[i] in _JOINT_TRANSMISSIONS else -1
-        width = int(model.actuator_ctrlnum[i])
-        first = int(model.actuator_ctrladr[i])
+        width, first = int(controls[i]), int(starts[i])
         actuators.append(
             Actuator(
                 record,
@@ -301,7 +302,7 @@ def _actuators(record: MirroredArticulation, model: mujoco.MjModel | None) -> li
             )
         )
         start += width
-        first_out += int(model.actuator_outnum[i])
+        first_out += int(forces[i])
     return actuators
 
 

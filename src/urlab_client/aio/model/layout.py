@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client._mujoco import control_counts, control_starts, force_counts
 from urlab_client.aio.model.mirror import model_names
 from urlab_client.protocol.names import split_prefix
 
@@ -83,8 +84,9 @@ def _layout(
     joint_ids = np.fromiter(joints.values(), dtype=np.intp)
     kinds = model.jnt_type[joint_ids]
     actuator_ids = np.fromiter(actuators.values(), dtype=np.intp)
-    ctrl_adr = _ranges(model.actuator_ctrladr[actuator_ids], model.actuator_ctrlnum[actuator_ids])
-    act_adr = np.repeat(model.actuator_actadr[actuator_ids], model.actuator_ctrlnum[actuator_ids]).astype(np.intp)
+    counts = control_counts(model)[actuator_ids]
+    ctrl_adr = _ranges(control_starts(model)[actuator_ids], counts)
+    act_adr = np.repeat(model.actuator_actadr[actuator_ids], counts).astype(np.intp)
     act_from = np.flatnonzero(act_adr >= 0)
     root = min(bodies.values(), default=-1)
     free = -1
@@ -103,7 +105,7 @@ def _layout(
         ctrl_adr=ctrl_adr,
         act_from=act_from,
         act_adr=act_adr[act_from],
-        n_out=int(model.actuator_outnum[actuator_ids].sum()),
+        n_out=int(force_counts(model)[actuator_ids].sum()),
         root_body=root,
         free_joint=free,
     )

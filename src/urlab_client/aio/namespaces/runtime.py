@@ -145,9 +145,11 @@ class RuntimeNamespace(RuntimeOps):
     async def forward(self, *, timeout: Timeout = DEFAULT) -> ForwardOk:
         """Run `mj_forward` on the server and take over the state: kinematics and dynamics, no integration.
 
+        In puppet mode `client.data` stays as it is: there it is yours, and what the server has was pushed from it.
+
         Returns:
             The state; time and step counter are unchanged.
         """
         reply = await self._call(Forward(), timeout)
-        self._state.absorb(reply, "forward")
+        self._state.absorb(reply, "forward", into_mirror=self._state.mode is not StepMode.PUPPET)
         return reply

@@ -18,6 +18,7 @@ from typing import Any, cast
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
+from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.transport import connection_status
 from urlab_client.aio.transport import context as shared_context
 from urlab_client.aio.transport.base import TransportStats
@@ -196,12 +197,8 @@ class ZmqTransport:
     def _open(self) -> tuple[asyncio.AbstractEventLoop, zmq.Socket[bytes], Readiness]:
         if self._closed:
             raise ClientClosed(f"The client of {self._endpoint} is closed.", hint="Make a new client.")
-        loop = asyncio.get_running_loop()
+        loop = running_loop(self._loop)
         if self._socket is not None and self._replies is not None:
-            if loop is not self._loop:
-                raise URLabError(
-                    "This client belongs to another event loop.", hint="Make one client per loop, or use the façade."
-                )
             return loop, self._socket, self._replies
         context = shared_context.borrow()
         socket = context.socket(zmq.DEALER)
@@ -286,7 +283,7 @@ class ZmqTransport:
             URLabTimeoutError(
                 f"{entry.op.name}: no reply from {self._endpoint} within {_ms(seconds)}.{executed}",
                 op=entry.op.name,
-                hint="The connection stands, so the server is busy or blocked; allow more time with timeout=…",
+                hint="The connection is up, so the server is busy or blocked; allow more time with timeout=…",
             )
         )
         if self._loop is not None and self._silent_since is None:
@@ -408,14 +405,14 @@ class ZmqTransport:
         if entry.op.effect is Effect.READ:
             return ConnectionLost(text, op=name, hint="The op changes nothing: it can be sent again.")
         return OutcomeUnknown(
-            text, op=name, hint="Whether it was executed is unknown: client.resync() finds out, and goes on."
+            text, op=name, hint="Whether it was executed is unknown: client.resync() finds out and recovers."
         )
 
     def _clogged(self, op: Op) -> ServerUnreachable:
         return ServerUnreachable(
             f"{op.name}: {self._endpoint} has not taken the requests before this one. Nothing was sent.",
             op=op.name,
-            hint="The connection stands, but the server does not read from it: restart it.",
+            hint="The connection is up, but the server does not read from it: restart it.",
         )
 
     def _too_late(self, op: Op) -> URLabTimeoutError:

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
+from urlab_client._mujoco import control_counts
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.model.layout import FREE, ArticulationLayout
 from urlab_client.aio.model.mirror import model_names
@@ -289,8 +290,9 @@ def _layout(model: mujoco.MjModel | None, layout: ArticulationLayout) -> SceneLa
             qpos += [f"{name}.{part}" for part in _FREE_QPOS[parts]]
             qvel += [f"{name}.{part}" for part in _FREE_QVEL[parts]]
     ctrl: list[str] = []
+    counts = control_counts(model)
     for name, actuator in layout.actuators.items():
-        count = int(model.actuator_ctrlnum[actuator])
+        count = int(counts[actuator])
         ctrl += [name] if count == 1 else [f"{name}.{i}" for i in range(count)]
     return SceneLayout(qpos=qpos, qvel=qvel, ctrl=ctrl, act=list(ctrl))
 

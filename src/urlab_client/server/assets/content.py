@@ -13,7 +13,6 @@ For `World`, which knows what is placed where. Nothing here places, compiles sce
 from __future__ import annotations
 
 import contextlib
-import errno
 import hashlib
 import logging
 import os
@@ -22,7 +21,6 @@ import shutil
 import sys
 import tempfile
 import threading
-import zipfile
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -34,7 +32,9 @@ from typing import Any, Final, Literal
 import msgspec
 import mujoco
 
+from urlab_client._mujoco import actuator_count, actuator_kind, check_copy, write_model
 from urlab_client.server.assets.bundled_robots import BUNDLED_PREFIX, bundled_models, bundled_root
+from urlab_client.server.assets.option_ranges import options_problem
 from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.system.temporary_folder import sweep, working_in
@@ -48,7 +48,6 @@ __all__ = [
     "level_package",
     "mujoco_messages",
     "one_line",
-    "open_archive",
     "sanitized",
     "write_atomic",
 ]
@@ -153,6 +152,8 @@ class _Record(msgspec.Struct, frozen=True, kw_only=True):
     sensors: tuple[str, ...]
     cameras: tuple[str, ...]
     n_bytes: int = 0
+    n_data_bytes: int = 0
+    n_sensor_values: int = 0
 
 
 _RECORD: Final = msgspec.json.Decoder(_Record)
@@ -165,6 +166,10 @@ class Compiled(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         messages: MuJoCo's warnings.
         n_bytes: Size of the compiled model.
+        n_data_bytes: Memory of its simulation, without an arena of MuJoCo's own choice.
+        n_arena_bytes: Memory of its arena.
+        n_sensor_values: Numbers that its sensors give.
+        options_problem: What is wrong with its `<option>`, if anything.
         largest_image: Largest width or height of its cameras, pixels.
     """
 
@@ -176,6 +181,10 @@ class Compiled(msgspec.Struct, frozen=True, kw_only=True):
     cameras: tuple[str, ...]
     messages: tuple[str, ...]
     n_bytes: int
+    n_data_bytes: int
+    n_arena_bytes: int
+    n_sensor_values: int
+    options_problem: str
     largest_image: int
 
 
@@ -196,7 +205,9 @@ class Blueprint:
         actuator_types: Actuator name to MJCF element; `motor` for `<general>`.
         sensors: Sensor names in compiled order.
         cameras: Camera names in compiled order.
-        n_bytes: Memory of the compiled model; 0 where an older import did not note it.
+        n_bytes: Memory of the compiled model; this and what follows is 0 where an older import did not note it.
+        n_data_bytes: Memory of its simulation, without an arena of MuJoCo's own choice.
+        n_sensor_values: Numbers that its sensors give.
     """
 
     stem: str
@@ -212,6 +223,8 @@ class Blueprint:
     sensors: tuple[str, ...]
     cameras: tuple[str, ...]
     n_bytes: int = 0
+    n_data_bytes: int = 0
+    n_sensor_values: int = 0
 
     @property
     def short_name(self) -> str:
@@ -404,7 +417,7 @@ class ContentRoot:
             candidates = self._candidates(path, trusted=trusted)
             file = next((candidate for candidate in candidates if candidate.is_file()), None)
         except (OSError, ValueError) as error:  # too long, a null byte, a loop of links
-            raise Refusal("import_failed", f"{path!r} is no usable path: {error}") from None
+            raise Refusal("import_failed", f"{path!r} is not a usable path: {error}") from None
         if file is not None:
             packaged = {location.resolve(): name for name, location in bundled.items()}
             return file, f"{BUNDLED_PREFIX}{packaged[file]}" if file in packaged else str(file)
@@ -461,6 +474,8 @@ class ContentRoot:
             sensors=compiled.sensors,
             cameras=compiled.cameras,
             n_bytes=compiled.n_bytes,
+            n_data_bytes=compiled.n_data_bytes,
+            n_sensor_values=compiled.n_sensor_values,
         )
         try:
             return self._register(home, folder, record)
@@ -472,7 +487,7 @@ class ContentRoot:
     def _build(self, file: Path, snapshot: Path, *, trusted: bool) -> Compiled:
         if trusted or file.is_relative_to(bundled_root()):
             try:
-                return build_snapshot(file, snapshot)
+                return build_snapshot(file, snapshot, self.limits)[0]
             except (ValueError, mujoco.FatalError) as error:
                 raise Refusal("import_failed", f"MuJoCo rejects {file}: {one_line(error)}") from None
         from urlab_client.server.assets.sandbox import build_confined  # noqa: PLC0415 - it imports this module
@@ -492,12 +507,13 @@ class ContentRoot:
         return blueprint
 
 
-def build_snapshot(file: Path, snapshot: Path) -> Compiled:
-    """Compile an MJCF file and write what is kept of it.
+def build_snapshot(file: Path, snapshot: Path, limits: Limits) -> tuple[Compiled, mujoco.MjModel]:
+    """Compile an MJCF file, write what is kept of it, and return what was learnt and the model.
 
     Args:
         file: The file.
         snapshot: Folder to write, which must not exist.
+        limits: For the ranges of its options; nothing is refused here.
 
     Raises:
         ValueError, mujoco.FatalError: MuJoCo rejects it.
@@ -505,22 +521,29 @@ def build_snapshot(file: Path, snapshot: Path) -> Compiled:
     with mujoco_messages() as messages:
         spec = mujoco.MjSpec.from_file(str(file))
         # Compiles the file itself, so that an error names the source's own line.
-        mujoco.MjModel.from_xml_path(str(file))
+        original = mujoco.MjModel.from_xml_path(str(file))
         prepared = _prepared(spec)
         kinds = {actuator.name: _actuator_kind(actuator) for actuator in prepared.actuators}
         _write_snapshot(prepared, snapshot, messages)
         model = mujoco.MjModel.from_xml_path(str(snapshot / "model.xml"))
-    return Compiled(
+        data = mujoco.MjData(model)
+        check_copy(original, model)
+    compiled = Compiled(
         model_name="" if spec.modelname in DEFAULT_MODEL_NAMES else spec.modelname,
         joints=_names(model.njnt, model.joint),
-        actuators=_names(model.nactuator, model.actuator),
+        actuators=_names(actuator_count(model), model.actuator),
         actuator_types=kinds,
         sensors=_names(model.nsensor, model.sensor),
         cameras=_names(model.ncam, model.camera),
         messages=tuple(dict.fromkeys(messages)),
         n_bytes=mujoco.mj_sizeModel(model),
+        n_data_bytes=data.nbuffer + max(prepared.memory, 0),
+        n_arena_bytes=data.narena,
+        n_sensor_values=model.nsensordata,
+        options_problem=options_problem(model.opt, limits),
         largest_image=int(model.cam_resolution.max(initial=0)),
     )
+    return compiled, model
 
 
 _hook_lock = threading.Lock()
@@ -578,6 +601,8 @@ def _blueprint(folder: Path, record: _Record) -> Blueprint:
         sensors=record.sensors,
         cameras=record.cameras,
         n_bytes=record.n_bytes,
+        n_data_bytes=record.n_data_bytes,
+        n_sensor_values=record.n_sensor_values,
     )
 
 
@@ -595,6 +620,8 @@ def _record(blueprint: Blueprint) -> _Record:
         sensors=blueprint.sensors,
         cameras=blueprint.cameras,
         n_bytes=blueprint.n_bytes,
+        n_data_bytes=blueprint.n_data_bytes,
+        n_sensor_values=blueprint.n_sensor_values,
     )
 
 
@@ -618,31 +645,14 @@ def _warn_if_stale(known: Blueprint, source: str, text: bytes) -> None:
 
 def _write_snapshot(spec: mujoco.MjSpec, folder: Path, messages: list[str]) -> None:
     """Write a spec and every file it needs to `folder`, as `model.xml` and what is beside it."""
-    spec.compiler.savecompiled = False  # as authored: compiled values are rounded to six digits
-    archive = folder.with_name("model.mjz")
     before = len(messages)
     try:
-        spec.encode(str(archive))
+        write_model(spec, folder)
     except mujoco.FatalError:
         # A model made of attached parts is written only once compilation has assembled its keyframes.
         del messages[before:]
         spec.compile()
-        spec.encode(str(archive))
-    with open_archive(archive) as content:
-        content.extractall(folder)
-    archive.unlink()
-
-
-def open_archive(archive: Path) -> zipfile.ZipFile:
-    """Open an archive that MuJoCo has written; it does not notice when it cannot write all of it.
-
-    Raises:
-        OSError: It is incomplete.
-    """
-    try:
-        return zipfile.ZipFile(archive)
-    except zipfile.BadZipFile:
-        raise OSError(errno.ENOSPC, "MuJoCo could not write all of it; is the disk full?", str(archive)) from None
+        write_model(spec, folder)
 
 
 def _digest(folder: Path) -> str:
@@ -682,7 +692,7 @@ def _constant(value: Any) -> str:
 
 
 def _actuator_kind(actuator: Any) -> str:
-    kind = _constant(actuator.type).lower()
+    kind = actuator_kind(actuator)
     return "motor" if kind == "general" else kind
 
 
@@ -699,7 +709,7 @@ def _naming(spec: mujoco.MjSpec) -> list[tuple[Sequence[Any], Callable[[Any], st
         (spec.sites, lambda _: "Site"),
         (spec.cameras, lambda _: "Camera"),
         (spec.lights, lambda _: "Light"),
-        (spec.actuators, lambda actuator: f"{_constant(actuator.type).capitalize()}Actuator"),
+        (spec.actuators, lambda actuator: f"{actuator_kind(actuator).capitalize()}Actuator"),
         (
             spec.sensors,
             lambda sensor: f"{_SENSOR_TAGS.get(_constant(sensor.type), _constant(sensor.type).capitalize())}Sensor",

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import re
-import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property, lru_cache
@@ -20,12 +19,22 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client._mujoco import (
+    control_counts,
+    control_starts,
+    export_model,
+    force_counts,
+    force_starts,
+    merge_assets,
+)
 from urlab_client.protocol.base import Vec3
 from urlab_client.protocol.controller_text import CUSTOM_TEXT, ControllerText
 from urlab_client.protocol.rotation import rotate, wxyz
-from urlab_client.server.assets.actors import Actor, Mesh
-from urlab_client.server.assets.content import Blueprint, mujoco_messages, one_line, open_archive
+from urlab_client.server.assets.actors import Actor, Mesh, scene_problem
+from urlab_client.server.assets.content import Blueprint, mujoco_messages, one_line
 from urlab_client.server.assets.decomposition import convex_parts
+from urlab_client.server.assets.option_ranges import options_problem
+from urlab_client.server.limits import Limits
 
 __all__ = [
     "ArticulationIndex",
@@ -51,6 +60,7 @@ _SPOT_CUTOFF: Final = 44.0
 """Unreal's default outer cone angle, degrees."""
 
 _SAME: Final = 1e-6
+_DEFAULT_LIMITS: Final = Limits()
 
 
 class CompileFailed(Exception):
@@ -198,12 +208,8 @@ class CompiledScene:
 
     @cached_property
     def _export(self) -> tuple[str, dict[str, bytes]]:
-        with tempfile.TemporaryDirectory() as folder, mujoco_messages():
-            archive = Path(folder) / "model.mjz"
-            self.spec.encode(str(archive))
-            with open_archive(archive) as content:
-                files = {name: content.read(name) for name in content.namelist() if not name.endswith("/")}
-        xml = files.pop("model.xml").decode()
+        with mujoco_messages():
+            xml, files = export_model(self.spec)
         names: dict[str, str] = {}
         for path in sorted(files):
             names[path] = _unique(path.rpartition("/")[2], set(names.values()))
@@ -216,7 +222,11 @@ class CompiledScene:
 
 
 def compile_scene(
-    actors: Sequence[Actor], *, honour_mjcf_options: bool = False, camera_size: tuple[int, int] | None = None
+    actors: Sequence[Actor],
+    *,
+    honour_mjcf_options: bool = False,
+    camera_size: tuple[int, int] | None = None,
+    limits: Limits = _DEFAULT_LIMITS,
 ) -> CompiledScene:
     """Compile the actors of a level into one model.
 
@@ -230,22 +240,26 @@ def compile_scene(
         actors: In spawn order.
         honour_mjcf_options: Take the `<option>` of the first articulation instead, integrator included.
         camera_size: Width and height of cameras whose MJCF gives no resolution.
+        limits: Memory and sensors of the scene, and the ranges of its options; checked before it is simulated.
 
     Returns:
         The scene, stepped once and reset.
 
     Raises:
-        CompileFailed: MuJoCo rejects it.
+        CompileFailed: MuJoCo rejects it, or it exceeds a limit.
     """
+    _refuse(scene_problem(actors, limits))
     articulations = [(actor, actor.blueprint) for actor in actors if actor.blueprint is not None]
     warnings: list[str] = []
     try:
         spec, entities = _compose(actors, articulations, warnings, honour_mjcf_options=honour_mjcf_options)
+        _refuse(options_problem(spec.option, limits))
         model = spec.compile()
         memory = sum(max(blueprint.spec.memory, 0) for _, blueprint in articulations)
         if memory > model.narena:  # somebody found MuJoCo's own estimate too small
             spec.memory = memory
             model = spec.compile()
+        _refuse(_size_problem(model, limits))
         if not honour_mjcf_options:
             model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         with mujoco_messages() as messages:
@@ -269,6 +283,23 @@ def compile_scene(
     return CompiledScene(
         model, data, spec, indices, tuple(_entity(model, *names) for names in entities), tuple(warnings)
     )
+
+
+def _refuse(problem: str) -> None:
+    if problem:
+        raise CompileFailed(problem)
+
+
+def _size_problem(model: mujoco.MjModel, limits: Limits) -> str:
+    """Return which limit the compiled scene exceeds where its parts gave no number, or nothing."""
+    n_bytes = mujoco.mj_sizeModel(model) + model.narena
+    if n_bytes > limits.scene_bytes:
+        return f"the scene takes {n_bytes} bytes, more than the limit scene_bytes, {limits.scene_bytes}"
+    if model.nsensordata > limits.sensor_values:
+        return (
+            f"its sensors give {model.nsensordata} numbers, more than the limit sensor_values, {limits.sensor_values}"
+        )
+    return ""
 
 
 def actor_bounds(actor: Actor, *, every_geom: bool = False) -> tuple[Vec3, Vec3] | None:
@@ -333,7 +364,7 @@ def _compose(
             if converted is not None:
                 bodies.append(converted)
     _restore_world_references(spec, {f"{actor.prefix}world" for actor, _ in articulations})
-    spec.dedup_assets()  # instances of one robot share its meshes and textures
+    merge_assets(spec, children)
     return spec, bodies
 
 
@@ -633,7 +664,7 @@ def _index(
     sensors, sensor_names = find(objects.mjOBJ_SENSOR, blueprint.sensors)
     cameras, camera_names = find(objects.mjOBJ_CAMERA, blueprint.cameras)
     positions, velocities = _joint_widths(model, joints)
-    controls = model.actuator_ctrlnum[actuators]
+    controls = control_counts(model)[actuators]
     return ArticulationIndex(
         key=actor.name,
         prefix=actor.prefix,
@@ -650,9 +681,9 @@ def _index(
         sensor_names=sensor_names,
         qpos_adr=_spans(model.jnt_qposadr[joints], positions),
         qvel_adr=_spans(model.jnt_dofadr[joints], velocities),
-        ctrl_adr=_spans(model.actuator_ctrladr[actuators], controls),
+        ctrl_adr=_spans(control_starts(model)[actuators], controls),
         act_adr=np.repeat(model.actuator_actadr[actuators], controls).astype(np.int32),
-        force_adr=_spans(model.actuator_outadr[actuators], model.actuator_outnum[actuators]),
+        force_adr=_spans(force_starts(model)[actuators], force_counts(model)[actuators]),
         actuator_types=MappingProxyType({name: blueprint.actuator_types[name] for name in actuator_names}),
         cameras=tuple(
             _camera(model, int(index), name, camera_size) for index, name in zip(cameras, camera_names, strict=True)

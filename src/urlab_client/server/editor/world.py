@@ -10,37 +10,32 @@ Positions are metres and rotations quaternions (x, y, z, w), both in MuJoCo's wo
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Iterable, Iterator, Mapping
-from ctypes import c_float
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 from urlab_client.protocol.base import Quat, Vec3
-from urlab_client.protocol.rotation import IDENTITY, euler_to_quat, normalized, swap_frame
-from urlab_client.server.assets.actors import ORIGIN, UNIT_SCALE, Actor, ActorKind, ConversionSettings, Light, Mesh
+from urlab_client.protocol.rotation import IDENTITY, euler_to_quat, swap_frame
+from urlab_client.protocol.types import ActorBounds, ActorHierarchyNode, BlueprintInfo
+from urlab_client.server.assets.actors import (
+    ORIGIN,
+    UNIT_SCALE,
+    Actor,
+    ActorKind,
+    ConversionSettings,
+    Light,
+    Mesh,
+    scene_problem,
+)
 from urlab_client.server.assets.content import PARENT_CLASS, Blueprint, ContentRoot, level_package, sanitized
 from urlab_client.server.assets.decomposition import ADVICE, is_available
 from urlab_client.server.assets.level import LevelError, read_level, write_level
 from urlab_client.server.compile.scene import CompileFailed, actor_bounds
+from urlab_client.server.editor import checks
 from urlab_client.server.refusal import Refusal
 
-__all__ = [
-    "Actor",
-    "ActorKind",
-    "ActorRow",
-    "ArticulationNames",
-    "BlueprintRow",
-    "Bounds",
-    "ConversionSettings",
-    "EditorWorld",
-    "HierarchyNode",
-    "Light",
-    "Mesh",
-    "PlacedLight",
-    "Placement",
-]
+__all__ = ["Actor", "ActorKind", "ActorNames", "ConversionSettings", "EditorWorld", "Light", "Mesh", "Placed"]
 
 logger = logging.getLogger("urlab_client.server")
 
@@ -49,155 +44,18 @@ ActorNames = Literal["model", "plugin"]
 UNTITLED: Final = "/Temp/Untitled_1"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Placement:
+class Placed(NamedTuple):
     """An actor that was placed or moved.
 
     Attributes:
-        actor_id: As requested; may be empty.
-        actor_name: Object name; the articulation's key.
-        actor_path: Full object path.
-        blueprint_class_path: Class path after expansion.
-        location: As requested, metres.
-        rotation_quat: As understood from the request; not normalised.
+        actor: The actor as it stands in the level now.
+        rotation_quat: Rotation as understood from the request; not normalised.
         was_existing: True if an existing actor was moved.
     """
 
-    actor_id: str
-    actor_name: str
-    actor_path: str
-    blueprint_class_path: str
-    location: Vec3
+    actor: Actor
     rotation_quat: Quat
     was_existing: bool
-
-
-@dataclass(frozen=True, kw_only=True)
-class PlacedLight:
-    """A light that was placed.
-
-    Attributes:
-        actor_id: As requested; may be empty.
-        actor_name: Object name.
-        actor_path: Full object path.
-        kind: `directional`, `point` or `spot`.
-        intensity: As requested.
-        color: As requested, rounded to single precision.
-        location: As requested, metres.
-        rotation_euler: As requested, degrees, Unreal's frame.
-    """
-
-    actor_id: str
-    actor_name: str
-    actor_path: str
-    kind: str
-    intensity: float
-    color: Vec3
-    location: Vec3
-    rotation_euler: Vec3
-
-
-@dataclass(frozen=True, kw_only=True)
-class ArticulationNames:
-    """Names of an articulation's elements: of the MJCF outside play, compiled ones with prefix in play.
-
-    Attributes:
-        joints: Joint names.
-        actuators: Actuator names.
-        sensors: Sensor names.
-        cameras: Camera names, never prefixed.
-    """
-
-    joints: tuple[str, ...]
-    actuators: tuple[str, ...]
-    sensors: tuple[str, ...]
-    cameras: tuple[str, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class ActorRow:
-    """An actor as the listing ops show it; each op takes the fields it sends.
-
-    Attributes:
-        name: Object name.
-        label: Display name.
-        class_name: Short class name.
-        actor_id: Stable id; may be empty.
-        location: Position, metres.
-        rotation_quat: Unit quaternion (x, y, z, w).
-        tags: Actor tags.
-        is_articulation: True for actors made from MJCF.
-        is_static_mesh_actor: True for plain meshes.
-        is_light: True for lights.
-        quick_convert: Quick Convert settings, or None.
-        names: Names of an articulation's elements; None for other actors.
-    """
-
-    name: str
-    label: str
-    class_name: str
-    actor_id: str
-    location: Vec3
-    rotation_quat: Quat
-    tags: tuple[str, ...]
-    is_articulation: bool
-    is_static_mesh_actor: bool
-    is_light: bool
-    quick_convert: ConversionSettings | None
-    names: ArticulationNames | None
-
-
-@dataclass(frozen=True, kw_only=True)
-class HierarchyNode:
-    """An actor and the actors attached to it.
-
-    Attributes:
-        name: Object name.
-        class_name: Short class name.
-        location: Position, metres.
-        children: Attached actors.
-    """
-
-    name: str
-    class_name: str
-    location: Vec3
-    children: tuple[HierarchyNode, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Bounds:
-    """Axis-aligned box in the world frame, metres; all zero for an actor without geometry.
-
-    Attributes:
-        actor_name: Object name.
-        min: Lower corner.
-        max: Upper corner.
-        center: Midpoint.
-        extents: Half sizes.
-    """
-
-    actor_name: str
-    min: Vec3
-    max: Vec3
-    center: Vec3
-    extents: Vec3
-
-
-@dataclass(frozen=True, kw_only=True)
-class BlueprintRow:
-    """A blueprint as `list_blueprints` shows it.
-
-    Attributes:
-        class_path: Class path for `spawn_actor`.
-        short_name: Asset name.
-        package_path: Package path.
-        parent_class: Short name of the parent class.
-    """
-
-    class_path: str
-    short_name: str
-    package_path: str
-    parent_class: str = PARENT_CLASS
 
 
 class EditorWorld:
@@ -242,10 +100,15 @@ class EditorWorld:
         self._refresh(blueprint)
         return blueprint, imported_now
 
-    def list_blueprints(self) -> list[BlueprintRow]:
+    def list_blueprints(self) -> list[BlueprintInfo]:
         """Return the imported blueprints, sorted by short name."""
         return [
-            BlueprintRow(class_path=item.class_path, short_name=item.short_name, package_path=item.package_path)
+            BlueprintInfo(
+                class_path=item.class_path,
+                short_name=item.short_name,
+                package_path=item.package_path,
+                parent_class=PARENT_CLASS,
+            )
             for item in sorted(self.content.blueprints.values(), key=lambda item: item.short_name)
         ]
 
@@ -259,7 +122,7 @@ class EditorWorld:
             Refusal: `missing_field`; `destroy_asset_failed` if actors of the open level use the blueprint, or the asset
                 cannot be deleted.
         """
-        _require(asset_path, "asset_path")
+        checks.require(asset_path, "asset_path")
         package, dot, name = asset_path.rpartition(".")
         if not dot:
             package = asset_path
@@ -283,7 +146,7 @@ class EditorWorld:
             Refusal: `missing_field`; `create_level_failed` if play runs, the name is unusable, the level exists, or it
                 cannot be written.
         """
-        _require(name, "name")
+        checks.require(name, "name")
         code = "create_level_failed"
         self._refuse_during_play(code)
         package, file = self._locate_level(name, code)
@@ -305,7 +168,7 @@ class EditorWorld:
         Raises:
             Refusal: `missing_field`; `load_level_failed` if play runs, or the level is missing or unusable.
         """
-        _require(name, "level_path")
+        checks.require(name, "level_path")
         code = "load_level_failed"
         self._refuse_during_play(code)
         package, file = self._locate_level(name, code)
@@ -390,7 +253,7 @@ class EditorWorld:
         rotation_quat: Quat | None = None,
         rotation_euler: Vec3 | None = None,
         scale: Vec3 = UNIT_SCALE,
-    ) -> Placement:
+    ) -> Placed:
         """Place an instance of a blueprint, or move the actor that carries the id.
 
         Args:
@@ -402,18 +265,18 @@ class EditorWorld:
             scale: Must be 1.
 
         Raises:
-            Refusal: `missing_field`; `spawn_failed` for an unknown blueprint, a scale, a pose that is none, or an id
+            Refusal: `missing_field`; `spawn_failed` for an unknown blueprint, a scale, an invalid pose, or an id
                 that belongs to an actor of another class.
         """
-        _require(blueprint, "blueprint")
+        checks.require(blueprint, "blueprint")
         code = "spawn_failed"
         found = self._blueprint(blueprint, code)
-        _refuse_scale(scale, code)
-        understood = _rotation(rotation_quat, rotation_euler, code)
-        pose = _pose(location, understood if understood is not None else IDENTITY, code)
+        checks.refuse_scale(scale, code)
+        understood = checks.rotation(rotation_quat, rotation_euler, code)
+        pose = checks.pose(location, understood if understood is not None else IDENTITY, code)
         existing = self._of_class(actor_id, found.class_name, code)
-        self._make_room(existing is None, found.n_bytes, code)
-        return self._place(found, actor_id, existing, location=location, understood=understood or IDENTITY, pose=pose)
+        self._make_room(existing is None, found, code)
+        return self._place(found, actor_id, existing, understood=understood or IDENTITY, pose=pose)
 
     def spawn_grid(
         self,
@@ -427,7 +290,7 @@ class EditorWorld:
         rotation_quat: Quat | None = None,
         rotation_euler: Vec3 | None = None,
         scale: Vec3 = UNIT_SCALE,
-    ) -> list[Placement]:
+    ) -> list[Placed]:
         """Place a grid of actors, x fastest. All is checked before the first is placed.
 
         Args:
@@ -444,8 +307,8 @@ class EditorWorld:
         Raises:
             Refusal: `missing_field`, `invalid_count`, `too_many_cells`, `spawn_failed`.
         """
-        _require(blueprint, "blueprint")
-        _require(base_actor_id, "base_actor_id")
+        checks.require(blueprint, "blueprint")
+        checks.require(base_actor_id, "base_actor_id")
         if count_x <= 0 or count_y <= 0:
             raise Refusal("invalid_count", f"count_x and count_y must be above zero, not {count_x} and {count_y}")
         most = self.content.limits.grid_cells
@@ -453,19 +316,19 @@ class EditorWorld:
             raise Refusal("too_many_cells", f"{count_x} x {count_y} cells are more than the limit grid_cells, {most}")
         code = "spawn_failed"
         found = self._blueprint(blueprint, code)
-        _refuse_scale(scale, code)
-        understood = _rotation(rotation_quat, rotation_euler, code) or IDENTITY
-        cells: list[tuple[str, Actor | None, Vec3, tuple[Vec3, Quat]]] = []
+        checks.refuse_scale(scale, code)
+        understood = checks.rotation(rotation_quat, rotation_euler, code) or IDENTITY
+        cells: list[tuple[str, Actor | None, tuple[Vec3, Quat]]] = []
         for j in range(count_y):
             for i in range(count_x):
                 actor_id = f"{base_actor_id}_{i}_{j}"
                 location = (origin[0] + i * spacing[0], origin[1] + j * spacing[1], origin[2])
                 existing = self._of_class(actor_id, found.class_name, code)
-                cells.append((actor_id, existing, location, _pose(location, understood, code)))
-        self._make_room(sum(existing is None for _, existing, _, _ in cells), found.n_bytes, code)
+                cells.append((actor_id, existing, checks.pose(location, understood, code)))
+        self._make_room(sum(existing is None for _, existing, _ in cells), found, code)
         return [
-            self._place(found, actor_id, existing, location=location, understood=understood, pose=pose)
-            for actor_id, existing, location, pose in cells
+            self._place(found, actor_id, existing, understood=understood, pose=pose)
+            for actor_id, existing, pose in cells
         ]
 
     def spawn_light(
@@ -477,7 +340,7 @@ class EditorWorld:
         rotation_euler: Vec3 = ORIGIN,
         intensity: float = 5000.0,
         color: Vec3 = UNIT_SCALE,
-    ) -> PlacedLight:
+    ) -> Actor:
         """Place a light; each call adds one, also with an id that is used already.
 
         Args:
@@ -495,23 +358,13 @@ class EditorWorld:
         name = kind.casefold()
         if name not in ("directional", "point", "spot"):
             raise Refusal(code, f"no kind of light is called '{kind}': use directional, point or spot")
-        _refuse_infinite((*rotation_euler, intensity, *color), "rotation_euler, intensity and color", code)
-        at, rotation = _pose(location, swap_frame(euler_to_quat(rotation_euler)), code)
-        self._make_room(1, 0, code)
-        red, green, blue = (_float32(channel) for channel in color)
-        light = Light(kind=name, intensity=_float32(intensity), color=(red, green, blue))
+        checks.refuse_infinite((*rotation_euler, intensity, *color), "rotation_euler, intensity and color", code)
+        at, rotation = checks.pose(location, swap_frame(euler_to_quat(rotation_euler)), code)
+        self._make_room(1, None, code)
+        red, green, blue = (checks.float32(channel) for channel in color)
+        light = Light(kind=name, intensity=checks.float32(intensity), color=(red, green, blue))
         draft = Actor(name="", label="", kind=ActorKind.LIGHT, actor_id=actor_id, light=light)
-        actor = self._add(replace(draft, name=self._numbered(draft.class_name), location=at, rotation=rotation))
-        return PlacedLight(
-            actor_id=actor_id,
-            actor_name=actor.name,
-            actor_path=self.actor_path(actor),
-            kind=name,
-            intensity=intensity,
-            color=light.color,
-            location=location,
-            rotation_euler=rotation_euler,
-        )
+        return self._add(replace(draft, name=self._numbered(draft.class_name), location=at, rotation=rotation))
 
     def destroy_actor(self, target: str) -> None:
         """Remove an actor from the level; actors attached to it stay where they are.
@@ -544,19 +397,19 @@ class EditorWorld:
             rotation_euler: (roll, pitch, yaw), degrees, as `spawn_actor`.
 
         Raises:
-            Refusal: `missing_field`; `set_actor_transform_failed` for an unknown actor or a pose that is none.
+            Refusal: `missing_field`; `set_actor_transform_failed` for an unknown actor or an invalid pose.
         """
         code = "set_actor_transform_failed"
         actor = self._find(target, code)
-        rotation = _rotation(rotation_quat, rotation_euler, code)
-        at, turned = _pose(
+        rotation = checks.rotation(rotation_quat, rotation_euler, code)
+        at, turned = checks.pose(
             location if location is not None else actor.location,
             rotation if rotation is not None else actor.rotation,
             code,
         )
         return self._put(replace(actor, location=at, rotation=turned if rotation is not None else actor.rotation))
 
-    def duplicate_actor(self, target: str, new_actor_id: str, *, location: Vec3 | None = None) -> Placement:
+    def duplicate_actor(self, target: str, new_actor_id: str, *, location: Vec3 | None = None) -> Placed:
         """Place a copy of an actor, or move the actor of the same class that carries the new id.
 
         Args:
@@ -569,13 +422,13 @@ class EditorWorld:
         """
         code = "duplicate_failed"
         source = self._find(target, code)
-        _require(new_actor_id, "new_actor_id")
+        checks.require(new_actor_id, "new_actor_id")
         if source.kind in (ActorKind.MANAGER, ActorKind.REPLAY_MANAGER):
             raise Refusal(code, f"'{source.name}' is a {source.class_name}, of which a level has one")
         x, y, z = source.location
-        at, rotation = _pose(location if location is not None else (x + 1.0, y, z), source.rotation, code)
+        at, rotation = checks.pose(location if location is not None else (x + 1.0, y, z), source.rotation, code)
         existing = self._of_class(new_actor_id, source.class_name, code)
-        self._make_room(existing is None, 0 if source.blueprint is None else source.blueprint.n_bytes, code)
+        self._make_room(existing is None, source.blueprint, code)
         if existing is not None:
             copy = self._put(replace(existing, location=at, rotation=rotation, scale=source.scale))
         else:
@@ -587,29 +440,21 @@ class EditorWorld:
             copy = self._add(
                 replace(source, name=name, label="", actor_id=new_actor_id, location=at, rotation=rotation, parent="")
             )
-        return Placement(
-            actor_id=new_actor_id,
-            actor_name=copy.name,
-            actor_path=self.actor_path(copy),
-            blueprint_class_path=copy.class_path,
-            location=at,
-            rotation_quat=rotation,
-            was_existing=existing is not None,
-        )
+        return Placed(copy, rotation, existing is not None)
 
     # Looking
 
-    def snapshot(self) -> list[ActorRow]:
-        """Return a row for every actor, of the play world while play runs."""
-        return [_row(actor, compiled=self.pie_running) for actor in self._shown()]
+    def snapshot(self) -> list[Actor]:
+        """Return every actor, of the play world while play runs."""
+        return list(self._shown())
 
-    def list_actors(self) -> list[ActorRow]:
-        """Return a row for every actor of the open level, also during play."""
-        return [_row(actor) for actor in self._actors.values()]
+    def list_actors(self) -> list[Actor]:
+        """Return every actor of the open level, also during play."""
+        return list(self._actors.values())
 
     def find_actors(
         self, *, class_filter: str = "", tag: str = "", name_prefix: str = "", in_pie: bool = False
-    ) -> tuple[list[ActorRow], bool]:
+    ) -> tuple[list[Actor], bool]:
         """Return the actors that pass every filter that is given; letter case does not count.
 
         Args:
@@ -619,21 +464,21 @@ class EditorWorld:
             in_pie: Look in the play world, if play runs.
 
         Returns:
-            The rows, and whether they come from the play world.
+            The actors, and whether they come from the play world.
         """
         in_play = in_pie and self.pie_running
         wanted = class_filter.casefold()
         classes = {wanted, wanted[1:]} if wanted[:1] in ("a", "u", "f") else {wanted}
-        rows = [
-            _row(actor, compiled=in_play)
+        found = [
+            actor
             for actor in (self._frozen if in_play else self._actors.values())
             if (not wanted or not classes.isdisjoint(name.casefold() for name in actor.class_chain))
             and (not tag or tag.casefold() in (own.casefold() for own in actor.tags))
             and actor.name.casefold().startswith(name_prefix.casefold())
         ]
-        return rows, in_play
+        return found, in_play
 
-    def actor_hierarchy(self, target: str) -> HierarchyNode:
+    def actor_hierarchy(self, target: str) -> ActorHierarchyNode:
         """Return an actor and the actors attached to it, of the play world while play runs.
 
         Raises:
@@ -642,7 +487,7 @@ class EditorWorld:
         shown = self._shown()
         return _node(_match(shown, target, "actor_hierarchy_failed"), shown)
 
-    def get_actor_bounds(self, target: str, *, components_only: bool = False) -> Bounds:
+    def get_actor_bounds(self, target: str, *, components_only: bool = False) -> ActorBounds:
         """Return the box around an actor at its authored pose.
 
         Args:
@@ -661,7 +506,7 @@ class EditorWorld:
         lower, upper = corners if corners is not None else (ORIGIN, ORIGIN)
         cx, cy, cz = ((low + high) / 2.0 for low, high in zip(lower, upper, strict=True))
         ex, ey, ez = ((high - low) / 2.0 for low, high in zip(lower, upper, strict=True))
-        return Bounds(actor_name=actor.name, min=lower, max=upper, center=(cx, cy, cz), extents=(ex, ey, ez))
+        return ActorBounds(actor_name=actor.name, min=lower, max=upper, center=(cx, cy, cz), extents=(ex, ey, ez))
 
     def select_actor(self, target: str) -> Actor:
         """Select one actor and return it.
@@ -720,11 +565,11 @@ class EditorWorld:
             raise Refusal(code, ADVICE)
         if actor.mesh.shape == "plane" and not static:
             raise Refusal(code, f"'{actor.name}' is a plane, which cannot move: pass static")
-        _refuse_infinite((coacd_threshold, *friction), "coacd_threshold and friction", code)
+        checks.refuse_infinite((coacd_threshold, *friction), "coacd_threshold and friction", code)
         settings = ConversionSettings(
             static=static,
             complex_mesh=complex_mesh,
-            coacd_threshold=_float32(coacd_threshold),
+            coacd_threshold=checks.float32(coacd_threshold),
             driven_by_unreal=driven_by_unreal,
             friction=friction,
         )
@@ -759,16 +604,17 @@ class EditorWorld:
 
     # Internal
 
-    def _make_room(self, count: int, n_bytes: int, code: str) -> None:
-        """Refuse with `code` when `count` more actors, each with a model of `n_bytes`, would be too many."""
+    def _make_room(self, count: int, blueprint: Blueprint | None, code: str) -> None:
+        """Refuse with `code` when `count` more actors of a blueprint would be too many."""
+        if not count:
+            return
         limits = self.content.limits
-        if count and len(self._actors) + count > limits.actors:
+        if len(self._actors) + count > limits.actors:
             raise Refusal(code, f"a level has at most {limits.actors} actors (limit actors)")
-        held = sum(actor.blueprint.n_bytes for actor in self._actors.values() if actor.blueprint is not None)
-        if count and held + count * n_bytes > limits.scene_bytes:
-            raise Refusal(
-                code, f"the models of a level take at most {limits.scene_bytes} bytes together (limit scene_bytes)"
-            )
+        more = [Actor(name="", label="", kind=ActorKind.ARTICULATION, blueprint=blueprint)] * count
+        problem = scene_problem((*self._actors.values(), *more), limits)
+        if problem:
+            raise Refusal(code, problem)
 
     def _shown(self) -> Iterable[Actor]:
         return self._frozen if self.pie_running else self._actors.values()
@@ -789,10 +635,9 @@ class EditorWorld:
         actor_id: str,
         existing: Actor | None,
         *,
-        location: Vec3,
         understood: Quat,
         pose: tuple[Vec3, Quat],
-    ) -> Placement:
+    ) -> Placed:
         at, rotation = pose
         if existing is not None:
             actor = self._put(replace(existing, location=at, rotation=rotation))
@@ -800,15 +645,7 @@ class EditorWorld:
             name = self._articulation_name(blueprint)
             draft = Actor(name=name, label="", kind=ActorKind.ARTICULATION, actor_id=actor_id, blueprint=blueprint)
             actor = self._add(replace(draft, location=at, rotation=rotation))
-        return Placement(
-            actor_id=actor_id,
-            actor_name=actor.name,
-            actor_path=self.actor_path(actor),
-            blueprint_class_path=blueprint.class_path,
-            location=location,
-            rotation_quat=understood,
-            was_existing=existing is not None,
-        )
+        return Placed(actor, understood, existing is not None)
 
     def _articulation_name(self, blueprint: Blueprint) -> str:
         if self._naming == "plugin":
@@ -923,11 +760,6 @@ class EditorWorld:
         return True
 
 
-def _require(value: str, name: str) -> None:
-    if not value:
-        raise Refusal("missing_field", f"{name} must not be empty")
-
-
 def _variants(stem: str, separator: str, first: int) -> Iterator[str]:
     """Yield `stem`, then `stem` with the numbers from `first` on."""
     yield stem
@@ -946,73 +778,13 @@ def _numbers(stem: str) -> Iterator[str]:
 
 def _match(actors: Iterable[Actor], target: str, code: str) -> Actor:
     """Return the first actor whose id or object name is `target`."""
-    _require(target, "target")
+    checks.require(target, "target")
     for actor in actors:
         if actor.name == target or actor.has_id(target):
             return actor
     raise Refusal(code, f"no actor has the id or name '{target}'; list_actors names them")
 
 
-def _row(actor: Actor, *, compiled: bool = False) -> ActorRow:
-    names: ArticulationNames | None = None
-    if actor.blueprint is not None:
-        prefix = actor.prefix if compiled else ""
-        names = ArticulationNames(
-            joints=tuple(f"{prefix}{name}" for name in actor.blueprint.joints),
-            actuators=tuple(f"{prefix}{name}" for name in actor.blueprint.actuators),
-            sensors=tuple(f"{prefix}{name}" for name in actor.blueprint.sensors),
-            cameras=actor.blueprint.cameras,
-        )
-    return ActorRow(
-        name=actor.name,
-        label=actor.label,
-        class_name=actor.class_name,
-        actor_id=actor.actor_id,
-        location=actor.location,
-        rotation_quat=actor.rotation,
-        tags=actor.tags,
-        is_articulation=actor.kind is ActorKind.ARTICULATION,
-        is_static_mesh_actor=actor.kind is ActorKind.STATIC_MESH,
-        is_light=actor.kind is ActorKind.LIGHT,
-        quick_convert=actor.quick_convert,
-        names=names,
-    )
-
-
-def _node(actor: Actor, actors: Iterable[Actor]) -> HierarchyNode:
-    children = tuple(_node(child, actors) for child in actors if child.parent == actor.name)
-    return HierarchyNode(name=actor.name, class_name=actor.class_name, location=actor.location, children=children)
-
-
-def _float32(value: float) -> float:
-    return c_float(value).value
-
-
-def _refuse_infinite(values: Iterable[float], names: str, code: str) -> None:
-    if not all(math.isfinite(value) for value in values):
-        raise Refusal(code, f"{names} must be finite numbers")
-
-
-def _refuse_scale(scale: Vec3, code: str) -> None:
-    if scale != UNIT_SCALE:
-        raise Refusal(
-            code,
-            f"an articulation cannot be scaled by {list(scale)}: MuJoCo has no scale for a placed model; "
-            "change the sizes in the MJCF",
-        )
-
-
-def _rotation(quat: Quat | None, euler: Vec3 | None, code: str) -> Quat | None:
-    """Return the rotation a spawn op means, unnormalised; None if it names none."""
-    if quat is not None or euler is None:
-        return quat
-    _refuse_infinite(euler, "rotation_euler", code)
-    return euler_to_quat(euler)
-
-
-def _pose(location: Vec3, rotation: Quat, code: str) -> tuple[Vec3, Quat]:
-    _refuse_infinite(location, "location", code)
-    try:
-        return location, normalized(rotation)
-    except ValueError as error:
-        raise Refusal(code, f"rotation_quat: {error}") from None
+def _node(actor: Actor, actors: Iterable[Actor]) -> ActorHierarchyNode:
+    children = [_node(child, actors) for child in actors if child.parent == actor.name]
+    return ActorHierarchyNode(name=actor.name, actor_class=actor.class_name, location=actor.location, children=children)

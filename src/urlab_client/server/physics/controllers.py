@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client._mujoco import control_counts
 from urlab_client.protocol.controller_text import ControllerText
 from urlab_client.protocol.enums import ControllerKind
 from urlab_client.server.compile.scene import ArticulationIndex
@@ -204,9 +205,10 @@ def _first_controls(model: mujoco.MjModel, articulation: Actuated) -> list[int]:
     """Position of each actuator's first control among the articulation's controls."""
     starts: list[int] = []
     total = 0
+    counts = control_counts(model)
     for actuator in articulation.actuators:
         starts.append(total)
-        total += int(model.actuator_ctrlnum[actuator])
+        total += int(counts[actuator])
     return starts
 
 
@@ -217,8 +219,9 @@ def _bind(model: mujoco.MjModel, articulation: Actuated) -> _Binding:
     places: list[int] = []
     joints: list[int] = []
     starts = _first_controls(model, articulation)
+    counts = control_counts(model)
     for actuator, name, place in zip(articulation.actuators, articulation.actuator_names, starts, strict=True):
-        if int(model.actuator_trntype[actuator]) not in joint_transmissions or model.actuator_ctrlnum[actuator] != 1:
+        if int(model.actuator_trntype[actuator]) not in joint_transmissions or counts[actuator] != 1:
             continue
         joint = int(model.actuator_trnid[actuator, 0])
         if int(model.jnt_type[joint]) in scalar_joints:

@@ -20,6 +20,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client._mujoco import reset_controls
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.messages.session import ArticulationCommand, Step
 from urlab_client.server.compile.scene import CompiledScene
@@ -172,7 +173,7 @@ class Engine:
 
     def _neutral_ctrl(self) -> Floats:
         kept = self._ctrl.copy()
-        mujoco.mj_resetCtrl(self._model, self._data)
+        reset_controls(self._model, self._data)
         neutral = self._ctrl.copy()
         self._ctrl[:] = kept
         return neutral

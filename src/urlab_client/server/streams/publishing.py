@@ -22,6 +22,7 @@ import zmq
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from urlab_client._mujoco import actuator_count, control_counts, control_starts
 from urlab_client._uninterrupted import uninterrupted
 from urlab_client.protocol.codec import encode_reply
 from urlab_client.protocol.enums import ObservationLevel, StepMode
@@ -392,11 +393,11 @@ class _Actuators:
     def __init__(self, model: mujoco.MjModel, controls: Iterable[ArticulationControl]) -> None:
         self._model = model
         self._set_points = [control.set_points for control in controls]
-        self._owner = np.full(model.nactuator, -1, dtype=np.intp)
-        self._place = np.zeros(model.nactuator, dtype=np.intp)
+        self._owner = np.full(actuator_count(model), -1, dtype=np.intp)
+        self._place = np.zeros(actuator_count(model), dtype=np.intp)
         for number, control in enumerate(controls):
             actuators = control.index.actuators
-            widths = model.actuator_ctrlnum[actuators]
+            widths = control_counts(model)[actuators]
             self._owner[actuators] = number
             self._place[actuators] = np.cumsum(widths) - widths
 
@@ -412,7 +413,7 @@ class _Actuators:
     def info(self, control: ArticulationControl, cameras: tuple[CameraEndpoint, ...]) -> ActuatorInfo:
         """Return what the info socket says about an articulation."""
         model, index = self._model, control.index
-        first = model.actuator_ctrladr[index.actuators]
+        first = control_starts(model)[index.actuators]
         limited = model.actuator_ctrllimited[first].astype(bool)
         ranges = model.actuator_ctrlrange[first].astype(np.float32).astype(np.float64)
         return ActuatorInfo(
