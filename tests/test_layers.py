@@ -68,6 +68,8 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "stream_buffer",
         "transport",
         "launch",
+        "control",
+        "jobs",
         "session",
         "streams",
         "live",
