@@ -352,13 +352,6 @@ def test_malformed_addresses_are_refused(address: str) -> None:
         URLabClient(address)
 
 
-async def test_a_client_stays_with_its_loop(scripted: Any) -> None:
-    async with URLabClient("tcp://127.0.0.1", step_port=scripted.port, local_model=False) as client:
-        await client.discover()
-        with pytest.raises(Exception, match="another event loop"):
-            await asyncio.to_thread(asyncio.run, client.discover())
-
-
 @pytest.mark.parametrize(
     "address",
     ["tcp://localhost:rpc", "tcp://localhost:70000", "tcp://localhost:0", "tcp://:5559", "tcp://::1", "tcp://", "lab"],
