@@ -157,6 +157,21 @@ async def test_default_timeout_comes_from_the_client(scripted: Any) -> None:
             await call
 
 
+async def test_one_timeout_covers_all_requests_of_a_handshake(client: Any, scripted: Any) -> None:
+    hello = scripted.answers["hello"]
+    scripted.on("hello", None)
+    scripted.on("meta", None)
+    call = asyncio.create_task(client.discover(timeout=DEADLINE_S))
+    await until(scripted.held.qsize)
+    pass_time(0.9 * DEADLINE_S)
+    scripted.release(hello({}))
+    await until(scripted.held.qsize)  # the second request, with what the first has left
+    pass_time(0.2 * DEADLINE_S)
+    with pytest.raises(URLabTimeoutError, match="meta: no reply"):
+        async with asyncio.timeout(0.4 * DEADLINE_S):  # and not as long again
+            await call
+
+
 async def test_cancelled_call_leaves_the_client_usable(client: Any, scripted: Any) -> None:
     await client.discover()
     call = asyncio.create_task(client.runtime.set_paused(True))
