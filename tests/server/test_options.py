@@ -101,3 +101,23 @@ def test_wrong_shapes_are_ignored_and_choices_take_any_case(ball: Wire) -> None:
     before = options(ball)
     assert options(ball, gravity=[1], timestep="x", iterations=[3]) == before
     assert options(ball, integrator="RK4", solver="cG")["solver"] == "cg"
+
+
+@pytest.mark.parametrize(
+    ("field", "problem"),
+    [
+        ({"timestep": 0.0}, "timestep must be above 0, got 0"),
+        ({"timestep": -1.0}, "timestep must be above 0, got -1"),
+        ({"timestep": float("nan")}, "timestep takes finite numbers, got nan"),
+        ({"gravity": [0.0, 0.0, float("inf")]}, "gravity takes finite numbers"),
+        ({"tolerance": -1e-8}, "tolerance must not be below 0"),
+    ],
+)
+def test_values_that_would_end_the_simulation_are_refused(ball: Wire, field: dict[str, Any], problem: str) -> None:
+    """The plugin takes them; then time stands still or is not a number."""
+    before = options(ball)
+    code, message = ball.refusal("set_sim_options", options={"density": 1.0, **field})
+    assert code == "bad_value"
+    assert problem in message
+    assert options(ball) == before, "nothing of the request is remembered"
+    assert ball.ask("step")["time"] == pytest.approx(0.002)

@@ -10,7 +10,7 @@ from typing import TypeVar
 from urlab_client.aio.deadline import DEFAULT, Timeout, shared
 from urlab_client.aio.transport.base import RequestTransport
 from urlab_client.protocol.base import Needs, Op, Reply, Request
-from urlab_client.protocol.codec import check_request, decode_reply, encode_request, op_of
+from urlab_client.protocol.codec import check_finite, check_request, decode_reply, encode_request, op_of
 from urlab_client.protocol.errors import ConnectionLost, ServerUnreachable, UnknownOp, URLabRPCError, URLabTimeoutError
 from urlab_client.protocol.features import Features
 from urlab_client.protocol.messages.session import Hello, HelloOk, Meta
@@ -82,8 +82,10 @@ class Session:
         try:
             stamped = self.session_id
             frame = encode_request(request, stamped, json=self._json)
-            if not op.hot and not self._json:
-                check_request(request, frame)
+            if not op.hot:
+                check_finite(request)
+                if not self._json:
+                    check_request(request, frame)
             connect_by = self._connect_by(now, deadline, timeout)
             try:
                 answer = await self._transport.request(frame, op, deadline=deadline, connect_by=connect_by)

@@ -1,6 +1,6 @@
 """What `set_sim_options` remembers of a play session and does to `mjOption`.
 
-For the handler, which holds the engine's lock. The numbers are not validated, as in the plugin.
+For the handler, which holds the engine's lock. The plugin validates no number; here the handler has.
 """
 
 from __future__ import annotations
