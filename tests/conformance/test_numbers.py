@@ -144,16 +144,16 @@ async def test_positions_are_numbers(client: Any) -> None:
 @pytest.mark.parametrize(
     ("options", "problem"),
     [
-        ({"timestep": 0.0}, "timestep must be above 0, got 0"),
-        ({"timestep": -1}, "timestep must be above 0, got -1"),
-        ({"timestep": 1e-60}, "timestep must be above 0"),
-        ({"timestep": NAN}, "timestep takes finite numbers, got nan"),
-        ({"timestep": INF}, "timestep takes finite numbers"),
-        ({"density": 1e300}, "density takes finite numbers"),
-        ({"gravity": (0, 0, NAN)}, "gravity takes finite numbers"),
-        ({"impratio": 0}, "impratio must be above 0"),
-        ({"iterations": -1}, "iterations must not be below 0"),
-        ({"iterations": 2**40}, "iterations takes integers of 32 bits"),
+        ({"timestep": 0.0}, "timestep must be a positive number, not 0.0"),
+        ({"timestep": -1}, "timestep must be a positive number, not -1"),
+        ({"timestep": 1e-60}, "timestep must be a positive number, not 0.0"),
+        ({"timestep": NAN}, "timestep must be a positive number, not nan"),
+        ({"timestep": INF}, "timestep must be a positive number, not inf"),
+        ({"density": 1e300}, "density must not be negative, and be finite: inf is not possible"),
+        ({"gravity": (0, 0, NAN)}, "gravity must be three finite numbers, not 0.0, 0.0, nan"),
+        ({"impratio": 0}, "impratio must be a positive number"),
+        ({"iterations": -1}, "iterations must not be negative: -1 is not possible"),
+        ({"iterations": 2**40}, "iterations must be an integer of 32 bits"),
     ],
 )
 async def test_options_are_values_that_a_simulation_can_have(

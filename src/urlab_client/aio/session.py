@@ -5,15 +5,26 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
+from urlab_client.aio.control import Control
 from urlab_client.aio.deadline import DEFAULT, Timeout, shared
+from urlab_client.aio.event_loop import running_loop
+from urlab_client.aio.jobs import OnProgress, finish
 from urlab_client.aio.transport.base import RequestTransport
-from urlab_client.protocol.base import Needs, Op, Reply, Request
-from urlab_client.protocol.codec import check_finite, check_request, decode_reply, encode_request, op_of
-from urlab_client.protocol.errors import ConnectionLost, ServerUnreachable, UnknownOp, URLabRPCError, URLabTimeoutError
+from urlab_client.protocol.base import ControlRequest, Needs, Op, Reply, Request
+from urlab_client.protocol.codec import check_finite, check_request, decode_answer, encode_request, op_of
+from urlab_client.protocol.errors import (
+    ConnectionLost,
+    ProtocolError,
+    ServerUnreachable,
+    UnknownOp,
+    URLabRPCError,
+    URLabTimeoutError,
+)
 from urlab_client.protocol.features import Features
-from urlab_client.protocol.messages.session import Hello, HelloOk, Meta
+from urlab_client.protocol.messages.jobs import OpStarted, OpStatus
+from urlab_client.protocol.messages.session import Hello, HelloOk, Meta, StateReply
 
 __all__ = ["Session"]
 
@@ -22,6 +33,13 @@ log = logging.getLogger("urlab_client.session")
 R = TypeVar("R", bound=Reply)
 
 _UNLISTED = frozenset({"hello", "meta"})  # every server has them, none lists them
+
+
+class Limits(NamedTuple):
+    """Loop times by which a request must have been answered, and a connection must stand; None waits."""
+
+    deadline: float | None
+    connect_by: float | None
 
 
 class Session:
@@ -33,6 +51,7 @@ class Session:
     Attributes:
         session_id: Id of the open session; empty without one.
         features: What the server can do, as far as its answers have shown.
+        control: The robots that this client owns.
         on_refusal: Told of each refusal before it is raised.
         confirmed: Whether the server has answered within this session since the connection was made. It may be another
             server after that was lost, which only a refused or accepted session id shows.
@@ -46,7 +65,10 @@ class Session:
         self._transport = transport
         self._default_timeout = default_timeout
         self._json = json
+        self.control = Control(self)
+        self._loop: asyncio.AbstractEventLoop | None = None
         self._turn = asyncio.Lock()
+        self._editing = asyncio.Lock()
         self._queued = 0
         self._aside: asyncio.Task[Reply] | None = None
 
@@ -55,12 +77,15 @@ class Session:
         """What carries the requests."""
         return self._transport
 
-    async def call(self, request: Request[R], *, timeout: Timeout = DEFAULT) -> R:
-        """Send a request and return its reply.
+    async def call(
+        self, request: Request[R], *, timeout: Timeout = DEFAULT, on_progress: OnProgress | None = None
+    ) -> R:
+        """Send a request and return its reply, after the end of the job that it may start.
 
         Args:
             request: Any request struct of `urlab_client.protocol.messages`.
-            timeout: Seconds for queueing, sending and the reply; None waits.
+            timeout: Seconds for queueing, sending and the reply, of a job, too; None waits.
+            on_progress: Told how far a job is.
 
         Raises:
             URLabRPCError: The server refused.
@@ -71,39 +96,78 @@ class Session:
         op = op_of(request)
         if op.name not in _UNLISTED and not self.features.offers(op.name):
             raise UnknownOp("unknown_op", "this server does not offer it. Nothing was sent.", op=op.name)
-        loop = asyncio.get_running_loop()
-        now = loop.time()
-        seconds = self._seconds(op) if timeout is DEFAULT else timeout
-        deadline = None if seconds is None else now + seconds
-        if self._turn.locked() or self._queued:
-            await self._wait_turn(op, deadline)
-        else:
-            await self._turn.acquire()
+        self._loop = running_loop(self._loop)
+        limits = self._limits(op, timeout)
+        if op.needs is not Needs.EDITOR:
+            return await self._in_turn(request, op, limits)
+        # One job at a time: the next op of the editor would wait for it anyway, and block the server meanwhile.
+        await self._acquire(self._editing, op, limits.deadline)
         try:
-            stamped = self.session_id
-            frame = encode_request(request, stamped, json=self._json)
-            if not op.hot:
-                check_finite(request)
-                if not self._json:
-                    check_request(request, frame)
-            connect_by = self._connect_by(now, deadline, timeout)
-            try:
-                answer = await self._transport.request(frame, op, deadline=deadline, connect_by=connect_by)
-            except ConnectionLost as lost:
-                answer = await self._ask_again(frame, op, lost, deadline=deadline, connect_by=connect_by)
+            answer = await self._answer_in_turn(request, op, limits)
+            if not isinstance(answer, OpStarted):
+                return answer
+            status = op_of(OpStatus)
+            return await finish(
+                op,
+                op_reply(request, op),
+                answer,
+                lambda question: self._in_turn(question, status, limits),
+                deadline=limits.deadline,
+                on_progress=on_progress,
+            )
+        finally:
+            self._editing.release()
+
+    async def _in_turn(self, request: Request[R], op: Op, limits: Limits) -> R:
+        answer = await self._answer_in_turn(request, op, limits)
+        if isinstance(answer, OpStarted):
+            raise ProtocolError(f"{op.name}: the server has started {answer.job_id} instead of answering.", op=op.name)
+        return answer
+
+    async def _answer_in_turn(self, request: Request[R], op: Op, limits: Limits) -> R | OpStarted:
+        await self._acquire(self._turn, op, limits.deadline)
+        try:
+            return await self._exchange(request, op, limits)
         finally:
             self._turn.release()
-        if log.isEnabledFor(logging.DEBUG):
-            log.debug(
-                "%s: %d bytes out, %d back in %.3f ms", op.name, len(frame), len(answer), 1e3 * (loop.time() - now)
-            )
+
+    async def _exchange(self, request: Request[R], op: Op, limits: Limits) -> R | OpStarted:
+        """Send a request and return its answer; for whoever has the turn."""
+        if isinstance(request, ControlRequest):
+            return await self.control.send(request, self._ask, limits)
+        return await self._answer(request, op, limits)
+
+    async def _ask(self, request: Request[R], limits: Limits) -> R:
+        op = op_of(request)
+        answer = await self._answer(request, op, limits)
+        if isinstance(answer, OpStarted):
+            raise ProtocolError(f"{op.name}: the server has started {answer.job_id} instead of answering.", op=op.name)
+        return answer
+
+    async def _answer(self, request: Request[R], op: Op, limits: Limits) -> R | OpStarted:
+        began = asyncio.get_running_loop().time()
+        stamped = self.session_id
+        frame = encode_request(request, stamped, json=self._json)
+        if not op.hot:
+            check_finite(request)
+            if not self._json:
+                check_request(request, frame)
         try:
-            reply = decode_reply(op, op_reply(request, op), answer)
+            answer = await self._transport.request(frame, op, deadline=limits.deadline, connect_by=limits.connect_by)
+        except ConnectionLost as lost:
+            answer = await self._ask_again(frame, op, lost, deadline=limits.deadline, connect_by=limits.connect_by)
+        if log.isEnabledFor(logging.DEBUG):
+            took = asyncio.get_running_loop().time() - began
+            log.debug("%s: %d bytes out, %d back in %.3f ms", op.name, len(frame), len(answer), 1e3 * took)
+        try:
+            reply = decode_answer(op, op_reply(request, op), answer)
         except URLabRPCError as refusal:
             # A refusal of what was sent before the latest hello says nothing about the session of now.
             if self.on_refusal is not None and stamped == self.session_id:
                 self.on_refusal(refusal)
             raise
+        if isinstance(reply, StateReply):
+            self.features = self.features.with_reply(reply)
         if not self.confirmed:
             self.confirmed = op.needs is not Needs.NOTHING and stamped == self.session_id
         return reply
@@ -150,12 +214,15 @@ class Session:
             return self._default_timeout
         return max(op.timeout, self._default_timeout)
 
-    def _connect_by(self, now: float, deadline: float | None, timeout: Timeout) -> float | None:
+    def _limits(self, op: Op, timeout: Timeout) -> Limits:
+        now = asyncio.get_running_loop().time()
+        seconds = self._seconds(op) if timeout is DEFAULT else timeout
+        deadline = None if seconds is None else now + seconds
         # A slow op may take long to answer; whether a server is there at all shows much sooner.
         if timeout is not DEFAULT or self._default_timeout is None:
-            return deadline
+            return Limits(deadline, deadline)
         by = now + self._default_timeout
-        return by if deadline is None else min(by, deadline)
+        return Limits(deadline, by if deadline is None else min(by, deadline))
 
     async def _ask_again(
         self, frame: bytes, op: Op, lost: ConnectionLost, *, deadline: float | None, connect_by: float | None
@@ -170,13 +237,16 @@ class Session:
             except ServerUnreachable as unreachable:
                 raise lost from unreachable
 
-    async def _wait_turn(self, op: Op, deadline: float | None) -> None:
+    async def _acquire(self, lock: asyncio.Lock, op: Op, deadline: float | None) -> None:
+        if not lock.locked() and not self._queued:
+            await lock.acquire()
+            return
         if self._aside is not None:
             self._aside.cancel()
         self._queued += 1
         try:
             async with asyncio.timeout_at(deadline):
-                await self._turn.acquire()
+                await lock.acquire()
         except TimeoutError:
             raise URLabTimeoutError(
                 f"{op.name}: another call held {self._transport.endpoint} until the deadline. Nothing was sent.",

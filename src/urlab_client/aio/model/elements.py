@@ -107,7 +107,9 @@ class Actuator:
             TypeError: It is not a number.
             ValueError: It is NaN, infinite, or, with `error`, out of range; nothing was set.
         """
-        self._record.ctrl[self.ctrl_local] = self.checked(v, OutOfRange(out_of_range))
+        value = self.checked(v, OutOfRange(out_of_range))
+        self._record.drive()
+        self._record.ctrl[self.ctrl_local] = value
 
     def checked(self, v: object, out_of_range: OutOfRange) -> float | Floats:
         """Return what `set_control` would set; raises as it does."""
@@ -246,7 +248,7 @@ class ArticulationElements:
 def make_elements(record: MirroredArticulation) -> ArticulationElements:
     """Make the handles of an articulation; without a local model only its actuators are known, by name and type."""
     model, layout, original = record.mirror.model, record.layout, record.info.original_names
-    prefix = record.name
+    prefix = record.info.compiled_prefix
     return ArticulationElements(
         joints=_named(prefix, "joint", _joints(record, model), original.joints),
         actuators=_named(prefix, "actuator", _actuators(record, model), original.actuators),

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import msgspec
 
 from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.namespaces._base import Namespace
 from urlab_client.aio.session import Session
 from urlab_client.aio.state.sim_state import SimState
@@ -56,7 +57,7 @@ class SimNamespace(Namespace):
         Raises:
             URLabPIEError: Play did not become ready; its message carries the compile log.
         """
-        loop = asyncio.get_running_loop()
+        loop = running_loop()
         deadline = loop.time() + timeout_s
         # In slices: while the server waits for the compile it answers nobody, this client included.
         reply = await self._begin(level_path, min(timeout_s, _SLICE_S), timeout)
@@ -97,7 +98,7 @@ class SimNamespace(Namespace):
             GameThreadTimeout: The editor did not react; often a modal dialog is open.
             URLabTimeoutError: The editor agreed, but play has not ended after ten seconds.
         """
-        loop = asyncio.get_running_loop()
+        loop = running_loop()
         self._state.stopping = True
         # On Windows, what we have mapped the server could neither remove nor make anew.
         self._state.publishers.release_regions()

@@ -12,7 +12,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import anyio.to_thread
 import numpy as np
@@ -28,17 +28,19 @@ from urlab_client.aio.session import Session
 from urlab_client.aio.state.handshake import Examined, examine
 from urlab_client.aio.state.recovery import PendingOutcomes
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.enums import CameraMode, StepMode
+from urlab_client.protocol.enums import LATER_MODE_NAMES, CameraMode, StepMode
 from urlab_client.protocol.errors import (
+    BadMode,
     NoActiveManager,
     ProtocolError,
     SessionTakenOver,
     URLabError,
     URLabRPCError,
 )
-from urlab_client.protocol.messages.runtime import SetMode
+from urlab_client.protocol.messages.runtime import SetMode, SetPaused
 from urlab_client.protocol.messages.session import (
     NOT_SENT,
+    ArticulationCommand,
     ArticulationState,
     CameraFrame,
     CameraInfo,
@@ -141,9 +143,12 @@ class SimState:
         self.sim_time_sec = self.sim_time_nsec = 0
         self.wall_time_sec = self.wall_time_nsec = 0
         self.recv_wall_time_ns = 0
+        self.user: dict[str, Any] = {}
         self._local_model = local_model
         self._check_version = check_version
+        self._mismatch_said = False
         session.on_refusal = self._note_refusal
+        session.control.resolve = self._articulation_key
         self._promote = promote
         self._trusted = trusted
         self._live_pictures = live_pictures
@@ -192,6 +197,37 @@ class SimState:
         """Records of the plain entities, by name."""
         return self._entity_records
 
+    def _articulation_key(self, name: str) -> str | None:
+        articulation = self.articulations.get(name)
+        return None if articulation is None else articulation.prefix
+
+    def direct_commands(self) -> dict[str, ArticulationCommand]:
+        """Return what a step tells the articulations and entities, wrenches included."""
+        claims = self.session.features.claims
+        # A server whose robots have owners refuses a step that writes to others' robots, so it hears of ours only.
+        commands = {
+            key: record.direct_command() for key, record in self._records.items() if record.driven or not claims
+        }
+        for name, record in self._entity_records.items():
+            if not record.wrenches:
+                continue
+            if not claims:
+                # Under its own name: the server tries the body's name alone after `<key>_<body>`.
+                commands[name] = record.wrench_command()
+            elif self._records:
+                # An entity has no owner, so one of the robots takes it along.
+                key = next(iter(commands or self._records))
+                carrier = commands.setdefault(key, ArticulationCommand())
+                carrier.xfrc_applied = {**(carrier.xfrc_applied or {}), **record.wrenches}
+        return commands
+
+    def live_commands(self) -> dict[str, ArticulationCommand]:
+        """Return what a step in live mode tells the articulations."""
+        if self.session.features.live_pictures_in_steps:
+            return self.direct_commands()
+        claims = self.session.features.claims
+        return {key: record.live_command() for key, record in self._records.items() if record.driven or not claims}
+
     def buffered_wrenches(self) -> list[tuple[MirroredEntity, Wrenches]]:
         """Return what a direct step is about to carry."""
         records: list[MirroredEntity] = [*self._records.values(), *self._entity_records.values()]
@@ -208,18 +244,30 @@ class SimState:
             )
         )
         self.level = self.sent_level = observations
-        if self._local_model and hello.mjb is not None:
-            mismatch = self.mirror.check_version(hello)
-            if mismatch is not None:
-                if self._check_version:
-                    raise mismatch
+        await self.adopt(hello, timeout=left())
+        return hello
+
+    async def _loadable(self, hello: HelloOk, timeout: Timeout) -> HelloOk:
+        """Return a handshake whose model this process can and may load.
+
+        Raises:
+            URLabVersionMismatch: It is another MuJoCo's, and the user wants to hear of that.
+            URLabError: The server is not trusted with binary models and offers no other.
+        """
+        mismatch = self.mirror.check_version(hello)
+        if mismatch is not None:
+            if self._check_version:
+                raise mismatch
+            if not self._mismatch_said:
+                self._mismatch_said = True
                 warnings.warn(
                     f"{mismatch.args[0]} The local model is compiled here from XML and only approximates the server's.",
                     stacklevel=2,
                 )
-                request = Hello(observations=observations, include_assets=True)
-                hello = await self.session.hello(request, timeout=left())
-        await self.adopt(hello, timeout=left())
+            if hello.mjcf_compiled is None:
+                hello = await self.session.hello(Hello(observations=self.level, include_assets=True), timeout=timeout)
+        if hello.mjb is not None and not self._trusted:
+            hello = await self._without_binary(hello, timeout)
         return hello
 
     async def _without_binary(self, hello: HelloOk, timeout: Timeout) -> HelloOk:
@@ -248,8 +296,8 @@ class SimState:
         await self.session.transport.follow(hello)
         loaded = None
         if self._local_model:
-            if hello.mjb is not None and not self._trusted:
-                hello = await self._without_binary(hello, timeout)
+            if hello.mjb is not None:
+                hello = await self._loadable(hello, timeout)
             load = partial(self.mirror.load, hello, trusted=self._trusted)
             loaded = await anyio.to_thread.run_sync(load, abandon_on_cancel=True)
         examined = examine(hello, None if loaded is None else loaded.model)
@@ -290,10 +338,26 @@ class SimState:
 
     async def ask_mode(self, mode: StepMode, *, timeout: Timeout = DEFAULT) -> StepMode:
         """Bring the server into a step mode, take over the one in force, and return the one before."""
+        left = shared(timeout)
         with self.pending.about_mode(mode):
-            reply = await self.session.call(SetMode(mode=mode), timeout=timeout)
-        self.mode = reply.current_mode
+            try:
+                reply = await self.session.call(SetMode(mode=mode), timeout=left())
+            except BadMode:
+                # Servers after the beta call the modes by other names.
+                reply = await self.session.call(SetMode(mode=LATER_MODE_NAMES.get(mode, mode)), timeout=left())
+        try:
+            if self.session.features.idles_in_puppet:
+                await self._still_puppet(reply.previous_mode, reply.current_mode, left())
+        finally:
+            self.mode = reply.current_mode
         return reply.previous_mode
+
+    async def _still_puppet(self, previous: StepMode, current: StepMode, timeout: Timeout) -> None:
+        """Keep physics from taking steps of its own between the pushes of puppet mode, and undo that afterwards."""
+        if current is StepMode.PUPPET:
+            await self.session.call(SetPaused(paused=True), timeout=timeout)
+        elif previous is StepMode.PUPPET and current is StepMode.LIVE:  # direct mode takes the pause back itself
+            await self.session.call(SetPaused(paused=False), timeout=timeout)
 
     def _global_camera(self, name: str, info: CameraInfo) -> URLabCameraView:
         view = self.global_cameras.get(name)
@@ -318,8 +382,8 @@ class SimState:
             else:
                 record.bind(info, layout)
             wrappers[key] = self.articulations.get(key) or URLabArticulation(record, self.session, self.publishers)
-            found = _ENGINE_NAME.fullmatch(key)
-            for alias in {info.actor_id, found["stem"] if found else ""} - {""}:
+            found = _ENGINE_NAME.fullmatch(info.compiled_prefix)
+            for alias in {info.actor_id, info.compiled_prefix, found["stem"] if found else ""} - {"", key}:
                 aliases.setdefault(alias, []).append(key)
         self._records = {key: self._records[key] for key in wrappers}
         self.articulations = NameMap(wrappers, aliases, kind="articulation")
@@ -439,6 +503,8 @@ class SimState:
     def _absorb_clocks(self, reply: StateReply | StateSnapshot, received: int) -> None:
         self.step_count = reply.step
         self.sim_time = reply.time
+        if isinstance(reply, StateSnapshot):
+            self.user = reply.user
         self.recv_wall_time_ns = received
         if reply.sim_time is not None:
             self.sim_time_sec, self.sim_time_nsec = reply.sim_time.sec, reply.sim_time.nsec
@@ -446,14 +512,15 @@ class SimState:
             self.wall_time_sec, self.wall_time_nsec = reply.wall_time.sec, reply.wall_time.nsec
 
     def mirror_qpos(self, key: str, qpos: Floats) -> None:
-        """Take over the leading joint positions of an articulation that `set_qpos` wrote.
+        """Take over the leading joint positions of an articulation that `set_qpos` wrote, by any of its names.
 
         Raises:
             ProtocolError: They are neither all of its positions nor those of its free base.
         """
-        record = self._records.get(key)
-        if record is None:
+        articulation = self.articulations.get(key)
+        if articulation is None:
             return
+        record = self._records[articulation.prefix]
         record.check_written(qpos)
         with self.mirror.lock:
             record.qpos = np.concatenate([qpos, record.qpos[len(qpos) :]])
@@ -487,6 +554,7 @@ class SimState:
         if self.hello is not None:
             self.hello.manager_present = False
         self.publishers.release_regions()
+        self.session.control.forget()
         self.mode = StepMode.LIVE
         self.promoted_from = None
         if played:

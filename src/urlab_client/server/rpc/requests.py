@@ -13,7 +13,7 @@ import re
 import types
 from collections.abc import Callable, Iterable, Mapping
 from enum import Enum
-from functools import cache
+from functools import cache, cached_property
 from typing import Annotated, Any, Final, TypeAlias, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import msgspec
@@ -115,7 +115,6 @@ class RequestReader:
                 Union[tuple(strict)],  # noqa: UP007 - a union of a run-time list
                 dec_hook=_strict_array,
             )
-        self._collides = {kind: _collision_test(_type_info(kind)) for kind in self._exact}
 
     def read(self, frame: bytes) -> Incoming:
         """Read one frame.
@@ -128,7 +127,7 @@ class RequestReader:
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
             return self._read_loosely(frame)
         kind = type(request)
-        collides = self._collides[kind]
+        collides = _collision_test_of(kind)
         if len(frame) > self._limits.request_bytes or (collides is not None and collides(request)):
             return self._read_loosely(frame)
         op = self._exact[kind]
@@ -190,13 +189,20 @@ def _session_id(fields: Mapping[str, Plain]) -> str:
 class _LooseOp:
     """What the field-by-field way needs to know of an op."""
 
-    __slots__ = ("convert", "declared", "exact", "op")
-
     def __init__(self, op: Op, struct: type[Request[Any]]) -> None:
         self.op = op
         self.exact = op.name in ("hello", "meta")
-        self.declared = op.declared_required
-        self.convert = _struct_converter(struct)
+        self._struct = struct
+
+    # Found out when first needed: a server that reads few kinds of requests starts the sooner.
+
+    @cached_property
+    def declared(self) -> tuple[str, ...]:
+        return self.op.declared_required
+
+    @cached_property
+    def convert(self) -> Callable[[dict[str, Plain]], Any]:
+        return _struct_converter(self._struct)
 
 
 # Bytes to plain data.
@@ -402,6 +408,11 @@ def _collision_test(info: inspect.Type) -> Callable[[Any], bool] | None:
             return _struct_collision_test(tests) if tests else None
         case _:
             return None
+
+
+@cache
+def _collision_test_of(kind: type) -> Callable[[Any], bool] | None:
+    return _collision_test(_type_info(kind))
 
 
 def _map_collision_test(test: Callable[[Any], bool] | None) -> Callable[[Any], bool]:

@@ -1,7 +1,8 @@
 """The shared-memory transport of a server: requests and replies in two regions, state and pictures in others.
 
-For `SimulatedServer`. One thread watches the request region. With our own client it sleeps until the doorbell rings;
-for clients without one, as the plugin's, it looks every 100 µs while they are at work and every 5 ms otherwise.
+For `SimulatedServer`. One thread watches the request region. With our own client it sleeps until the doorbell rings, or
+on Windows the named event is set; for clients without one, as the plugin's, it looks every 100 µs while they are at
+work and every 5 ms otherwise.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import Final, cast
 
 from urlab_client._processors import crowded
+from urlab_client._windows import NamedEvent
 from urlab_client.protocol import doorbell
 from urlab_client.protocol.errors import ProtocolError
 from urlab_client.protocol.shm import (
@@ -297,9 +299,14 @@ class SharedMemoryServer:
 
 
 class _Bell:
-    """The server's end of the doorbell; see `urlab_client.protocol.doorbell`. Without Unix sockets nobody rings."""
+    """The server's end of the doorbell; see `urlab_client.protocol.doorbell`.
+
+    Windows has no Unix sockets in Python. There the plugin's named events tell of requests and replies.
+    """
 
     def __init__(self, directory: Path) -> None:
+        self._asked = NamedEvent(f"Local\\URLab_{directory.name}_req_ready", create=True)
+        self._answered = NamedEvent(f"Local\\URLab_{directory.name}_rep_ready", create=True)
         self._wants: dict[socket.socket, set[bytes]] = {}
         self._lock = threading.Lock()
         self._selector = selectors.DefaultSelector()
@@ -322,6 +329,8 @@ class _Bell:
 
     def ring(self, ring: bytes) -> None:
         """Tell the clients, without waiting for any. From any thread."""
+        if ring == doorbell.REPLY:
+            self._answered.set()
         with self._lock:
             for client, wants in self._wants.items():
                 if ring == doorbell.REPLY or ring in wants:
@@ -330,11 +339,14 @@ class _Bell:
 
     def wake(self) -> None:
         """End `wait`. From any thread."""
+        self._asked.set()
         with contextlib.suppress(OSError):
             self._waker.send(b"\0")
 
     def wait(self, seconds: float) -> bool:
         """Wait until a client rings, or for so long; return whether one announced a request."""
+        if self._asked.exists:
+            return self._asked.wait(seconds)
         if self._door_shut_until and time.monotonic() >= self._door_shut_until:
             self._open_door()
         if seconds < _SELECTOR_STEP_S:
@@ -345,6 +357,8 @@ class _Bell:
 
     def close(self) -> None:
         """Let everybody go and remove the socket."""
+        self._asked.close()
+        self._answered.close()
         with self._lock:
             for client in self._wants:
                 client.close()
