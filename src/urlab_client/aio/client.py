@@ -20,6 +20,7 @@ from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.explain import diagnose
 from urlab_client.aio.launch import SCHEME, LaunchedTransport
+from urlab_client.aio.live.camera_switch import CameraSwitch
 from urlab_client.aio.live.publishers import Publishers
 from urlab_client.aio.model.mirror import model_names
 from urlab_client.aio.model.numbers import finite
@@ -35,6 +36,7 @@ from urlab_client.aio.session import Session
 from urlab_client.aio.state.connection_monitor import ConnectionMonitor
 from urlab_client.aio.state.recovery import resync
 from urlab_client.aio.state.sim_state import SimState
+from urlab_client.aio.state.step_pictures import StepPictures
 from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS, Stream
 from urlab_client.aio.transport.base import RequestTransport, TransportStats
 from urlab_client.aio.transport.curve import ClientKeys, client_keys, is_local
@@ -47,7 +49,7 @@ from urlab_client.protocol.errors import UnknownKeyframe, URLabError
 from urlab_client.protocol.messages.session import Meta as MetaRequest
 from urlab_client.protocol.messages.session import MetaOk, OpInfo, Reset, ResetOk, Step, StepOk
 from urlab_client.protocol.messages.streams import ClientEvent, RowSample, StateSnapshot, StreamPolicy
-from urlab_client.protocol.names import NameMap, unknown_name
+from urlab_client.protocol.names import NameMap
 from urlab_client.protocol.rows import TopicKind
 from urlab_client.protocol.types import ClientConfig, Diagnosis, Resync, ServerInfo
 
@@ -60,7 +62,6 @@ log = logging.getLogger("urlab_client.client")
 
 R = TypeVar("R", bound=Reply)
 
-_SYNC_CAMERA_S = 3.0  # the server waits up to 2 s + 1 s for each
 _REVERT_S = 1.0
 
 _HOST = re.compile(r"(\[[^\[\]\s]+\]|[^:\[\]\s]+)(:(?P<port>[0-9]+))?")
@@ -176,6 +177,7 @@ class URLabClient:
             keys=keys,
             memory=memory,
         )
+        self._publishers.camera_switch = CameraSwitch(self._session, self._publishers.subscriptions.refresh)
         self._state = SimState(
             self._session,
             self._publishers,
@@ -422,7 +424,8 @@ class URLabClient:
         Args:
             n_steps: Physics steps.
             include_cameras: True for the newest frame of every camera, or camera name to `sync` (rendered after the
-                step) or `latest`. Ignored in live mode.
+                step) or `latest`. A `sync` picture that came out older than the step is left out of the reply, as one
+                that did not come. Ignored in live mode by servers that draw in the other modes only.
             observations: Level of this reply alone; default the level of the session.
             timeout: Seconds to wait; None waits without limit.
 
@@ -441,29 +444,25 @@ class URLabClient:
         cameras = self._cameras(include_cameras)
         for observer in state.observers:
             cameras = observer.wanted_pictures(cameras, n_steps)
-        if timeout is DEFAULT and isinstance(cameras, dict):
-            waits = sum(timing == CameraTiming.SYNC for timing in cameras.values())
-            timeout = _SYNC_CAMERA_S * waits + (op_of(Step).timeout or 0.0) if waits else DEFAULT
+        pictures = StepPictures(state, cameras)
+        if timeout is DEFAULT and pictures.seconds:
+            timeout = pictures.seconds + (op_of(Step).timeout or 0.0)
         if state.mode is StepMode.LIVE:
-            carried = state.buffered_wrenches() if self._session.features.live_pictures_in_steps else []
-            request = Step(per_articulation=state.live_commands() or None)
-            reply = await self._session.call(request, timeout=timeout)
-            for record, wrenches in carried:
-                record.drop_wrenches(wrenches)
-            state.absorb(reply, "step")
-            return reply
+            return await self._live_step(pictures, timeout)
         request = self._puppet_request(n_steps) if state.mode is StepMode.PUPPET else self._direct_request(n_steps)
         carried = state.buffered_wrenches()
-        request.include_cameras = cameras
+        if pictures:
+            pictures.ask(request)
         if level != state.sent_level:
             request.observations = level
         state.sent_level = ""  # unknown to us until the server has answered
         try:
             reply = await self._session.call(request, timeout=timeout)
-            state.sent_level = level
+            state.sent_level = level if self._session.features.level_sticks else state.level
             if state.mode is StepMode.DIRECT:
                 for record, wrenches in carried:
                     record.drop_wrenches(wrenches)
+            pictures.take(reply)
             state.absorb(reply, "step", into_mirror=state.mode is not StepMode.PUPPET)
         except BaseException as error:
             state.pending.add_steps(state, error, 1 if state.mode is StepMode.PUPPET else max(n_steps, 1), carried)
@@ -473,8 +472,8 @@ class URLabClient:
         if state.mode is StepMode.PUPPET:
             with state.mirror.lock:
                 state.mirror.perturb(reply.perturbation)
-        if cameras:
-            state.note_missing_frames(cameras, reply)
+        if pictures:
+            state.note_missing_frames(pictures.names, reply)
         return reply
 
     async def reset(
@@ -653,7 +652,10 @@ class URLabClient:
         promoted_from = self._state.promoted_from
         self._publishers.close()
         try:
-            await self._session.control.aclose(connected=self.connected and self.manager_present)
+            playing = self.connected and self.manager_present
+            if self._publishers.camera_switch is not None:
+                await self._publishers.camera_switch.aclose(connected=playing)
+            await self._session.control.aclose(connected=playing)
             await self._watch.aclose()
             if promoted_from is not None and self.connected and self.manager_present:
                 with contextlib.suppress(URLabError):  # a courtesy: the server may have moved on
@@ -679,6 +681,22 @@ class URLabClient:
             "URLabClient cannot be pickled: it belongs to a connection of this process. "
             "Send client.config, and make a client from it: URLabClient(**config.options())."
         )
+
+    async def _live_step(self, pictures: StepPictures, timeout: Timeout) -> StepOk:
+        state = self._state
+        everything = self._session.features.live_pictures_in_steps
+        carried = state.buffered_wrenches() if everything else []
+        request = Step(per_articulation=state.live_commands() or None)
+        if pictures and everything:
+            pictures.ask(request)
+        reply = await self._session.call(request, timeout=timeout)
+        for record, wrenches in carried:
+            record.drop_wrenches(wrenches)
+        pictures.take(reply)
+        state.absorb(reply, "step")
+        if request.include_cameras:
+            state.note_missing_frames(pictures.names, reply)
+        return reply
 
     def _direct_request(self, n_steps: int) -> Step:
         return Step(n_steps=n_steps, per_articulation=self._state.direct_commands() or None)
@@ -707,10 +725,6 @@ class URLabClient:
     def _cameras(self, include: bool | Mapping[str, str | CameraTiming]) -> bool | dict[str, str | None]:
         if isinstance(include, bool):
             return include
-        for name in include:
-            if self._state.camera(name) is None:
-                known = [f"{art.prefix}/{camera}" for art in self.articulations.values() for camera in art.cameras]
-                raise unknown_name("camera", name, [*known, *self.global_cameras])
         return {name: str(CameraTiming(timing)) for name, timing in include.items()}
 
     def _state_port(self) -> int:

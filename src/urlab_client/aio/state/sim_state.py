@@ -10,6 +10,7 @@ import math
 import re
 import time
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any, NamedTuple, Protocol
@@ -52,7 +53,7 @@ from urlab_client.protocol.messages.session import (
     StepOk,
 )
 from urlab_client.protocol.messages.streams import PlayEnded, PlayStarted, SessionLost, SessionOpened, StateSnapshot
-from urlab_client.protocol.names import NameMap
+from urlab_client.protocol.names import NameMap, unknown_name
 from urlab_client.protocol.rows import Pixels, decode_camera
 from urlab_client.protocol.sim_options import check_sim_options
 from urlab_client.protocol.types import SimOptions
@@ -74,7 +75,7 @@ class _Checked(NamedTuple):
     reply: StateReply | StateSnapshot
     articulations: list[tuple[MirroredArticulation, ArticulationState]]
     entities: list[tuple[MirroredEntity, EntityState]]
-    pictures: list[tuple[URLabCameraView, Pixels]]
+    pictures: list[tuple[URLabCameraView, Pixels, CameraFrame]]
 
 
 class StateObserver(Protocol):
@@ -319,6 +320,8 @@ class SimState:
             self.step_count = 0
         self._views()  # binds the cameras to what the handshake says of them
         self.publishers.refresh()
+        if self.publishers.camera_switch is not None:
+            self.publishers.camera_switch.restart([view.info for view in self._views()])
         if hello.manager_present and not played:
             self.publishers.events.publish(PlayStarted(articulations=list(self.articulations)))
         if self.on_adopted is not None:
@@ -465,10 +468,10 @@ class SimState:
             entities = [(known[name], state) for name, state in reply.entities.items() if name in known]
             for record, state in entities:
                 record.check_pose(state, op)
-        pictures: list[tuple[URLabCameraView, Pixels]] = []
+        pictures: list[tuple[URLabCameraView, Pixels, CameraFrame]] = []
         if isinstance(reply, StepOk):
             self._check_perturbation(reply.perturbation, op)
-            pictures = [(view, _pixels(view, frame)) for view, frame in self._frames(reply.cameras or {})]
+            pictures = [(view, _pixels(view, frame), frame) for view, frame in self._frames(reply.cameras or {})]
         return _Checked(reply, articulations, entities, pictures)
 
     def _take_over(self, checked: _Checked, received: int, *, into_mirror: bool) -> None:
@@ -480,12 +483,16 @@ class SimState:
                     record.write_mirror(state)
             for record, state in checked.entities:
                 record.absorb_pose(state, into_mirror=into_mirror)
-            for view, pixels in checked.pictures:
-                view.pictures.deliver(pixels, reply.time)
+            for view, pixels, frame in checked.pictures:
+                taken = reply.time if frame.sim_time is None else frame.sim_time
+                view.pictures.deliver(pixels, taken, frame.frame_id)
             if into_mirror and self.mirror.data is not None:
                 self.mirror.data.time = reply.time
             self.mirror.mark_stale()
             self._absorb_clocks(reply, received)
+        own = self.publishers.own_steps
+        if own and isinstance(reply, StateReply) and not (self.live or self.session.features.publishes_steps):
+            own.publish(reply)
         for observer in self.observers:
             observer.on_state(reply)
 
@@ -562,12 +569,9 @@ class SimState:
             if self.on_adopted is not None:
                 self.on_adopted()
 
-    def note_missing_frames(self, asked: bool | Mapping[str, str | None], reply: StepOk) -> None:
+    def note_missing_frames(self, asked: Iterable[str], reply: StepOk) -> None:
         """Mark the cameras whose frame was asked for and did not come: the server just leaves them out."""
-        if isinstance(asked, bool):
-            views = [view for art in self.articulations.values() for view in art.cameras.values()] if asked else []
-        else:
-            views = [view for view in map(self.camera, asked) if view is not None]
+        views = [view for view in map(self.camera, asked) if view is not None]
         came = {id(self.camera(name)) for name in reply.cameras or {}}
         for view in views:
             if view.delivered and id(view) not in came:
@@ -577,21 +581,68 @@ class SimState:
     def _frames(self, cameras: Mapping[str, CameraFrame]) -> list[tuple[URLabCameraView, CameraFrame]]:
         found: list[tuple[URLabCameraView, CameraFrame]] = []
         for name, frame in cameras.items():
-            view = self.camera(name)
+            view = self.camera(name) or self._scene_camera(name, frame)
             if view is None:
                 raise ProtocolError(f"step: a frame of camera {name!r}, which the handshake does not list.", op="step")
             found.append((view, frame))
         return found
 
-    def camera(self, name: str) -> URLabCameraView | None:
-        """Return the camera that the wire calls `<articulation>/<camera>` or just `<camera>`, or None."""
-        prefix, slash, short = name.rpartition("/")
+    def _scene_camera(self, name: str, frame: CameraFrame) -> URLabCameraView | None:
+        """Return a view of a camera of the scene that was announced by its picture alone."""
+        if not self.hidden_cameras:
+            return None
+        mode = CameraMode.DEPTH if frame.dtype == "float32" else CameraMode.REAL
+        info = CameraInfo(mode=mode, resolution=(frame.width, frame.height), fovy=0.0, zmq_endpoint="", zmq_topic=name)
+        view = URLabCameraView(name, info, self.publishers)
+        self.global_cameras = NameMap({**self.global_cameras, name: view}, kind="camera")
+        return view
+
+    def camera_names(self) -> list[str]:
+        """Return a name of each camera that no other has: `<articulation>/<camera>`, or the scene's."""
+        own = [f"{art.prefix}/{name}" for art in self.articulations.values() for name in art.cameras]
+        return [*own, *self.global_cameras]
+
+    def shown_cameras(self, names: Iterable[str]) -> dict[str, str]:
+        """Return what users call cameras by `camera_names`: by the name alone where that means one of them."""
+        short = {name: name.rpartition("/")[2] for name in names}
+        counts = Counter(short.values())
+        return {name: bare if counts[bare] == 1 else name for name, bare in short.items()}
+
+    def camera_name(self, name: str) -> str:
+        """Return which of `camera_names` a user means by `<articulation>/<camera>` or just `<camera>`.
+
+        Raises:
+            KeyError: None of them, or several.
+        """
+        names = self.camera_names()
+        owner, slash, short = name.rpartition("/")
         if slash:
-            art = self.articulations.get(prefix)
-            return None if art is None else art.cameras.get(short)
-        # As on the server, the articulation listed last wins when several have a camera of that name.
-        owners = [art for art in self.articulations.values() if name in art.cameras]
-        return owners[-1].cameras[name] if owners else self.global_cameras.get(name)
+            art = self.articulations.get(owner)
+            found = [f"{art.prefix}/{short}"] if art is not None and short in art.cameras else []
+        else:
+            found = [known for known in names if known == name or known.endswith(f"/{name}")]
+        if len(found) != 1:
+            raise (
+                unknown_name("camera", name, names)
+                if not found
+                else KeyError(f"camera {name!r} is ambiguous: it could mean {' or '.join(map(repr, found))}")
+            )
+        return found[0]
+
+    @property
+    def hidden_cameras(self) -> bool:
+        """Whether the scene may have cameras that the handshake does not list."""
+        return any("/" in name for record in self._records.values() for name in record.info.camera_topics)
+
+    def camera(self, name: str) -> URLabCameraView | None:
+        """Return the camera that a user means by `<articulation>/<camera>` or just `<camera>`, or None."""
+        if name in self.global_cameras:
+            return self.global_cameras[name]
+        try:
+            owner, _, short = self.camera_name(name).rpartition("/")
+        except KeyError:
+            return None
+        return self.articulations[owner].cameras[short] if owner else self.global_cameras[short]
 
 
 def _listed(keys: Iterable[str]) -> str:
