@@ -61,7 +61,7 @@ import tomllib
 
 with open(sys.argv[1], "rb") as file:
     project = tomllib.load(file)["project"]
-for requirement in [*project["dependencies"], *project["optional-dependencies"]["test"], "colorama"]:
+for requirement in [*project["dependencies"], *project["optional-dependencies"]["test"], "cffi", "colorama"]:  # pip asks Linux what Windows needs
     if not requirement.startswith(("selenium", "uvloop")):
         print(requirement)
 EOF
