@@ -35,6 +35,10 @@ if [[ ! -e $target/py/python.exe ]]; then
     mv "$target/py/DLLs/python311.dll" "$target/py/"
     cp -r /usr/lib/python3.11 "$target/py/Lib"
     rm -rf "$target"/py/Lib/{lib-dynload,dist-packages,test} "$target"/py/Lib/config-*
+    # Debian's 3.11.2 has it without the decorator that later releases of 3.11, as this interpreter, count on.
+    metadata=$target/py/Lib/importlib/metadata/__init__.py
+    grep -B 1 'def invalidate_caches(cls)' "$metadata" | grep -q classmethod ||
+        sed -i 's/^    def invalidate_caches(cls):/    @classmethod\n&/' "$metadata"
     mkdir -p "$site"
     x86_64-w64-mingw32-gcc -municode -O2 -o "$target/py/python.exe" "$here/launcher.c"
     # Wine 8 lacks the C runtime's complex functions, which NumPy imports: a DLL of our own has them.
