@@ -63,6 +63,9 @@ SLICE_S: Final = 0.05
 MAX_SLICE: Final = 1000
 """Sub-steps in such a slice at most, for models that get slower while they run."""
 
+LEAST_PATIENCE_S: Final = 1.0
+"""A call of MuJoCo does not count as overdue before; a slice of a long request may take a while on a busy machine."""
+
 INLINE_SHARE: Final = 0.02
 """A direct step expected to take less than this share of the step timeout runs on the calling thread."""
 
@@ -133,7 +136,7 @@ class Engine:
             health: Told when the physics thread dies.
         """
         self.scene = scene
-        self._call = _MujocoCall(step_timeout_s)
+        self._call = _MujocoCall(max(step_timeout_s, LEAST_PATIENCE_S))
         self.lock = DataLock(step_timeout_s, self._call)
         self.on_substep: list[Hook] = []
         self.on_tick: list[Hook] = []
@@ -263,7 +266,7 @@ class Engine:
 
     @property
     def overdue(self) -> Overdue | None:
-        """The call of MuJoCo that has not come back for longer than the step timeout, or None."""
+        """The call of MuJoCo that has not come back for longer than a step may take, or None."""
         return self._call.overdue
 
     @contextmanager
@@ -735,7 +738,7 @@ class Engine:
 
 @dataclass(frozen=True)
 class Overdue:
-    """A call of MuJoCo that takes longer than the step timeout.
+    """A call of MuJoCo that takes longer than a step may.
 
     Attributes:
         thread: The thread that is in it.
