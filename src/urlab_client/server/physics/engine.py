@@ -21,9 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client._mujoco import reset_controls
+from urlab_client.protocol.dialects import ALPHA, Dialect
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.messages.session import ArticulationCommand, Step
-from urlab_client.server.compile.scene import CompiledScene
+from urlab_client.server.compile.scene import ArticulationIndex, CompiledScene
 from urlab_client.server.physics.controllers import ArticulationControl, ControllerConfig, ControlSource, Twist, float32
 from urlab_client.server.physics.replay import Player
 from urlab_client.server.refusal import Refusal
@@ -103,7 +104,11 @@ class Engine:
         lock: Guards the model, the data and this object. Re-entrant. `with engine.lock` raises a `not_ready` refusal
             when physics keeps it for longer than the step timeout. Not to be held while calling `step` or `close`,
             which may have to wait for the physics thread.
-        controls: Set-points, controller and twist of each articulation, by articulation key.
+        dialect: What the server says in the way of one generation of the plugin.
+        controls: Set-points, controller and twist of each articulation, by what it is called in requests and replies.
+        names: What each articulation is called in requests and replies, by the key of its compiled names.
+        frame_id: Number of the newest snapshot of the state; grows with each request that steps, and in live mode with
+            each iteration that moves.
         on_substep: Called under the lock after each integration step and each puppet push.
         on_tick: Called under the lock after each live iteration (also while paused) and each direct request, and about
             ten times a second while a stepped mode idles. A hook of either list that raises is logged and removed.
@@ -119,6 +124,7 @@ class Engine:
         controllers: Mapping[str, ControllerConfig] = MappingProxyType({}),
         step_timeout_s: float = 5.0,
         health: Health | None = None,
+        dialect: Dialect = ALPHA,
     ) -> None:
         """Prepare a scene for stepping; `start` sets it going.
 
@@ -129,8 +135,10 @@ class Engine:
             controllers: Controller to attach by articulation key; `*` stands for all keys not listed.
             step_timeout_s: Seconds a direct step may take before its caller is told `step_timeout`.
             health: Told when the physics thread dies.
+            dialect: Decides what articulations are called, and what steps do besides.
         """
         self.scene = scene
+        self.dialect = dialect
         self.lock = DataLock(step_timeout_s)
         self.on_substep: list[Hook] = []
         self.on_tick: list[Hook] = []
@@ -145,16 +153,20 @@ class Engine:
         everyone = controllers.get("*")
         self.controls: Mapping[str, ArticulationControl] = MappingProxyType(
             {
-                index.key: ArticulationControl(self._model, index, neutral, controllers.get(index.key, everyone))
-                for index in scene.articulations
+                name: ArticulationControl(self._model, index, neutral, controllers.get(index.key, everyone))
+                for name, index in _named(scene, dialect)
             }
         )
-        self._folded = {key.casefold(): control for key, control in reversed([*self.controls.items()])}
+        self._folded = _folded(self.controls, dialect)
+        self._names = {control: name for name, control in self.controls.items()}
+        self.names: Mapping[str, str] = {control.index.key: name for name, control in self.controls.items()}
         self._pinned = None if pinned_mode is StepMode.AUTO else pinned_mode
         self._mode = self._pinned or StepMode.LIVE
         self._paused = paused
         self._speed = 100.0
         self._step_count = 0
+        self.frame_id = 0
+        self._live_pushed: list[int] = []
         self._fault: str | None = None
         self._death: str | None = None
         self._health = Health() if health is None else health
@@ -317,7 +329,7 @@ class Engine:
                 raise _busy()
             queued = _QueuedStep(request, observe)
             self._queue.append(queued)
-            return queued.wait(0.0, self._step_timeout_s)
+            return self._await(queued, 0.0)
         try:
             mode = self._mode
             if self._stopping:
@@ -331,6 +343,10 @@ class Engine:
                 raise Refusal("not_ready", self._fault)
             if mode is not StepMode.DIRECT:
                 self._stage_positional(request)
+                if self.dialect.live_commands:
+                    commands = request.per_articulation or {}
+                    self._stage_named(commands)
+                    self._live_pushed += self._apply_wrenches(commands)
                 self._kick()
                 return observe(mode)
             n_steps = max(1, request.n_steps)
@@ -346,7 +362,10 @@ class Engine:
             self._wake.notify()
         finally:
             self.lock.inner.release()
-        return queued.wait(deadline - time.monotonic(), self._step_timeout_s)
+        return self._await(queued, deadline - time.monotonic())
+
+    def _await(self, queued: _QueuedStep[T], remaining: float) -> T:
+        return queued.wait(remaining, self._step_timeout_s, runs_late=self.dialect.late_steps)
 
     def reset(
         self,
@@ -487,6 +506,10 @@ class Engine:
         with self.lock:
             self._step_count = 0
 
+    def name(self, control: ArticulationControl) -> str:
+        """Return what an articulation is called in requests and replies."""
+        return self._names[control]
+
     # What follows runs under the lock.
 
     def _set_paused(self, paused: bool) -> None:
@@ -546,6 +569,7 @@ class Engine:
         except Exception as error:
             raise self._fail(error) from error
         self._step_count += n_steps
+        self.frame_id += 1
         self._tick_due = bool(self.on_tick)
 
     def _run_direct(self, request: Step) -> None:
@@ -567,6 +591,7 @@ class Engine:
             if pushed:
                 self._xfrc[pushed] = 0.0
         self._step_count += n_steps
+        self.frame_id += 1
         self._tick_due = bool(self.on_tick)
 
     def _integrate(self, n_steps: int, raw: Container[ArticulationControl]) -> None:
@@ -604,6 +629,7 @@ class Engine:
             raise self._fail(error) from error
         _call(self.on_substep)
         self._step_count += 1
+        self.frame_id += 1
 
     def _override_joints(self, overrides: Mapping[str, Mapping[str, float]]) -> None:
         for key, joints in overrides.items():
@@ -668,6 +694,8 @@ class Engine:
             self._wake.wait(IDLE_S)
 
     def _serve(self, queued: _QueuedStep[Any]) -> None:
+        if not queued.begin():
+            return
         try:
             self._run_direct(queued.request)
             queued.succeed()
@@ -686,6 +714,10 @@ class Engine:
         if not self._paused:
             mujoco.mj_step(self._model, self._data)
             _call(self.on_substep)
+            self.frame_id += 1
+        if self._live_pushed:
+            self._xfrc[self._live_pushed] = 0.0
+            self._live_pushed.clear()
         self._tick()
         if time.perf_counter() - self._last_rest > HOLD_S:
             self._wake.wait(GIVE_WAY_S)
@@ -736,8 +768,17 @@ class _QueuedStep(Generic[T]):
         self._observe = observe
         self._settled = threading.Event()
         self._abandoned = False
+        self._begun = False
+        self._dropped = False
+        self._lock = threading.Lock()
         self._results: list[T] = []
         self._error: Exception | None = None
+
+    def begin(self) -> bool:
+        """Return whether it is to be done; its caller may have been told that it will not be."""
+        with self._lock:
+            self._begun = True
+            return not self._dropped
 
     def succeed(self) -> None:
         """Observe for the caller, if it still waits, and release it. The engine's lock is held."""
@@ -750,19 +791,20 @@ class _QueuedStep(Generic[T]):
         self._error = error
         self._settled.set()
 
-    def wait(self, remaining: float, timeout: float) -> T:
+    def wait(self, remaining: float, timeout: float, *, runs_late: bool) -> T:
         """Return the observation, or raise what the step raised.
 
         Args:
             remaining: Seconds until `step_timeout` is raised.
             timeout: Seconds since the request came in by then.
+            runs_late: Whether it stays queued then although it has not begun.
         """
         if not self._settled.wait(max(0.0, remaining)):
             self._abandoned = True
-            raise Refusal(
-                "step_timeout",
-                f"the step did not finish within {timeout:g} s; it stays queued and runs when physics gets to it",
-            )
+            with self._lock:
+                self._dropped = not (runs_late or self._begun)
+            fate = "is not done any more" if self._dropped else "runs to its end when physics gets to it"
+            raise Refusal("step_timeout", f"the step did not finish within {timeout:g} s; it {fate}")
         if self._error is not None:
             raise self._error
         return self._results[0]
@@ -802,6 +844,26 @@ class _WarningLog:
 
 
 _mujoco_warnings = _WarningLog()
+
+
+def _named(scene: CompiledScene, dialect: Dialect) -> list[tuple[str, ArticulationIndex]]:
+    """Return each articulation by what it is called; of two that would be called alike, the later by its actor."""
+    named: dict[str, ArticulationIndex] = {}
+    for index in scene.articulations:
+        name = dialect.robot_key(index.actor_id, index.key)
+        named[index.key if name in named else name] = index
+    return list(named.items())
+
+
+def _folded(controls: Mapping[str, ArticulationControl], dialect: Dialect) -> dict[str, ArticulationControl]:
+    """Return the articulations by all that requests may call them, in one case; the first to claim a name has it."""
+    folded = {name.casefold(): control for name, control in reversed([*controls.items()])}
+    if dialect.public_names:
+        for control in controls.values():
+            for name in (control.index.key, control.index.actor_id):
+                if name:
+                    folded.setdefault(name.casefold(), control)
+    return folded
 
 
 def _call(hooks: list[Hook]) -> None:

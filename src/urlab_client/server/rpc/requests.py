@@ -30,6 +30,9 @@ __all__ = ["Incoming", "RequestReader", "need", "usable"]
 
 _DEFAULT_LIMITS: Final = Limits()
 
+_BINARY_SUFFIX: Final = "__b64__"
+"""Ends the key of what is binary, in JSON."""
+
 INT32_MIN: Final = -(2**31)
 INT32_MAX: Final = 2**31 - 1
 
@@ -153,6 +156,8 @@ class RequestReader:
                 f"a request of {len(frame)} bytes exceeds the limit request_bytes, {limits.request_bytes}"
             )
         fields = _fold(_decode(frame, limits.request_depth))
+        for key in [key for key in fields if key.endswith(_BINARY_SUFFIX)]:
+            fields.setdefault(key.removesuffix(_BINARY_SUFFIX), fields[key])
         name = _text(fields.get("op"))
         if name is _ABSENT:
             return Incoming(None)
@@ -524,12 +529,23 @@ def _converter(info: inspect.Type) -> Converter:
     return convert
 
 
+def _binary(value: Plain) -> Any:
+    """Return bytes; text, in which JSON carries them, is base64."""
+    if isinstance(value, str):
+        try:
+            return base64.b64decode(value, validate=True)
+        except ValueError:
+            return _ABSENT
+    return value if isinstance(value, bytes) else _ABSENT
+
+
 def _same(value: Plain) -> Plain:
     return value
 
 
 _SIMPLE: Final[Mapping[type[inspect.Type], Converter]] = {
     inspect.StrType: _text,
+    inspect.BytesType: _binary,
     inspect.BoolType: _flag,
     inspect.IntType: _whole,
     inspect.FloatType: _number,
