@@ -100,6 +100,8 @@ class Dialect:
         live_commands: A live step applies all of its commands.
         late_steps: A direct step that timed out before it began is done all the same.
         level_sticks: The observation level of a step holds for later replies, too.
+        auto_mode: `auto` is a step mode beside live, else another name of it.
+        controls_float32: Set-points are rounded to single precision.
         options_float32: Options are kept in single precision and keywords in lower case.
         options_merged: The `<option>` of imported robots reaches the scene.
         attached_documents: The scene's document attaches those of the robots, which are assets.
@@ -126,6 +128,8 @@ class Dialect:
     live_commands: bool
     late_steps: bool
     level_sticks: bool
+    auto_mode: bool
+    controls_float32: bool
     options_float32: bool
     options_merged: bool
     attached_documents: bool
@@ -179,6 +183,8 @@ ALPHA: Final = Dialect(
     live_commands=False,
     late_steps=True,
     level_sticks=True,
+    auto_mode=True,
+    controls_float32=True,
     options_float32=True,
     options_merged=False,
     attached_documents=False,
@@ -206,6 +212,8 @@ BETA: Final = Dialect(
     live_commands=True,
     late_steps=False,
     level_sticks=False,
+    auto_mode=False,
+    controls_float32=False,
     options_float32=False,
     options_merged=True,
     attached_documents=True,

@@ -45,6 +45,7 @@ from urlab_client.server.physics.controllers import ControllerConfig
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.render.camera_renderer import RenderQuality, find_backend
 from urlab_client.server.rpc.dispatch import Dispatcher
+from urlab_client.server.rpc.watchdog import Watchdog
 from urlab_client.server.session import ServerSession
 from urlab_client.server.snapshot import LARGEST_PIXELS, take_snapshot
 from urlab_client.server.streams.camera_streams import CameraStreams
@@ -501,6 +502,7 @@ class _Opened:
         self._faults = config.faults
         self._authored: object = None
         self._endpoint: RpcEndpoint | None = None
+        self._watchdog: Watchdog | None = None
         self._memory: SharedMemoryServer | None = None
         self._core: ServerCore | None = None
         self._registration: Registration | None = None
@@ -609,6 +611,9 @@ class _Opened:
             for problem in unmatched_names(core.play.running().scene, config.physics):
                 raise ModelError(problem)
         self._authored = self._mark(core)
+        self._dispatcher.served = [served.serving for served in (self._endpoint, memory) if served is not None]
+        self._watchdog = Watchdog(core, self._dispatcher, self.health)
+        self._watchdog.start()
         self._endpoint.start()
         if config.dialect.instance and (config.index >= 0 or os.environ.get("URLAB_REGISTRY_DIR")):
             self._registration = Registration(registry_directory(), self._instance)
@@ -689,9 +694,9 @@ class _Opened:
                 files.add((file, status.st_mtime_ns, status.st_size))
         return core.world.authored(), files
 
-    def _served(self) -> list[RpcEndpoint | StreamServer | CameraStreams | SharedMemoryServer]:
+    def _served(self) -> list[Watchdog | RpcEndpoint | StreamServer | CameraStreams | SharedMemoryServer]:
         """Return what has a thread; shared memory last, since the streams write to it."""
-        every = (self._endpoint, self._streams, self._cameras, self._memory)
+        every = (self._watchdog, self._endpoint, self._streams, self._cameras, self._memory)
         return [served for served in every if served is not None]
 
     def close(self) -> None:

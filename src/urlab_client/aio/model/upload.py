@@ -85,14 +85,12 @@ def flatten(model: str | os.PathLike[str] | mujoco.MjSpec) -> FlatModel:
 
     from urlab_client._mujoco import flat_model  # noqa: PLC0415
 
-    if isinstance(model, (str, os.PathLike)):
-        path = Path(model)
-        if not path.is_file():
-            raise FileNotFoundError(f"upload_model: {path} does not exist or is not a file")
-        source, spec = str(path), mujoco.MjSpec.from_file(str(path))
-    else:
-        source, spec = f"the spec {model.modelname!r}", model.copy()
+    path = None if isinstance(model, mujoco.MjSpec) else Path(model)
+    if path is not None and not path.is_file():
+        raise FileNotFoundError(f"upload_model: {path} does not exist or is not a file")
+    source = "the spec" if path is None else str(path)
     try:
+        spec = model.copy() if isinstance(model, mujoco.MjSpec) else mujoco.MjSpec.from_file(source)
         spec.compile()
         xml, files = flat_model(spec)
     except (ValueError, mujoco.FatalError) as error:

@@ -55,7 +55,7 @@ def set_mode(server: ServerCore, request: SetMode) -> SetModeOk:
     engine = server.play.running().engine
     if engine.pinned_mode is not None:
         engine.set_mode(StepMode.LIVE)  # refuses, before the field is looked at
-    previous, current = engine.set_mode(parse_mode(need(request, request.mode, "mode")))
+    previous, current = engine.set_mode(parse_mode(need(request, request.mode, "mode"), server.dialect))
     return SetModeOk(previous_mode=previous, current_mode=current)
 
 

@@ -76,7 +76,7 @@ def handshake(server: ServerCore, session_id: str, *, include_assets: bool = Fal
     if running is None:
         return reply
     scene, engine = running.scene, running.engine
-    with engine.lock:
+    with engine.look():
         reply.mjb = scene.mjb()
         reply.articulations = [_articulation(server, name, control) for name, control in engine.controls.items()]
     reply.mjb_base64 = msgspec.Raw(msgspec.msgpack.encode(base64.b64encode(reply.mjb).decode("ascii")))

@@ -12,7 +12,9 @@ import math
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Container, Generator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from types import MappingProxyType, TracebackType
 from typing import Any, Final, Generic, Self, TypeVar, cast
 
@@ -31,7 +33,7 @@ from urlab_client.server.refusal import Refusal
 from urlab_client.server.system.health import Health
 from urlab_client.server.system.thread_join import ended, within
 
-__all__ = ["DataLock", "Engine", "parse_control_source", "parse_mode"]
+__all__ = ["DataLock", "Engine", "Overdue", "parse_control_source", "parse_mode"]
 
 logger = logging.getLogger("urlab_client.server")
 
@@ -62,21 +64,25 @@ SLICE_S: Final = 0.05
 MAX_SLICE: Final = 1000
 """Sub-steps in such a slice at most, for models that get slower while they run."""
 
+LEAST_PATIENCE_S: Final = 1.0
+"""A call of MuJoCo does not count as overdue before; a slice of a long request may take a while on a busy machine."""
+
 INLINE_SHARE: Final = 0.02
 """A direct step expected to take less than this share of the step timeout runs on the calling thread."""
 
 
-def parse_mode(text: str) -> StepMode:
-    """Return the step mode called `text`, in any case; `streaming` is another name of live.
+def parse_mode(text: str, dialect: Dialect = ALPHA) -> StepMode:
+    """Return the step mode called `text`, in any case; `streaming` is another name of live, `auto` in newer dialects.
 
     Raises:
         Refusal: `bad_mode`.
     """
     name = text.casefold()
     try:
-        return StepMode.LIVE if name == "streaming" else StepMode(name)
+        mode = StepMode.LIVE if name == "streaming" else StepMode(name)
     except ValueError:
         raise Refusal("bad_mode", f"unknown step mode '{text}': use live, direct, puppet or auto") from None
+    return StepMode.LIVE if mode is StepMode.AUTO and not dialect.auto_mode else mode
 
 
 def parse_control_source(text: str) -> ControlSource:
@@ -139,7 +145,8 @@ class Engine:
         """
         self.scene = scene
         self.dialect = dialect
-        self.lock = DataLock(step_timeout_s)
+        self._call = _MujocoCall(max(step_timeout_s, LEAST_PATIENCE_S))
+        self.lock = DataLock(step_timeout_s, self._call)
         self.on_substep: list[Hook] = []
         self.on_tick: list[Hook] = []
         self.seed: int | None = None
@@ -153,7 +160,13 @@ class Engine:
         everyone = controllers.get("*")
         self.controls: Mapping[str, ArticulationControl] = MappingProxyType(
             {
-                name: ArticulationControl(self._model, index, neutral, controllers.get(index.key, everyone))
+                name: ArticulationControl(
+                    self._model,
+                    index,
+                    neutral,
+                    controllers.get(index.key, everyone),
+                    exact=not dialect.controls_float32,
+                )
                 for name, index in _named(scene, dialect)
             }
         )
@@ -210,7 +223,11 @@ class Engine:
         """
         first, self._stopping = not self._stopping, True
         deadline = time.monotonic() + timeout
-        idle = within(timeout, lambda seconds: self.lock.inner.acquire(timeout=seconds))
+        idle = within(timeout / 2.0, lambda seconds: self.lock.inner.acquire(timeout=seconds))
+        if not idle:
+            # Whatever its solver still iterates for is no longer wanted: any improvement is too small to go on.
+            self._model.opt.tolerance = self._model.opt.noslip_tolerance = math.inf
+            idle = within(timeout / 2.0, lambda seconds: self.lock.inner.acquire(timeout=seconds))
         if idle:
             self._wake.notify_all()
             self.lock.inner.release()
@@ -265,6 +282,26 @@ class Engine:
     def fault(self) -> str | None:
         """What stopped physics, or None. Cleared by a reset, by unpausing and by a change of mode."""
         return self._fault
+
+    @property
+    def overdue(self) -> Overdue | None:
+        """The call of MuJoCo that has not come back for longer than a step may take, or None."""
+        return self._call.overdue
+
+    @contextmanager
+    def look(self) -> Generator[None]:
+        """Hold the lock, or go without it while MuJoCo does not come back: for what no step changes.
+
+        Raises:
+            Refusal: `not_ready` when physics is busy, but comes back.
+        """
+        with ExitStack() as held:
+            try:
+                held.enter_context(self.lock)
+            except Refusal:
+                if self.overdue is None:
+                    raise
+            yield
 
     @property
     def replay(self) -> Player | None:
@@ -324,7 +361,7 @@ class Engine:
                 `shutting_down`, or `not_ready` with MuJoCo's text after a physics error.
         """
         deadline = time.monotonic() + self._step_timeout_s
-        if not self.lock.inner.acquire(timeout=self._step_timeout_s):
+        if not self.lock.acquire():
             if self._mode is not StepMode.DIRECT:
                 raise _busy()
             queued = _QueuedStep(request, observe)
@@ -402,7 +439,7 @@ class Engine:
                 else:
                     mujoco.mj_resetDataKeyframe(self._model, self._data, key)
                 self._override_joints(per_articulation_qpos or {})
-                mujoco.mj_forward(self._model, self._data)
+                self._forward()
             except Exception as error:
                 raise self._fail(error) from error
             self._step_count = 0
@@ -418,7 +455,7 @@ class Engine:
         with self.lock:
             self._tick_if_due()
             try:
-                mujoco.mj_forward(self._model, self._data)
+                self._forward()
             except Exception as error:
                 raise self._fail(error) from error
 
@@ -503,7 +540,7 @@ class Engine:
 
     def reset_step_count(self) -> None:
         """Set the step counter to 0, as a handshake does."""
-        with self.lock:
+        with self.look():
             self._step_count = 0
 
     def name(self, control: ArticulationControl) -> str:
@@ -565,7 +602,8 @@ class Engine:
         self._tick_if_due()
         n_steps = max(1, n_steps)
         try:
-            player.advance(n_steps)
+            with self._call:
+                player.advance(n_steps)
         except Exception as error:
             raise self._fail(error) from error
         self._step_count += n_steps
@@ -604,13 +642,14 @@ class Engine:
                 raise _shutting_down()
             count = min(n_steps, MAX_SLICE, max(1, int(SLICE_S / self._substep_s)))
             started = time.perf_counter()
-            if every_substep:
-                for _ in range(count):
-                    self._apply_controls(raw)
-                    mj_step(model, data)
-                    _call(self.on_substep)
-            else:
-                mj_step(model, data, count)
+            with self._call:
+                if every_substep:
+                    for _ in range(count):
+                        self._apply_controls(raw)
+                        mj_step(model, data)
+                        _call(self.on_substep)
+                else:
+                    mj_step(model, data, count)
             self._substep_s = max((time.perf_counter() - started) / count, 1e-9)
             n_steps -= count
 
@@ -624,12 +663,16 @@ class Engine:
                 target[:] = values
         self._data.time = request.time or 0.0
         try:
-            mujoco.mj_forward(self._model, self._data)
+            self._forward()
         except Exception as error:
             raise self._fail(error) from error
         _call(self.on_substep)
         self._step_count += 1
         self.frame_id += 1
+
+    def _forward(self) -> None:
+        with self._call:
+            mujoco.mj_forward(self._model, self._data)
 
     def _override_joints(self, overrides: Mapping[str, Mapping[str, float]]) -> None:
         for key, joints in overrides.items():
@@ -712,8 +755,9 @@ class Engine:
         self._slot = now if now - due > MAX_LAG_S else due
         self._apply_controls()
         if not self._paused:
-            mujoco.mj_step(self._model, self._data)
-            _call(self.on_substep)
+            with self._call:
+                mujoco.mj_step(self._model, self._data)
+                _call(self.on_substep)
             self.frame_id += 1
         if self._live_pushed:
             self._xfrc[self._live_pushed] = 0.0
@@ -731,6 +775,48 @@ class Engine:
         return min(period, MAX_PERIOD_S) if period > MIN_PERIOD_S else MIN_PERIOD_S
 
 
+@dataclass(frozen=True)
+class Overdue:
+    """A call of MuJoCo that takes longer than a step may.
+
+    Attributes:
+        thread: The thread that is in it.
+        began_at: When it began, seconds of `time.perf_counter`.
+        seconds: How long ago that is.
+    """
+
+    thread: threading.Thread
+    began_at: float
+    seconds: float
+
+
+class _MujocoCall:
+    """Which thread is inside MuJoCo, and since when. Entered under the engine's lock, looked at by everybody."""
+
+    __slots__ = ("_patience_s", "_under_way")
+
+    def __init__(self, patience_s: float) -> None:
+        self._patience_s = patience_s
+        self._under_way: tuple[threading.Thread, float] | None = None
+
+    def __enter__(self) -> None:
+        self._under_way = threading.current_thread(), time.perf_counter()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._under_way = None
+
+    @property
+    def overdue(self) -> Overdue | None:
+        under_way = self._under_way
+        if under_way is None:
+            return None
+        thread, began_at = under_way
+        seconds = time.perf_counter() - began_at
+        return Overdue(thread, began_at, seconds) if seconds > self._patience_s else None
+
+
 class DataLock:
     """A re-entrant lock around model and data whose `with` gives up after a time.
 
@@ -738,20 +824,39 @@ class DataLock:
         inner: The lock itself, for the physics thread and for waits with deadlines of their own.
     """
 
-    __slots__ = ("_timeout", "inner")
+    __slots__ = ("_call", "_timeout", "inner")
 
-    def __init__(self, timeout: float) -> None:
+    def __init__(self, timeout: float, call: _MujocoCall) -> None:
         """Make a lock that nobody holds.
 
         Args:
             timeout: Seconds after which entering raises `Refusal` with `not_ready`: a step request may legally keep
                 physics busy for hours, and no other request may hang for that.
+            call: Tells when there is nothing to wait for.
         """
         self.inner = threading.RLock()
         self._timeout = timeout
+        self._call = call
+
+    def acquire(self) -> bool:
+        """Take the lock, if it becomes free in time.
+
+        Raises:
+            Refusal: `not_ready`, at once, while MuJoCo does not come back.
+        """
+        if self.inner.acquire(blocking=False):
+            return True
+        overdue = self._call.overdue
+        if overdue is not None:
+            raise Refusal(
+                "not_ready",
+                f"physics has not come back from MuJoCo for {overdue.seconds:.0f} s: play goes on when it does, and "
+                "stop_pie ends it",
+            )
+        return self.inner.acquire(timeout=self._timeout)
 
     def __enter__(self) -> None:
-        if not self.inner.acquire(timeout=self._timeout):
+        if not self.acquire():
             raise _busy()
 
     def __exit__(

@@ -22,6 +22,7 @@ from urlab_client.protocol.registry import OPS
 from urlab_client.server.core import ServerCore
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.requests import Incoming, RequestReader
+from urlab_client.server.system.serving_thread import ServingThread
 
 __all__ = ["HANDLERS", "Dispatcher", "Handler", "HandlerTable", "handles"]
 
@@ -89,8 +90,18 @@ HANDLERS: Final = HandlerTable()
 handles = HANDLERS.handles
 
 
+RENEWED_S: Final = 0.25
+"""How soon a request notices that the lock it waits for is not the one any more."""
+
+
 class Dispatcher:
-    """Answers requests, one at a time whatever transport they came by."""
+    """Answers requests, one at a time whatever transport they came by.
+
+    Attributes:
+        served: The threads that call `answer`.
+    """
+
+    served: list[ServingThread]
 
     def __init__(self, core: ServerCore, table: HandlerTable) -> None:
         """Prepare for a server.
@@ -103,6 +114,8 @@ class Dispatcher:
         self._handlers: Mapping[str, Handler] = table.handlers
         self._reader = RequestReader(ops=core.dialect.ops, structs=table.structs, limits=core.world.content.limits)
         self._lock = threading.Lock()
+        self._name = ""
+        self.served = []
 
     def answer(
         self, frame: bytes, transport: Transport = Transport.ZMQ, *, max_reply_bytes: int | None = None
@@ -114,15 +127,18 @@ class Dispatcher:
             transport: How it came; shared memory does not take the editor's ops.
             max_reply_bytes: Longest reply that can be sent. A request whose reply cannot be shorter is not executed.
         """
-        with self._lock:
-            name = "request"
+        lock = self._enter()
+        try:
+            self._name = name = "request"
             try:
                 incoming = self._reader.read(frame)
-                name = incoming.name or name
+                self._name = name = incoming.name or name
                 reply = self._serve(incoming, transport, max_reply_bytes)
                 return _fitting(self._encoded(reply), incoming, max_reply_bytes)
             except Exception as failure:  # noqa: BLE001 - whatever happens, there is an answer
                 return encode_reply(_error(name, failure), json=self._core.session.json)
+        finally:
+            lock.release()
 
     def _encoded(self, reply: Reply | bytes) -> bytes:
         core = self._core
@@ -131,12 +147,42 @@ class Dispatcher:
     @contextmanager
     def standstill(self, timeout: float) -> Generator[bool]:
         """Answer no request meanwhile; yields False if the one under way did not end within `timeout` seconds."""
-        idle = self._lock.acquire(timeout=timeout)
+        lock = self._lock
+        idle = lock.acquire(timeout=timeout)
         try:
             yield idle
         finally:
             if idle:
-                self._lock.release()
+                lock.release()
+
+    def relieve(self, thread: threading.Thread) -> bool:
+        """Answer the request that a thread does not come back from, and let another thread serve.
+
+        What was asked for goes on, and takes effect when MuJoCo comes back, as a step does that is queued.
+
+        Returns:
+            False when the thread serves no request, or has come back.
+        """
+        error = ErrorReply(
+            code="step_timeout",
+            message=f"{self._name}: MuJoCo has not come back from it; it takes effect when MuJoCo does, "
+            "unless stop_pie ends play before",
+        )
+        reply = encode_reply(error, json=self._core.session.json)
+        return any(serving.relieve(thread, reply, self._renew) for serving in self.served)
+
+    def _renew(self) -> None:
+        """Leave the lock to the thread that does not come back."""
+        self._lock = threading.Lock()
+
+    def _enter(self) -> threading.Lock:
+        """Wait for one's turn and return the lock to release after it."""
+        while True:
+            lock = self._lock
+            if lock.acquire(timeout=RENEWED_S):
+                if lock is self._lock:
+                    return lock
+                lock.release()
 
     def _serve(self, incoming: Incoming, transport: Transport, max_reply_bytes: int | None) -> Reply | bytes:
         core, request = self._core, incoming.request

@@ -156,8 +156,6 @@ class RequestReader:
                 f"a request of {len(frame)} bytes exceeds the limit request_bytes, {limits.request_bytes}"
             )
         fields = _fold(_decode(frame, limits.request_depth))
-        for key in [key for key in fields if key.endswith(_BINARY_SUFFIX)]:
-            fields.setdefault(key.removesuffix(_BINARY_SUFFIX), fields[key])
         name = _text(fields.get("op"))
         if name is _ABSENT:
             return Incoming(None)
@@ -643,15 +641,18 @@ def _nested_converter(struct: type[Struct]) -> Converter:
 @cache
 def _struct_converter(struct: type[Struct]) -> Callable[[dict[str, Plain]], Any]:
     """Return a function that fills a `struct` from a map with lower-case keys."""
-    plan: list[tuple[str, str, Converter, Callable[[], Any]]] = []
+    plan: list[tuple[str, str, str, Converter, Callable[[], Any]]] = []
     for field in msgspec.structs.fields(struct):
         info = inspect.type_info(field.type)
-        plan.append((field.name, field.encode_name.lower(), _converter(info), _default(field)))
+        key = field.encode_name.lower()
+        binary = isinstance(info.type if isinstance(info, inspect.Metadata) else info, inspect.BytesType)
+        plan.append((field.name, key, key + _BINARY_SUFFIX if binary else key, _converter(info), _default(field)))
 
     def convert(fields: dict[str, Plain]) -> Any:
         values: dict[str, Any] = {}
-        for name, key, of_field, default in plan:
-            value = of_field(fields[key]) if key in fields else _ABSENT
+        for name, key, other, of_field, default in plan:
+            sent = key if key in fields else other
+            value = of_field(fields[sent]) if sent in fields else _ABSENT
             values[name] = default() if value is _ABSENT else value
         return struct(**values)
 
