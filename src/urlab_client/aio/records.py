@@ -24,7 +24,7 @@ from urlab_client.protocol.messages.session import (
     TwistState,
 )
 
-__all__ = ["ArticulationRecord", "EntityRecord", "Wrenches"]
+__all__ = ["ArticulationRecord", "Carried", "EntityRecord", "Wrenches", "give_back"]
 
 Wrenches = dict[str, list[float]]
 """(fx, fy, fz, tx, ty, tz) by body."""
@@ -101,13 +101,20 @@ class EntityRecord:
             return data.qvel[self.qvel_offset : self.qvel_offset + 6].copy()
         return None if self.pose is None else self.pose.qvel
 
-    def wrench_command(self) -> ArticulationCommand:
+    def wrench_command(self, wrenches: Wrenches) -> ArticulationCommand:
         """Return what makes a direct step carry the wrenches alone."""
-        return ArticulationCommand(xfrc_applied=self.wrenches)
+        return ArticulationCommand(xfrc_applied=wrenches)
 
-    def drop_wrenches(self, carried: Wrenches) -> None:
-        """Forget the wrenches that a step has carried, but not one that was applied again meanwhile."""
-        self.wrenches = {body: w for body, w in self.wrenches.items() if carried.get(body) is not w}
+    def apply_wrench(self, body: str, wrench: list[float]) -> None:
+        """Buffer a wrench for the next step, in place of an earlier one on the same body. From any thread."""
+        with self.mirror.lock:
+            self.wrenches[body] = wrench
+
+    def take_wrenches(self) -> Wrenches:
+        """Return the wrenches for the step that is being built, and leave the buffer empty."""
+        with self.mirror.lock:
+            taken, self.wrenches = self.wrenches, {}
+        return taken
 
 
 class ArticulationRecord(EntityRecord):
@@ -257,13 +264,13 @@ class ArticulationRecord(EntityRecord):
         """Return what a live step tells the articulation: the server ignores anything but `ctrl`."""
         return ArticulationCommand(ctrl=self.ctrl.tolist())
 
-    def direct_command(self) -> ArticulationCommand:
-        """Return what a direct step tells the articulation."""
+    def direct_command(self, wrenches: Wrenches | None) -> ArticulationCommand:
+        """Return what a direct step that carries these wrenches tells the articulation."""
         bypass = self.controller is not None and self.control_mode is ControlMode.RAW
         return ArticulationCommand(
             ctrl=self.ctrl.tolist(),
             control_mode=str(ControlMode.RAW) if bypass else None,
-            xfrc_applied=self.wrenches or None,
+            xfrc_applied=wrenches,
         )
 
     def body_pose(self, name: str, body_id: int) -> tuple[Floats, Floats] | None:
@@ -274,3 +281,14 @@ class ArticulationRecord(EntityRecord):
                 return np.array(received.xpos), np.array(received.xquat)
             pair = self.mirror.derived()
             return None if pair is None else (pair[1].xpos[body_id].copy(), pair[1].xquat[body_id].copy())
+
+
+Carried = dict[EntityRecord, Wrenches]
+"""The wrenches that a step carries, by what they were applied to."""
+
+
+def give_back(carried: Carried) -> None:
+    """Buffer wrenches again whose step was not executed, where nothing newer was applied."""
+    for record, wrenches in carried.items():
+        with record.mirror.lock:
+            record.wrenches = {**wrenches, **record.wrenches}

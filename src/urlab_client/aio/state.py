@@ -18,18 +18,19 @@ import numpy as np
 
 from urlab_client.aio.articulation import URLabArticulation, URLabEntity
 from urlab_client.aio.cameras import URLabCameraView
-from urlab_client.aio.deadline import DEFAULT, Timeout, shared
 from urlab_client.aio.layout import FREE, ArticulationLayout, articulation_layouts
 from urlab_client.aio.mirror import Mirror, model_names, write_options
 from urlab_client.aio.publishers import Publishers
 from urlab_client.aio.reception import LiveReception, Pictures
-from urlab_client.aio.records import ArticulationRecord, EntityRecord, Wrenches
-from urlab_client.aio.recovery import Doubts
-from urlab_client.aio.session import Session
+from urlab_client.aio.records import ArticulationRecord, Carried, EntityRecord
+from urlab_client.aio.recovery import Doubts, leaves_open
+from urlab_client.aio.session import Session, Turn
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.enums import StepMode
+from urlab_client.protocol.enums import CameraTiming, StepMode
 from urlab_client.protocol.errors import (
+    ModeLocked,
     NoActiveManager,
+    NoSession,
     ProtocolError,
     SessionTakenOver,
     URLabError,
@@ -87,6 +88,7 @@ class SimState:
         publishers: What the server publishes.
         mirror: Local model and data.
         wanted_mode: Step mode the user asked for.
+        mode_assumed: Whether nothing the server said shows yet that `mode` is in force.
         promoted_from: Mode to go back to on close, after a promotion of our own.
         level: Observation level of the session.
         sent_level: Observation level the server has, which an earlier step may have changed.
@@ -119,6 +121,7 @@ class SimState:
         self.mirror = Mirror()
         self.wanted_mode = wanted_mode
         self._mode = StepMode.LIVE
+        self.mode_assumed = False
         self._reception = LiveReception(publishers.state(), self._absorb_live, self.mirror.lock)
         self.promoted_from: StepMode | None = None
         self.level = "standard"
@@ -135,6 +138,7 @@ class SimState:
         self.recv_wall_time_ns = 0
         self._local_model = local_model
         self._check_version = check_version
+        session.on_opened = self._note_session
         session.on_refusal = self._note_refusal
         self._promote = promote
         self._trusted = trusted
@@ -153,6 +157,7 @@ class SimState:
 
     @mode.setter
     def mode(self, mode: StepMode) -> None:
+        self.mode_assumed = False
         self._mode = mode
         live = mode is StepMode.LIVE and self.hello is not None and self.hello.manager_present
         receivers: list[LiveReception | Pictures] = [self._reception]
@@ -163,6 +168,11 @@ class SimState:
                 receiver.start()
             else:
                 receiver.stop()
+
+    def assume_mode(self, mode: StepMode) -> None:
+        """Go by a step mode until a reply shows which one is in force: no op tells it without changing it."""
+        self.mode = mode
+        self.mode_assumed = True
 
     @property
     def live(self) -> bool:
@@ -184,21 +194,34 @@ class SimState:
         """Records of the plain entities, by name."""
         return self._entity_records
 
-    def buffered_wrenches(self) -> list[tuple[EntityRecord, Wrenches]]:
-        """Return what a direct step is about to carry."""
-        records: list[EntityRecord] = [*self._records.values(), *self._entity_records.values()]
-        return [(record, dict(record.wrenches)) for record in records if record.wrenches]
+    @property
+    def local_time(self) -> float:
+        """Simulation time of the local data, or without them of the last reply, seconds."""
+        return self.sim_time if self.mirror.data is None else self.mirror.data.time
 
-    async def open(self, observations: str, *, timeout: Timeout = DEFAULT) -> HelloOk:
-        """Open a session and take over what the server says."""
-        left = shared(timeout)
-        hello = await self.session.hello(Hello(observations=observations), timeout=left())
-        self.doubts.clear()  # what belonged to the session before is refused now
-        self.publishers.events.publish(
-            SessionOpened(
-                session_id=hello.session_id, urlab_version=hello.urlab_version, mujoco_version=hello.mujoco_version
+    def take_wrenches(self) -> Carried:
+        """Take what the step that is being built carries out of its buffers."""
+        records: list[EntityRecord] = [*self._records.values(), *self._entity_records.values()]
+        return {record: record.take_wrenches() for record in records if record.wrenches}
+
+    def require_handshake(self, op: str) -> None:
+        """Refuse an op that goes by what a handshake said, when that is not known.
+
+        Raises:
+            NoSession: There was no handshake, or play was started anew and its handshake was not waited for.
+        """
+        if self.hello is None:
+            raise NoSession("discover() was not called, or did not finish. Nothing was sent.", op=op)
+        if self.doubts.play:
+            raise NoSession(
+                "sim.start() was broken off, so it is not known what plays now. Nothing was sent.",
+                op=op,
+                hint="Call sim.start(), discover() or resync().",
             )
-        )
+
+    async def open(self, turn: Turn, observations: str) -> HelloOk:
+        """Open a session and take over what the server says."""
+        hello = await self.session.hello(turn, Hello(observations=observations))
         self.level = self.sent_level = observations
         if self._local_model and hello.mjb is not None:
             mismatch = self.mirror.check_version(hello)
@@ -210,11 +233,23 @@ class SimState:
                     stacklevel=2,
                 )
                 request = Hello(observations=observations, include_assets=True)
-                hello = await self.session.hello(request, timeout=left())
-        await self.adopt(hello, timeout=left())
+                hello = await self.session.hello(turn, request)
+                self.sent_level = observations
+        await self.adopt(turn, hello)
         return hello
 
-    async def _without_binary(self, hello: HelloOk, timeout: Timeout) -> HelloOk:
+    def _note_session(self, hello: HelloOk) -> None:
+        """Note that a session was opened, maybe by a handshake that its caller had given up."""
+        self.doubts.clear()  # what belonged to the session before is refused now
+        self.step_count = 0
+        self.sent_level = ""
+        self.publishers.events.publish(
+            SessionOpened(
+                session_id=hello.session_id, urlab_version=hello.urlab_version, mujoco_version=hello.mujoco_version
+            )
+        )
+
+    async def _without_binary(self, turn: Turn, hello: HelloOk) -> HelloOk:
         """Return the handshake with a model in XML alone: MuJoCo's binary loader is no match for a hostile model.
 
         Raises:
@@ -222,7 +257,8 @@ class SimState:
         """
         if hello.mjcf_compiled is None:
             log.info("the server is not trusted with binary models: the local model is compiled here from XML")
-            hello = await self.session.hello(Hello(observations=self.level, include_assets=True), timeout=timeout)
+            hello = await self.session.hello(turn, Hello(observations=self.level, include_assets=True))
+            self.sent_level = self.level
         if hello.manager_present and hello.mjcf_compiled is None:
             raise URLabError(
                 "The server offers its model only in MuJoCo's binary format, which is loaded from servers on this "
@@ -234,16 +270,16 @@ class SimState:
         hello.mjb = None
         return hello
 
-    async def adopt(self, hello: HelloOk, *, timeout: Timeout = DEFAULT) -> None:
+    async def adopt(self, turn: Turn, hello: HelloOk) -> None:
         """Take over a handshake: load its model, bind the wrappers, bring the server into the wanted step mode."""
         hello.mjb_base64 = NOT_SENT  # it keeps the whole reply in memory
         await self.session.transport.follow(hello)
         loaded = None
         if self._local_model:
             if hello.mjb is not None and not self._trusted:
-                hello = await self._without_binary(hello, timeout)
+                hello = await self._without_binary(turn, hello)
             load = partial(self.mirror.load, hello, trusted=self._trusted)
-            loaded = await anyio.to_thread.run_sync(load, abandon_on_cancel=True)
+            loaded = await turn.aside(anyio.to_thread.run_sync(load, abandon_on_cancel=True))
         self.publishers.check_open()
         # From here on nothing waits until all is taken over: cancelled or not, model and wrappers belong together.
         # The model's bytes, several times its size, are not needed any more.
@@ -260,6 +296,7 @@ class SimState:
                 {n: self._global_camera(n, info) for n, info in cameras.items()}, kind="camera"
             )
             self.step_count = 0
+        self.doubts.play = False
         self._views()  # binds the cameras to what the handshake says of them
         self.publishers.refresh()
         if hello.manager_present and not played:
@@ -268,21 +305,46 @@ class SimState:
             self.on_adopted()
         if not hello.manager_present:
             self.mode = StepMode.LIVE
-        elif self._promote and self.wanted_mode in (StepMode.DIRECT, StepMode.PUPPET):
-            previous = await self.ask_mode(self.wanted_mode, timeout=timeout)
-            if previous is not self.mode:
-                self.promoted_from = previous
+        elif self._promote and self.wanted_mode is not StepMode.AUTO:
+            await self._promote_to(turn, self.wanted_mode)
         else:
-            self.mode = StepMode.LIVE if self.wanted_mode is StepMode.AUTO else self.wanted_mode
+            self.assume_mode(StepMode.LIVE if self.wanted_mode is StepMode.AUTO else self.wanted_mode)
         log.info(
             "session with %s, MuJoCo %s: %d articulations, mode %s",
             hello.urlab_version, hello.mujoco_version, len(self.articulations), self.mode,
         )  # fmt: skip
 
-    async def ask_mode(self, mode: StepMode, *, timeout: Timeout = DEFAULT) -> StepMode:
-        """Bring the server into a step mode, take over the one in force, and return the one before."""
-        with self.doubts.about_mode(mode):
-            reply = await self.session.call(SetMode(mode=mode), timeout=timeout)
+    async def _promote_to(self, turn: Turn, mode: StepMode) -> None:
+        self.doubts.mode = mode  # until the server has agreed, whatever comes between
+        try:
+            previous = await self.ask_mode(turn, mode)
+        except ModeLocked as locked:
+            if locked.pinned is not None:
+                raise
+            self.assume_mode(mode)  # which mode it is pinned to shows in the reply to the first step
+            return
+        except BaseException as error:
+            if leaves_open(error) and self.promoted_from is None:
+                self.promoted_from = StepMode.LIVE  # what play begins in; the reply would have told
+            raise
+        if previous is not self.mode:
+            self.promoted_from = previous
+
+    async def ask_mode(self, turn: Turn, mode: StepMode) -> StepMode:
+        """Bring the server into a step mode, take over the one in force, and return the one before.
+
+        Raises:
+            ModeLocked: The project pins another one, which has been taken over if its name is known.
+        """
+        try:
+            with self.doubts.about_mode(mode):
+                reply = await turn.call(SetMode(mode=mode))
+        except ModeLocked as locked:
+            if locked.pinned is not None:
+                self.mode = locked.pinned
+            if locked.pinned is not mode:
+                raise
+            return mode
         self.mode = StepMode(reply.current_mode)
         return StepMode(reply.previous_mode)
 
@@ -474,6 +536,20 @@ class SimState:
             if view.delivered and id(view) not in came:
                 log.warning("camera %s delivered no frame; its latest_frame is older than the state", view.name)
             view.delivered = id(view) in came
+
+    def wanted_pictures(self, include: bool | Mapping[str, str | CameraTiming]) -> bool | dict[str, str | None]:
+        """Return `include_cameras` as it travels.
+
+        Raises:
+            KeyError: There is no such camera.
+        """
+        if isinstance(include, bool):
+            return include
+        for name in include:
+            if self.camera(name) is None:
+                known = [f"{art.prefix}/{camera}" for art in self.articulations.values() for camera in art.cameras]
+                raise KeyError(f"no camera {name!r}; there are: {', '.join(known) or 'none'}")
+        return {name: str(CameraTiming(timing)) for name, timing in include.items()}
 
     def _frames(self, cameras: Mapping[str, CameraFrame]) -> list[tuple[URLabCameraView, CameraFrame]]:
         found: list[tuple[URLabCameraView, CameraFrame]] = []

@@ -14,7 +14,7 @@ from urlab_client.aio.session import Session
 from urlab_client.aio.state import SimState
 from urlab_client.protocol.codec import building
 from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.messages.runtime import ContactFilter, GetContacts, SetQpos, SetSimOptions
+from urlab_client.protocol.messages.runtime import ContactFilter, GetContacts, SetMode, SetQpos, SetSimOptions
 from urlab_client.protocol.messages.session import Forward, ForwardOk
 from urlab_client.protocol.types import ContactsResult, SimOptions
 
@@ -44,8 +44,10 @@ class RuntimeNamespace(RuntimeOps):
             DimMismatch: The number of values does not fit.
         """
         values = np.asarray(tuple(qpos), dtype=np.float64)
-        reply = await self._call(SetQpos(target=target, qpos=values, target_by=target_by(by_name)), timeout)
-        self._state.mirror_qpos(reply.actor_name, reply.qpos)
+        async with self._session.turn(SetQpos, timeout=timeout) as turn:
+            self._state.require_handshake("set_qpos")
+            reply = await turn.call(SetQpos(target=target, qpos=values, target_by=target_by(by_name)))
+            self._state.mirror_qpos(reply.actor_name, reply.qpos)
 
     async def get_contacts(
         self,
@@ -93,9 +95,10 @@ class RuntimeNamespace(RuntimeOps):
             raise TypeError(f"set_sim_options: unknown option {', '.join(unknown)}; it takes {known}")
         with building():
             options = msgspec.convert(opts, SimOptions)
-        reply = await self._call(SetSimOptions(options=options), timeout)
-        self._state.mirror_options(reply.options)
-        return reply.options
+        async with self._session.turn(SetSimOptions, timeout=timeout) as turn:
+            reply = await turn.call(SetSimOptions(options=options))
+            self._state.mirror_options(reply.options)
+            return reply.options
 
     async def set_mode(self, mode: StepMode | str, *, timeout: Timeout = DEFAULT) -> StepMode:
         """Switch the step mode and return the one in force. Any mode but live un-pauses physics.
@@ -106,13 +109,14 @@ class RuntimeNamespace(RuntimeOps):
 
         Raises:
             ValueError: Unknown mode; nothing was sent.
-            ModeLocked: The project pins the mode.
+            ModeLocked: The project pins another mode.
         """
         wanted = StepMode(mode)
-        # On the wire `auto` is a mode in which every step times out.
-        await self._state.ask_mode(StepMode.LIVE if wanted is StepMode.AUTO else wanted, timeout=timeout)
-        self._state.wanted_mode = self._state.mode
-        return self._state.mode
+        async with self._session.turn(SetMode, timeout=timeout) as turn:
+            # On the wire `auto` is a mode in which every step times out.
+            await self._state.ask_mode(turn, StepMode.LIVE if wanted is StepMode.AUTO else wanted)
+            self._state.wanted_mode = self._state.mode
+            return self._state.mode
 
     async def forward(self, *, timeout: Timeout = DEFAULT) -> ForwardOk:
         """Run `mj_forward` on the server and take over the state: kinematics and dynamics, no integration.
@@ -120,6 +124,8 @@ class RuntimeNamespace(RuntimeOps):
         Returns:
             The state; time and step counter are unchanged.
         """
-        reply = await self._call(Forward(), timeout)
-        self._state.absorb(reply, "forward")
-        return reply
+        async with self._session.turn(Forward, timeout=timeout) as turn:
+            self._state.require_handshake("forward")
+            reply = await turn.call(Forward())
+            self._state.absorb(reply, "forward")
+            return reply

@@ -91,7 +91,7 @@ class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
 
         Raises:
             ValueError: Unknown mode; nothing was sent.
-            ModeLocked: The project pins the mode.
+            ModeLocked: The project pins another mode.
         """
         return self._portal.call(self._aio.set_mode(mode, timeout=timeout))
 
