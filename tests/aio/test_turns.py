@@ -184,7 +184,7 @@ async def test_a_cancelled_handshake_is_not_somebody_else(
     await until(lambda: late.applied)
     await cancelled(discovering)
     if fresh:
-        with pytest.raises(NoSession, match=r"^step: discover\(\) .* did not finish. .* Call discover\(\) first"):
+        with pytest.raises(NoSession, match=r"^step: discover\(\) did not finish. .* Call discover\(\) first"):
             await user.step()
         assert await user.outliner.list_actors()
         await user.discover()

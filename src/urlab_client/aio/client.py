@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import logging
 import operator
@@ -589,6 +590,7 @@ class URLabClient:
         self._publishers.close()
         try:
             await self._watch.aclose()
+            await asyncio.sleep(0)  # a blocking client notices only now that the server has gone meanwhile
             if promoted_from is not None and self.connected and self.manager_present:
                 with contextlib.suppress(URLabError):  # a courtesy: the server may have moved on
                     await self._session.call(SetMode(mode=promoted_from), timeout=_REVERT_S)

@@ -48,6 +48,7 @@ class Session:
 
     Attributes:
         session_id: Id of the open session; empty without one.
+        greeted: Whether a handshake was sent, with whatever outcome.
         offered: Ops the server lists, or None before it was asked.
         on_opened: Told of each session that was opened, also by a handshake that its caller had given up.
         on_refusal: Told of each refusal before it is raised.
@@ -59,6 +60,7 @@ class Session:
 
     def __init__(self, transport: Transport, *, default_timeout: float | None, json: bool = False) -> None:
         self.session_id = ""
+        self.greeted = False
         self.offered: frozenset[str] | None = None
         self.on_opened: Callable[[HelloOk], None] | None = None
         self.on_refusal: Callable[[URLabRPCError], None] | None = None
@@ -210,9 +212,9 @@ class Session:
                 )
             except ConnectionLost as lost:
                 answer = await self._ask_again(frame, op, lost, limits)
-        except BaseException:
-            self._unanswered = self._unanswered or (hello and self._transport.stats.sent > sent)
-            raise
+        finally:
+            if hello and self._transport.stats.sent > sent:
+                self.greeted = self._unanswered = True  # until its answer has been read
         if log.isEnabledFor(logging.DEBUG):
             log.debug(
                 "%s: %d bytes out, %d back in %.3f ms", op.name, len(frame), len(answer), 1e3 * (loop.time() - began)

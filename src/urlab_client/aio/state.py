@@ -36,7 +36,7 @@ from urlab_client.protocol.errors import (
     URLabError,
     URLabRPCError,
 )
-from urlab_client.protocol.messages.runtime import SetMode
+from urlab_client.protocol.messages.runtime import SetMode, SetPaused
 from urlab_client.protocol.messages.session import (
     NOT_SENT,
     ArticulationInfo,
@@ -208,10 +208,10 @@ class SimState:
         """Refuse an op that goes by what a handshake said, when that is not known.
 
         Raises:
-            NoSession: There was no handshake, or play was started anew and its handshake was not waited for.
+            NoSession: The handshake of the session, or of a new play, was given up.
         """
-        if self.hello is None:
-            raise NoSession("discover() was not called, or did not finish. Nothing was sent.", op=op)
+        if self.hello is None and self.session.greeted:
+            raise NoSession("discover() did not finish. Nothing was sent.", op=op)
         if self.doubts.play:
             raise NoSession(
                 "sim.start() was broken off, so it is not known what plays now. Nothing was sent.",
@@ -344,6 +344,9 @@ class SimState:
                 self.mode = locked.pinned
             if locked.pinned is not mode:
                 raise
+            if mode is StepMode.DIRECT:
+                # Play starts paused, and no change of mode can resume it where the mode is pinned.
+                await turn.call(SetPaused(paused=False))
             return mode
         self.mode = StepMode(reply.current_mode)
         return StepMode(reply.previous_mode)
