@@ -1,10 +1,8 @@
 """A Gymnasium environment over a simulated server: a proportional controller for the arm, and a picture of the end."""
 
-from pathlib import Path
-
 import gymnasium
-import matplotlib.image
 import numpy as np
+from PIL import Image
 
 import urlab_client.integrations.gym  # registers the environments  # noqa: F401
 
@@ -19,5 +17,5 @@ for _ in range(env.spec.max_episode_steps):
     if terminated or truncated:
         break
 print(f"score {score:.1f} after {info['sim_time']:.1f} s, hand at {np.round(arm.get_sensors()['grip_position'], 2)}")
-matplotlib.image.imsave(Path("arm.png"), env.render())
+Image.fromarray(env.render()).save("arm.png")
 env.close()

@@ -1,9 +1,8 @@
 """Debug drawing in the viewport of a simulated server: the picture in docs/simulated-server.md."""
 
 import math
-from pathlib import Path
 
-import matplotlib.image
+from PIL import Image
 
 from urlab_client import URLabClient
 from urlab_client.server import ControllerConfig, SimulatedServer
@@ -31,5 +30,5 @@ with (
     client.debug.draw_axes((0.6, 0.0, 0.01), scale=0.3, ttl=-1.0)
     client.debug.set_overlay_text(f"t = {client.sim_time:.2f} s")
     client.viewport.set_camera((1.8, -1.1, 1.2), rotation_euler=(0.0, -24.0, -128.0), fov=60.0)
-    matplotlib.image.imsave(Path("viewport.png"), server.snapshot((960, 540)))
+    Image.fromarray(server.snapshot((960, 540))).save("viewport.png")
 print("viewport.png shows where the grip went")

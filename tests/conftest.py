@@ -1,15 +1,25 @@
 """What holds for every test."""
 
+import importlib.metadata
 import importlib.util
+import os
+import sys
+import tomllib
+from collections.abc import Generator
+from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
 
+# The tests start some hundred processes, each of which would compile the package anew.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
 # A test that is slow because the machine is busy has not failed; pytest's own limit ends those that hang.
-settings.register_profile("urlab", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("urlab", deadline=None, suppress_health_check=[HealthCheck.too_slow], max_examples=30)
+settings.register_profile("thorough", settings.get_profile("urlab"), max_examples=300)
 settings.load_profile("urlab")
 
-# Marker of the tests that need an extra which the test command does not install -> its modules, and what to install.
+# Marker -> modules without which its tests are left out, and the extras to install.
 OPTIONAL = {"ray": (("ray",), "ray"), "view": (("foxglove", "rerun"), "foxglove,rerun")}
 
 MISSING = {
@@ -19,17 +29,71 @@ MISSING = {
 }
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> Generator[None, int, int]:
+    """Take one worker more than xdist would, as tests also wait; none for single files, or with `-s`."""
+    workers = yield
+    return 0 if config.option.capture == "no" or not any(map(os.path.isdir, config.args)) else workers + 1
+
+
+MUJOCO = importlib.metadata.version("mujoco")
+
+
+def release(version: str) -> tuple[int, ...]:
+    """Return a version's first two numbers."""
+    return tuple(int(part) for part in version.split(".")[:2])
+
+
+def on_wine() -> bool:
+    """Whether this Windows is Wine."""
+    if sys.platform != "win32":
+        return False
+    import ctypes
+
+    return hasattr(ctypes.WinDLL("ntdll"), "wine_get_version")
+
+
+def impossible_here() -> dict[str, str]:
+    """Return the tests that this system cannot run, and why: `not_on_windows.toml` is the list."""
+    if sys.platform != "win32":
+        return {}
+    listed = tomllib.loads((Path(__file__).parent / "not_on_windows.toml").read_text("utf-8"))
+    groups = [*listed["windows"], *(listed["wine"] if on_wine() else [])]
+    return {test: group["why"] for group in groups for test in group["tests"]}
+
+
+IMPOSSIBLE = impossible_here()
+
+
+def impossible(item: pytest.Item) -> bool:
+    """Whether the list names a test, its file or its folder."""
+    name = item.nodeid.partition("[")[0]
+    return any(name == test or name.startswith((f"{test}::", f"{test}/")) or item.nodeid == test for test in IMPOSSIBLE)
+
+
+def too_new(item: pytest.Item) -> bool:
+    """Whether a test needs a newer MuJoCo than is installed."""
+    marker = item.get_closest_marker("mujoco")
+    return marker is not None and release(MUJOCO) < release(marker.args[0])
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out what needs such an extra where it is not installed: counted as deselected. CI has steps for them."""
-    left_out = [item for item in items if any(item.get_closest_marker(marker) for marker in MISSING)]
+    """Leave out what cannot run here: for want of an extra, of a newer MuJoCo, or of something that Windows lacks."""
+    left_out = [
+        item
+        for item in items
+        if any(item.get_closest_marker(marker) for marker in MISSING) or too_new(item) or impossible(item)
+    ]
     if left_out:
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if item not in left_out]
 
 
-def pytest_report_header() -> list[str]:
-    """Say what is left out."""
+def pytest_report_header(config: pytest.Config) -> list[str]:
+    """Say what is left out: with workers, the summary does not count it."""
     return [
-        f"tests marked `{marker}` are deselected: pip install -e '.[{extras}]' to run them"
-        for marker, extras in MISSING.items()
+        *([f"tests are left out by -m {config.option.markexpr!r}"] if config.option.markexpr else []),
+        *(f"tests marked `{marker}` need: pip install -e '.[{extras}]'" for marker, extras in MISSING.items()),
+        f"tests marked `mujoco` need the release that they name, or a later one; this is {MUJOCO}",
+        *([f"{len(IMPOSSIBLE)} entries of tests/not_on_windows.toml are left out"] if IMPOSSIBLE else []),
     ]

@@ -14,22 +14,92 @@ PACKAGE = Path(__file__).resolve().parents[1] / "src" / "urlab_client"
 ALLOWED: dict[str, frozenset[str]] = {
     "protocol": frozenset(),
     "keys": frozenset({"protocol"}),
-    "aio": frozenset({"_children", "_confined", "_processors", "keys", "protocol"}),
+    "aio": frozenset(
+        {
+            "_children",
+            "_confined",
+            "_landlock",
+            "_mjcf_files",
+            "_mujoco",
+            "_processors",
+            "_uninterrupted",
+            "keys",
+            "protocol",
+        }
+    ),
     "sync": frozenset({"aio", "protocol"}),
-    "server": frozenset({"_children", "_confined", "_processors", "keys", "protocol"}),
+    "server": frozenset(
+        {
+            "_children",
+            "_confined",
+            "_landlock",
+            "_mjcf_files",
+            "_mujoco",
+            "_processors",
+            "_uninterrupted",
+            "keys",
+            "protocol",
+        }
+    ),
     "enums": frozenset({"protocol"}),
     "_children": frozenset(),
     "_confined": frozenset(),
+    "_landlock": frozenset(),
+    "_mjcf_files": frozenset(),
+    "_mujoco": frozenset(),
     "_installation": frozenset(),
     "_processors": frozenset(),
+    "_uninterrupted": frozenset(),
     "": frozenset({"_installation", "sync", "enums", "protocol"}),
-    "integrations": frozenset({"", "aio", "enums", "keys", "protocol", "server", "sync"}),
+    "integrations": frozenset({"", "_mujoco", "aio", "enums", "keys", "protocol", "server", "sync"}),
     "cluster": frozenset({"integrations", "protocol", "sync"}),
     "web": frozenset({"aio", "protocol"}),
     "cli": frozenset(
-        {"", "_installation", "aio", "enums", "integrations", "keys", "protocol", "server", "sync", "web"}
+        {"", "_installation", "_mujoco", "aio", "enums", "integrations", "keys", "protocol", "server", "sync", "web"}
     ),
     "__main__": frozenset({"cli"}),
+}
+
+# Inside the two large layers, too: a room (a package, or a module beside the packages) imports those before it only.
+ROOMS: dict[str, tuple[str, ...]] = {
+    "aio": (
+        "deadline",
+        "stream_buffer",
+        "transport",
+        "launch",
+        "session",
+        "streams",
+        "live",
+        "model",
+        "controllers",
+        "cameras",
+        "articulation",
+        "state",
+        "explain",
+        "namespaces",
+        "client",
+        "",
+    ),
+    "server": (
+        "system",
+        "limits",
+        "refusal",
+        "assets",
+        "compile",
+        "editor",
+        "render",
+        "physics",
+        "transport",
+        "streams",
+        "session",
+        "core",
+        "rpc",
+        "handlers",
+        "faults",
+        "snapshot",
+        "simulated",
+        "",
+    ),
 }
 
 # `protocol` is pure: it turns values into bytes and back, and leaves waiting, threads and sockets to others.
@@ -62,6 +132,31 @@ def target_of(imported: str, package: Path) -> str | None:
     return top if (package / top).is_dir() or (package / f"{top}.py").is_file() else ""
 
 
+def room_of(module: str, layer: str) -> str:
+    """Return the room of a module `urlab_client.LAYER.ROOM…`; the empty name is the layer itself."""
+    parts = module.split(".")[2:]
+    return parts[0] if parts and parts[0] in ROOMS[layer] else ""
+
+
+def room_violations(package: Path) -> list[str]:
+    found: list[str] = []
+    for layer, order in ROOMS.items():
+        for file in sorted((package / layer).rglob("*.py")):
+            relative = file.relative_to(package / layer)
+            room = relative.parts[0].removesuffix(".py").removesuffix("__init__")
+            where = file.relative_to(package.parent).as_posix()
+            if room not in order:
+                found.append(f"{where}: {room} is not a room of {layer}; say in {Path(__file__).name} where it belongs")
+                continue
+            for line, imported in imports(ast.parse(file.read_text(encoding="utf-8"), str(file))):
+                if not imported.startswith(f"{package.name}.{layer}."):
+                    continue
+                target = room_of(imported, layer)
+                if target != room and order.index(target) >= order.index(room):
+                    found.append(f"{where}:{line}: {layer}/{room} imports {imported}, which stands above it")
+    return found
+
+
 def violations(package: Path) -> list[str]:
     found: list[str] = []
     for file in sorted(package.rglob("*.py")):
@@ -86,6 +181,41 @@ def test_imports_point_one_way() -> None:
     assert violations(PACKAGE) == []
 
 
+def test_imports_inside_the_large_layers_point_one_way() -> None:
+    assert room_violations(PACKAGE) == []
+
+
+def test_every_room_with_a_place_exists() -> None:
+    for layer, order in ROOMS.items():
+        rooms = {path.name.removesuffix(".py").removesuffix("__init__") for path in (PACKAGE / layer).iterdir()}
+        assert rooms - {"__pycache__"} >= set(order)
+
+
+@pytest.mark.parametrize(
+    ("file", "source", "complaint"),
+    [
+        (
+            "server/physics/a.py",
+            "from urlab_client.server.handlers.scene import x\n",
+            "server/physics/a.py:1: server/physics imports urlab_client.server.handlers.scene.x, which stands above it",
+        ),
+        (
+            "aio/session.py",
+            "def f():\n    from urlab_client.aio import client\n",
+            "aio/session.py:2: aio/session imports urlab_client.aio.client, which stands above it",
+        ),
+        ("server/attic/a.py", "", "server/attic/a.py: attic is not a room of server"),
+    ],
+)
+def test_an_import_from_a_higher_room_is_found(tmp_path: Path, file: str, source: str, complaint: str) -> None:
+    package = tmp_path / "urlab_client"
+    path = package / file
+    path.parent.mkdir(parents=True)
+    path.write_text(source)
+    (found,) = room_violations(package)
+    assert found.startswith(f"urlab_client/{complaint}")
+
+
 def test_every_layer_with_a_rule_exists() -> None:
     assert {layer_of(file, PACKAGE) for file in PACKAGE.rglob("*.py")} == ALLOWED.keys()
 
@@ -106,8 +236,8 @@ def test_every_layer_with_a_rule_exists() -> None:
         ),
         (
             "aio/client.py",
-            "import urlab_client.server.world as w\n",
-            "aio/client.py:1: aio imports urlab_client.server.world",
+            "import urlab_client.server.editor.world as w\n",
+            "aio/client.py:1: aio imports urlab_client.server.editor.world",
         ),
         ("sync/a.py", "from urlab_client.server import x\n", "sync/a.py:1: sync imports urlab_client.server.x"),
         (

@@ -107,8 +107,8 @@ def resolve(requirements: list[str]) -> list[dict[str, Any]]:
         Conflict: Nothing meets the requirements.
     """
     # The package itself is built by what is installed here, which saves an environment for each build.
-    with tempfile.TemporaryDirectory(prefix="urlab-extras-") as scratch:
-        report = Path(scratch) / "report.json"
+    with tempfile.TemporaryDirectory(prefix="urlab-extras-") as temporary:
+        report = Path(temporary) / "report.json"
         options = ["--dry-run", "--ignore-installed", "--no-build-isolation", "--quiet", "--report", str(report)]
         pip("install", *options, *requirements)
         return [entry["metadata"] for entry in json.loads(report.read_text(encoding="utf-8"))["install"]]
@@ -120,14 +120,14 @@ def pip_check(found: list[dict[str, Any]]) -> None:
     Raises:
         Conflict: It found something.
     """
-    with tempfile.TemporaryDirectory(prefix="urlab-extras-") as scratch:
-        venv.create(scratch, with_pip=False, symlinks=True)
-        site = next(Path(scratch).glob("lib/python*/site-packages"))
+    with tempfile.TemporaryDirectory(prefix="urlab-extras-") as temporary:
+        venv.create(temporary, with_pip=False, symlinks=True)
+        site = next(Path(temporary).glob("lib/python*/site-packages"))
         for metadata in found:
             folder = site / f"{canonical(metadata['name']).replace('-', '_')}-{metadata['version']}.dist-info"
             folder.mkdir()
             (folder / "METADATA").write_text(rendered(metadata), encoding="utf-8")
-        pip("--python", str(Path(scratch) / "bin" / "python"), "check")
+        pip("--python", str(Path(temporary) / "bin" / "python"), "check")
 
 
 def rendered(metadata: dict[str, Any]) -> str:

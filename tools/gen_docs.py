@@ -13,7 +13,8 @@ import inspect
 import json
 import sys
 import textwrap
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from enum import StrEnum
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -69,7 +70,23 @@ def first_sentence(doc: str | None) -> str:
     return " ".join((doc or "").strip().partition("\n\n")[0].split())
 
 
-ELSEWHERE = {"configure_controller": ("URLabController", "articulation.controller.configure()")}
+ELSEWHERE = {
+    "configure_controller": ("URLabController", "articulation.controller.configure()"),
+    **dict.fromkeys(
+        (
+            "claim_control",
+            "release_control",
+            "set_camera_streaming",
+            "set_camera_delay",
+            "op_status",
+            "remove_actor",
+            "upload_model_manifest",
+            "upload_model_chunk",
+            "upload_model_commit",
+        ),
+        ("URLabClient", "call()"),
+    ),
+}
 """Ops whose method is not on the client or one of its namespaces: class and how users write it."""
 
 
@@ -137,7 +154,7 @@ def render() -> str:
     import urlab_client.server.handlers  # noqa: F401  # registers the handlers
     from urlab_client.protocol import errors
     from urlab_client.protocol.registry import ENVELOPE_ERRORS, OPS
-    from urlab_client.server.dispatch import HANDLERS
+    from urlab_client.server.rpc.dispatch import HANDLERS
 
     namespaces: dict[str, list[Op]] = {}
     for op in OPS.values():
@@ -206,7 +223,7 @@ def wire_type(hint: Any, structs: list[type[Any]]) -> str:
         name = f"list of {wire_type(arguments[0], structs)}"
     elif origin is tuple:
         name = f"{len(arguments)} numbers"
-    elif origin is dict:
+    elif origin in (dict, Mapping):
         name = f"map of {wire_type(arguments[1], structs)}"
     elif origin in (np.ndarray, NDArray):  # the latter from NumPy 2.5 on Python 3.12 on
         name = "list of number"
@@ -214,6 +231,8 @@ def wire_type(hint: Any, structs: list[type[Any]]) -> str:
         if hint not in structs:
             structs.append(hint)
         name = f"[{hint.__name__}](#{hint.__name__.lower()})"
+    elif isinstance(hint, type) and issubclass(hint, StrEnum):
+        name = PLAIN[str]
     else:
         name = "anything" if hint is msgspec.Raw else PLAIN[hint]
     return name

@@ -406,7 +406,7 @@ class Mirror:
         own = f"self._aio.{node.name}"
         match [self._text(decorator) for decorator in node.decorator_list]:
             case []:
-                statement = self._statement(cls, node, f"{own}({self._arguments(node)})", returns)
+                statement = self._statement(cls, node, own, returns)
             case ["property"] if isinstance(node, ast.FunctionDef):
                 statement = f"return {self._read(cls, node, returns, name)}"
             case [setter] if setter == f"{node.name}.setter":
@@ -415,16 +415,19 @@ class Mirror:
                 raise self.module.refuse(node, f"{cls.name}.{node.name}: cannot mirror @{' @'.join(decorators)}")
         return self._function(node, name, statement)
 
-    def _statement(self, cls: ast.ClassDef, node: Function, call: str, returns: ast.expr) -> str:
+    def _statement(self, cls: ast.ClassDef, node: Function, own: str, returns: ast.expr) -> str:
         if node.name == "__aiter__":
             return "return self"
         if node.name == "__anext__":
             return "return self._portal.next_of(self._aio)"
+        arguments = self._arguments(node)
+        call = f"{own}({arguments})"
         if isinstance(node, ast.AsyncFunctionDef):
+            # The portal makes the coroutine: one made here would be left unawaited by an interrupt on the way there.
             verb = "call"
             if node.name in {"close", "aclose", "__aexit__"}:
                 verb = "close" if cls.name == self.sources.plan.root else "release"
-            call = f"self._portal.{verb}({call})"
+            call = f"self._portal.{verb}({own}, {arguments})" if arguments else f"self._portal.{verb}({own})"
         value = self._result(cls, node, returns, call, node.name)
         return value if self._text(returns) == "None" else f"return {value}"
 

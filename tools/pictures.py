@@ -1,7 +1,7 @@
 """Make the pictures in `docs/images` again: python tools/pictures.py [NAME...], all without a name.
 
-`PICTURES` says which script makes which. Examples run in a scratch folder, and the file they leave is copied; the other
-scripts know where to write. Drawings not named here are text, edited by hand.
+`PICTURES` says which script makes which. Examples run in a temporary folder, and the file they leave is copied;
+the other scripts know where to write. Drawings not named here are text, edited by hand.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ PICTURES = {
 
 def make(script: str, wanted: dict[str, str]) -> None:
     """Run a script and copy what it left: pictures by the names that it gives them."""
-    with tempfile.TemporaryDirectory(prefix="pictures") as scratch:
+    with tempfile.TemporaryDirectory(prefix="pictures") as temporary:
         environment = {**os.environ, "MPLBACKEND": "agg"}
-        subprocess.run([sys.executable, ROOT / script], cwd=scratch, env=environment, check=True)  # noqa: S603 - ours
+        subprocess.run([sys.executable, ROOT / script], cwd=temporary, env=environment, check=True)  # noqa: S603 - ours
         for left, name in wanted.items():
-            shutil.copy(Path(scratch) / left, IMAGES / name)
+            shutil.copy(Path(temporary) / left, IMAGES / name)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

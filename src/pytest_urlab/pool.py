@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import logging
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
+
+import pytest
 
 from urlab_client.server import Faults, SimulatedServer
 
@@ -46,7 +49,7 @@ class ServerPool:
     def acquire(
         self, models: Sequence[str | os.PathLike[str]], options: Mapping[str, Any], folder: Path
     ) -> SimulatedServer:
-        """Return an open server.
+        """Return an open server, all of whose threads run.
 
         Args:
             models: As of `SimulatedServer`; files are looked for in `folder` first.
@@ -65,13 +68,23 @@ class ServerPool:
         else:
             self._idle.remove(entry)
         entry.server.start()
+        failure = entry.server.failure
+        if failure is not None:
+            entry.server.close()
+            entry.server.start()
         self._lent.append(entry)
+        if failure is not None:
+            _report(f"the simulated server failed after the test before this one and was started again: {failure}")
         return entry.server
 
     def release(self, server: SimulatedServer) -> None:
-        """Take a server back and bring it to its initial state; one that cannot be brought there is closed."""
+        """Take a server back and bring it to its initial state; one that cannot be brought there is closed.
+
+        One that has failed is started again, with a warning.
+        """
         entry = next(lent for lent in self._lent if lent.server is server)
         self._lent.remove(entry)
+        failure = server.failure
         try:
             server.restore()
         except Exception:
@@ -80,6 +93,12 @@ class ServerPool:
         self._idle.append(entry)
         if len(self._idle) > MAX_OPEN:
             self._idle.pop(0).server.close()
+        if failure is not None:
+            _report(f"the simulated server failed during this test and is started again for the next: {failure}")
+
+
+def _report(problem: str) -> None:
+    warnings.warn(pytest.PytestWarning(problem), stacklevel=3)
 
 
 def _located(model: str, folder: Path) -> str:

@@ -1,32 +1,12 @@
-"""What a process that compiles a foreign model may use, and which files the model names. For client and server."""
+"""What a process that compiles a foreign model may use. For client and server."""
 
 from __future__ import annotations
 
 import contextlib
-import html
-import re
 import sys
 from pathlib import Path
 
-__all__ = ["limit_process", "named_files"]
-
-_REFERENCE = re.compile(r"""([\w.:-]*(?:file|dir)[\w.:-]*)\s*=\s*(?:"([^"]*)"|'([^']*)')""")
-
-
-def named_files(text: str) -> tuple[set[str], set[str]]:
-    """Return the names of files and of folders in the text of an MJCF. They may be too many, never too few.
-
-    Raises:
-        ValueError: The text has a document type, which could hide names.
-    """
-    if "<!ENTITY" in text or "<!DOCTYPE" in text:
-        raise ValueError("it has a document type, which no MJCF needs")
-    names: set[str] = set()
-    folders: set[str] = set()
-    for attribute, double, single in _REFERENCE.findall(text):
-        value = html.unescape(double or single).replace("\\", "/")
-        (folders if attribute.endswith("dir") else names).add(value)
-    return names, folders
+__all__ = ["limit_process"]
 
 
 def limit_process(memory_bytes: int, cpu_s: int) -> None:

@@ -24,7 +24,7 @@ def arguments(op: Op) -> tuple[dict[str, Any], dict[str, Any]]:
     given: dict[str, Any] = {}
     expected: dict[str, Any] = {}
     for field in msgspec.structs.fields(op.request):
-        if field.name == "session_id":
+        if field.name in {"session_id", "control_owner"}:
             continue
         if field.name == "target_by":
             given["by_name"] = True

@@ -18,7 +18,7 @@ from samples import filled
 from waiting import in_time, until
 
 from urlab_client.aio import URLabClient, launch
-from urlab_client.protocol.base import Timing
+from urlab_client.protocol.base import Effect
 from urlab_client.protocol.codec import encode_reply
 from urlab_client.protocol.errors import (
     ClientClosed,
@@ -72,7 +72,7 @@ async def test_a_server_that_dies_with_the_request_and_comes_back(client: Any, s
     reborn = type(scripted)(scripted.port)
     reborn.on(name, answer)
     try:
-        if op.effect is Timing.READ:
+        if op.effect is Effect.READ:
             assert type(await in_time(5, call)) is op.reply
         else:
             with pytest.raises(OutcomeUnknown):

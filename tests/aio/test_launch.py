@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from waiting import DEADLINE_S, until
+from waiting import DEADLINE_S, eventually, pass_time, until
 
 import urlab_client
 from urlab_client import ClientClosed, OutcomeUnknown, ServerUnreachable
@@ -52,6 +52,15 @@ def test_the_facade_does_the_same() -> None:
         client.step(10)
         assert set(client.articulations) == {"ball", "pallet"}
     assert children() == set()
+
+
+async def test_the_start_of_the_server_counts_for_no_deadline() -> None:
+    async with URLabClient("sim://ball") as client:
+        calling = asyncio.create_task(client.discover())
+        await until(children)
+        pass_time(40)  # that is longer than a call may take, or wait for a connection
+        await calling
+        assert client.session_id
 
 
 async def test_options_of_serve_go_into_the_address(tmp_path: Path) -> None:
@@ -124,6 +133,58 @@ def test_closing_a_blocking_client_while_its_server_starts(never_ready: None) ->
             call.result()
 
 
+@pytest.fixture
+def never_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Servers that are ready at once, and do not end with their input."""
+    program = tmp_path / "python"
+    ready = '{"address": "tcp://127.0.0.1", "step_port": 1, "state_port": 2}'
+    program.write_text(f"#!{sys.executable}\nimport time\nprint('{ready}', flush=True)\ntime.sleep(600)\n")
+    program.chmod(0o700)
+    monkeypatch.setattr(sys, "executable", str(program))
+
+
+async def test_cancelling_the_close_ends_the_server_at_once(never_ends: None) -> None:
+    client = URLabClient("sim://ball", rcv_timeout_ms=1)
+    with pytest.raises(ServerUnreachable):
+        await client.discover()
+    process = client._transport._process  # type: ignore[attr-defined]
+    close = asyncio.create_task(client.close())
+    await until(process.stdin.is_closing, look=0)
+    assert process.returncode is None
+    close.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await close
+    assert process.returncode == -signal.SIGKILL
+    assert process._transport.is_closing(), "its pipes are closed"
+    await client.close()
+
+
+def test_interrupting_a_blocking_close_ends_the_server_at_once(never_ends: None) -> None:
+    client = urlab_client.URLabClient("sim://ball", rcv_timeout_ms=1)
+    with pytest.raises(ServerUnreachable):
+        client.discover()
+    process = client._aio._transport._process  # type: ignore[attr-defined]
+
+    def interrupt() -> None:
+        eventually(process.stdin.is_closing)
+        os.kill(os.getpid(), signal.SIGUSR1)
+
+    def strike(*_: object) -> None:
+        raise InterruptedError
+
+    before = signal.signal(signal.SIGUSR1, strike)
+    try:
+        with ThreadPoolExecutor(1) as pool:
+            interrupting = pool.submit(interrupt)
+            with pytest.raises(InterruptedError):
+                client.close()
+            interrupting.result()
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+    assert process.returncode == -signal.SIGKILL
+    client.close()
+
+
 def test_the_server_dies_with_its_client() -> None:
     script = (
         "import os, urlab_client\n"
@@ -155,7 +216,7 @@ def test_a_blocking_client_starts_servers_under_uvloops_policy() -> None:
         "    client.discover()\n"
         "    process = client._aio._transport._process\n"
         "    os.kill(process.pid, signal.SIGKILL)\n"
-        "    client._portal.call(process.wait())\n"
+        "    client._portal.call(process.wait)\n"
         "    client.discover()\n"
         "    print(process.returncode, client.step().step)\n"
         "    process = client._aio._transport._process\n"

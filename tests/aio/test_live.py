@@ -144,13 +144,16 @@ class TestInTheBackground:
     ) -> None:
         await client.discover()
         await publisher.subscribed(STATE, TOPIC)
+        art = client.articulations["arm0"]
         await client.step()
-        plugin.tick(0.4, 0.4, wall=99.9)
-        plugin.tick(0.6, 0.6, wall=100.1)
-        await until(lambda: client.sim_time != 0.5)
-        assert client.sim_time == 0.6
-        plugin.tick(0.7, wall=90.0)  # somebody set the server's clock
-        await until(lambda: client.sim_time == 0.7)
+        async with client.state_stream("all") as arrivals:
+            plugin.tick(0.4, 0.4, wall=99.9)
+            assert (await arrivals.receive()).time == 0.4  # it has been offered to the client's own state, too
+            assert (client.sim_time, art.qpos_array.tolist()) == (0.5, [0.5])
+            plugin.tick(0.6, 0.6, wall=100.1)
+            await until(lambda: client.sim_time == 0.6)
+            plugin.tick(0.7, wall=90.0)  # somebody set the server's clock
+            await until(lambda: client.sim_time == 0.7)
 
     async def test_a_state_that_does_not_fit_is_refused_whole(
         self, client: URLabClient, plugin: Plugin, publisher: Publisher, caplog: pytest.LogCaptureFixture

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+import zmq
 from waiting import DEADLINE_S, pass_time, until
 
 from urlab_client import Verdict
@@ -65,6 +66,35 @@ async def test_refused_names_address_and_stage() -> None:
     assert isinstance(info.value, ConnectionError)
     assert info.value.op == "hello"
     assert "urlab serve" in str(info.value)
+
+
+async def test_a_slow_op_waits_for_a_connection_no_longer_than_a_quick_one() -> None:
+    """`hello` may take 30 s to be answered, but whether somebody is there shows sooner."""
+    with socket.socket() as nobody:
+        nobody.bind(("127.0.0.1", 0))
+        where = nobody.getsockname()[1]
+        async with URLabClient("tcp://127.0.0.1", step_port=where, rcv_timeout_ms=2000) as client:
+            calling = asyncio.create_task(client.discover())
+            await until(lambda: client._transport._waiting)  # type: ignore[attr-defined]
+            pass_time(2.5)
+            await asyncio.wait((calling,), timeout=1.5)
+            assert calling.done()
+            with pytest.raises(ServerUnreachable, match="no connection"):
+                await calling
+
+
+async def test_a_reply_that_came_before_the_line_broke_counts(client: Any, scripted: Any) -> None:
+    """The end of a connection is told by another socket than its last reply is: both may wait when the loop looks."""
+    await discovered(client, scripted)
+    scripted.on("set_paused", None)
+    call = asyncio.create_task(client.runtime.set_paused(True))
+    await until(scripted.held.qsize)
+    transport = client._transport
+    scripted.release(PAUSED)
+    assert transport._socket.poll(round(1e3 * DEADLINE_S))  # the loop stands still
+    transport._note(zmq.Event.DISCONNECTED, 0)
+    assert not client.connected
+    assert await call is True
 
 
 async def test_something_else_listens_there() -> None:

@@ -17,9 +17,9 @@ from plugin_memory import WrittenRegion
 from publisher import Publisher
 from waiting import DEADLINE_S
 
-from urlab_client.aio.publishers import Publishers
+from urlab_client.aio.live.publishers import Publishers
 from urlab_client.aio.streams import Stream
-from urlab_client.aio.transport.shm import SharedMemory
+from urlab_client.aio.transport.shm import SharedMemoryRegions
 from urlab_client.protocol import shm
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.fence import processor_fence
@@ -60,15 +60,15 @@ async def publisher() -> AsyncIterator[Publisher]:
 
 
 @pytest.fixture
-async def memory(tmp_path: Path) -> AsyncIterator[SharedMemory]:
-    made = SharedMemory(tmp_path)
+async def memory(tmp_path: Path) -> AsyncIterator[SharedMemoryRegions]:
+    made = SharedMemoryRegions(tmp_path)
     made.follow(msgspec.convert(hello_ok(), HelloOk, strict=False))
     yield made
     made.close()
 
 
 @pytest.fixture
-async def publishers(publisher: Publisher, memory: SharedMemory) -> AsyncIterator[Publishers]:
+async def publishers(publisher: Publisher, memory: SharedMemoryRegions) -> AsyncIterator[Publishers]:
     made = Publishers(lambda: "tcp://127.0.0.1:1", lambda: publisher.port, default_timeout=DEADLINE_S, memory=memory)
     yield made
     made.close()
@@ -342,7 +342,7 @@ async def test_snapshots_go_on_when_a_server_lays_them_out_in_another_way(
 
 
 async def test_streams_survive_a_server_that_calls_its_directory_something_else(
-    publishers: Publishers, publisher: Publisher, memory: SharedMemory, state_region: WrittenRegion
+    publishers: Publishers, publisher: Publisher, memory: SharedMemoryRegions, state_region: WrittenRegion
 ) -> None:
     state_region.publish(snapshot(1.0))
     async with states(publishers) as stream:

@@ -18,10 +18,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from publisher import Publisher
-from waiting import DEADLINE_S, until
+from waiting import DEADLINE_S, pass_time, until
 
-from urlab_client.aio.reception import LiveReception
-from urlab_client.aio.sources import CameraSource, EventBus, RowSource, StateSource
+from urlab_client.aio.live.live_state import LiveState
+from urlab_client.aio.live.sources import CameraSource, EventBus, RowSource, StateSource
 from urlab_client.aio.streams import Stream
 from urlab_client.aio.transport.subscriber import Subscriptions
 from urlab_client.protocol.enums import CameraMode
@@ -82,6 +82,12 @@ def latest(source: Any, **options: Any) -> Stream[Any]:
 
 def everything(source: Any, **options: Any) -> Stream[Any]:
     return Stream(source, policy="all", **{"default_timeout": DEADLINE_S, **options})
+
+
+async def turns() -> None:
+    """Let the loop do what is due, and what that leads to."""
+    for _ in range(5):
+        await asyncio.sleep(0)
 
 
 class Marker:
@@ -504,6 +510,43 @@ class TestWaiting:
         assert isinstance(raised.value, TimeoutError)
         assert "client.sim.start()" in str(raised.value)
 
+    @pytest.mark.parametrize("live", [True, False])
+    async def test_a_server_that_prepares_its_first_picture_has_time(
+        self, subscriptions: Subscriptions, publisher: Publisher, live: bool
+    ) -> None:
+        camera = Camera(publisher.endpoint)
+        source = CameraSource(subscriptions, camera, lambda: "127.0.0.1", lambda: live)
+        async with latest(source, default_timeout=1.0) as frames:
+            first = asyncio.ensure_future(frames.receive())
+            await publisher.subscribed(b"arm0/camera/wrist ")
+            await until(lambda: source.first_after(frames._channel) == (30.0 if live else 0.0))
+            pass_time(2.0)
+            await turns()
+            if live:
+                publisher.send(b"arm0/camera/wrist ", bytes(16))
+                assert (await first).pixels.shape == (2, 2, 4)
+                first = asyncio.ensure_future(frames.receive())
+                await turns()
+                pass_time(2.0)
+            with pytest.raises(URLabTimeoutError, match=r"nothing came within 1000 ms.*looks for OpenGL"):
+                await first
+
+    async def test_the_first_picture_has_its_deadline_too(
+        self, subscriptions: Subscriptions, publisher: Publisher
+    ) -> None:
+        source = CameraSource(subscriptions, Camera(publisher.endpoint), lambda: "127.0.0.1", lambda: True)
+        async with latest(source, default_timeout=1.0) as frames:
+            first = asyncio.ensure_future(anext(frames))
+            await publisher.subscribed(b"arm0/camera/wrist ")
+            await until(lambda: source.first_after(frames._channel))
+            pass_time(2.0)
+            await turns()
+            pass_time(40.0)
+            with pytest.raises(URLabTimeoutError, match=r"nothing came within 30000 ms.*looks for OpenGL"):
+                await first
+            with pytest.raises(URLabTimeoutError, match="within 10 ms"):
+                await frames.receive(timeout=0.01)
+
     async def test_a_silent_publisher_is_told_apart_and_the_stream_goes_on(
         self, publisher: Publisher, subscriptions: Subscriptions
     ) -> None:
@@ -753,7 +796,7 @@ class TestBackground:
 
     async def test_the_newest_snapshot_is_taken_over(self, publisher: Publisher, state: StateSource) -> None:
         taken: list[float] = []
-        reception = LiveReception(state, lambda found: taken.append(found.time), threading.RLock())
+        reception = LiveState(state, lambda found: taken.append(found.time), threading.RLock())
         reception.start()
         reception.start()
         async with Marker(state, publisher) as marker:
@@ -782,7 +825,7 @@ class TestBackground:
 
         holder = asyncio.create_task(asyncio.to_thread(hold))
         assert await asyncio.to_thread(held.wait, DEADLINE_S)
-        reception = LiveReception(state, lambda found: taken.append(found.time), lock)
+        reception = LiveState(state, lambda found: taken.append(found.time), lock)
         reception.start()
         async with Marker(state, publisher) as marker:
             await publisher.subscribed(STATE)
@@ -802,7 +845,7 @@ class TestBackground:
             if found.time > 0:
                 raise ProtocolError("state/full: its model has 5.", hint="Call discover().")
 
-        reception = LiveReception(state, absorb, threading.RLock())
+        reception = LiveState(state, absorb, threading.RLock())
         reception.start()
         async with Marker(state, publisher) as marker:
             await publisher.subscribed(STATE)

@@ -11,8 +11,9 @@ import pytest
 from hello import hello_ok
 
 from urlab_client import ProtocolError
-from urlab_client.aio import URLabClient, compilation
+from urlab_client.aio import URLabClient
 from urlab_client.aio import client as client_module
+from urlab_client.aio.model import compilation
 
 MESH = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 BODY = '<body><freejoint/><geom size=".1"/></body>'
@@ -70,6 +71,23 @@ async def test_it_reads_no_file_of_this_machine(told: Callable[..., URLabClient]
         with pytest.raises(ProtocolError, match=r"a file of this machine.*local_model=False"):
             await client.discover()
         assert client.model is None
+
+
+INCLUDING = '<mujoco><include file="sub/part.xml"/></mujoco>'
+ATTACHING = '<mujoco><asset><model name="a" file="part.xml"/></asset></mujoco>'
+
+
+async def test_documents_that_came_with_it_read_none_either(told: Callable[..., URLabClient], tmp_path: Path) -> None:
+    secret = tmp_path / "secret.obj"
+    secret.write_text(MESH)
+    part = f'<mujoco><asset><mesh name="m" file="{secret}"/></asset></mujoco>'
+    async with told(INCLUDING, {"part.xml": part.encode()}) as client:
+        with pytest.raises(ProtocolError, match=r"a file of this machine.*local_model=False"):
+            await client.discover()
+    for disguise in ("", " " * 256, "\v", "\ufeff\ufeff", "A poem. ", '<!-- file=" -->'):
+        for xml in (INCLUDING, ATTACHING):
+            with pytest.raises(ValueError, match=r"secret\.obj, a file of this machine"):
+                compilation._refuse_local_files(xml, {"part.xml": (disguise + part).encode()})
 
 
 async def test_it_may_not_hide_names_in_entities(told: Callable[..., URLabClient]) -> None:

@@ -14,11 +14,11 @@ import mujoco
 import numpy as np
 import pytest
 from commands import GYMNASIUM_MODELS, urlab
-from matplotlib.image import imread
+from PIL import Image
 
 from urlab_client import URLabClient
 from urlab_client.cli import main
-from urlab_client.cli.pilots import SinePilot
+from urlab_client.cli.demo_controllers import SineController
 from urlab_client.cli.robot_file import read_robot
 from urlab_client.server import SimulatedServer
 
@@ -90,7 +90,7 @@ def test_plots_the_joints(demonstration: tuple[Path, str]) -> None:
     width, height = png_size(folder / "joints.png")
     assert width >= 1200
     assert height >= 900
-    pixels = (imread(folder / "joints.png")[..., :3] * 255).astype(np.uint32)
+    pixels = np.asarray(Image.open(folder / "joints.png"))[..., :3].astype(np.uint32)
     assert len(np.unique(pixels @ np.array([1, 256, 65536], np.uint32))) > 50  # a dozen lines and their soft edges
 
 
@@ -102,7 +102,7 @@ def test_draws_the_last_state_or_says_what_is_missing(demonstration: tuple[Path,
         assert not picture.exists()
         return
     assert png_size(picture) == (1280, 960)
-    red, green, blue = np.moveaxis(imread(picture)[..., :3], -1, 0)
+    red, green, blue = np.moveaxis(np.asarray(Image.open(picture)) / 255, -1, 0)
     shell = (red > 0.6) & (green < 0.75 * red) & (blue < 0.5 * red)  # the quadruped's orange
     rows, columns = np.nonzero(shell)
     assert shell.mean() > 0.005
@@ -117,7 +117,9 @@ def test_records_the_configuration(record: dict[str, Any]) -> None:
     assert len(record["model"]["sha256"]) == 64
     assert record["options"]["timestep"] == 0.002
     assert record["seed"] == 0
-    assert {pilot["kind"] for pilots in record["pilots"].values() for pilot in pilots} == {"trot"}
+    assert {controller["kind"] for controllers in record["controllers"].values() for controller in controllers} == {
+        "trot"
+    }
 
 
 def test_leaves_nothing_else(demonstration: tuple[Path, str], record: dict[str, Any]) -> None:
@@ -192,14 +194,14 @@ def test_an_output_folder_that_is_none(tmp_path: Path, capsys: pytest.CaptureFix
     assert str(file) in capsys.readouterr().err
 
 
-def test_the_gentle_pilot_stays_inside_the_control_ranges() -> None:
+def test_the_gentle_controller_stays_inside_the_control_ranges() -> None:
     with SimulatedServer("arm", play=True) as server, URLabClient(**server.client_options()) as client:
         client.discover()
         arm = client.articulations["arm"]
-        pilot = SinePilot(arm, read_robot("arm").home_ctrl)
+        controller = SineController(arm, read_robot("arm").home_ctrl)
         seen = []
         for time in np.linspace(0, 5, 200):
-            pilot.act(time)
+            controller.act(time)
             seen.append(arm.ctrl_array.copy())
         ranges = np.array([actuator.ctrlrange for actuator in arm.actuators.values()])
     low, high = np.min(seen, axis=0), np.max(seen, axis=0)

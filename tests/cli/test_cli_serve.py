@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import socket
 from pathlib import Path
@@ -91,6 +92,26 @@ def test_a_signal_during_a_start_that_takes_long(tmp_path: Path) -> None:
         out, err = process.communicate(timeout=DEADLINE_S)
     assert (process.returncode, out, err) == (0, "", "")
     assert not scratch.exists()
+
+
+def test_ends_with_the_reason_when_a_thread_dies(tmp_path: Path) -> None:
+    program = tmp_path / "dying.py"
+    program.write_text(
+        "import ctypes, sys, threading\n"
+        "from urlab_client.cli import main\n"
+        "def strike():\n"
+        "    sys.stdin.readline()\n"
+        "    (physics,) = [thread for thread in threading.enumerate() if thread.name == 'urlab-physics']\n"
+        "    ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(physics.ident), ctypes.py_object(SystemExit))\n"
+        "threading.Thread(target=strike, daemon=True).start()\n"
+        "sys.exit(main(sys.argv[1:]))\n"
+    )
+    with child(program, "serve", "arm", "--play", "--json", *FREE_PORTS, cwd=tmp_path) as process:
+        assert process.stdout is not None
+        assert json.loads(process.stdout.readline())["event"] == "ready"
+        out, err = process.communicate("now\n", timeout=DEADLINE_S)
+    assert (process.returncode, out) == (2, "")
+    assert err.splitlines()[-1] == "urlab serve: the server's thread 'urlab-physics' died of SystemExit"
 
 
 def test_every_option_has_its_effect(tmp_path: Path) -> None:

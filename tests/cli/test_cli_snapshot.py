@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import refusal, urlab
-from matplotlib.image import imread
+from PIL import Image
 
 from urlab_client import URLabClient
 from urlab_client.cli import main
@@ -24,13 +24,13 @@ def _in_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def picture(*arguments: str) -> np.ndarray[Any, Any]:
     """Run the command and return its picture, channels in 0..1."""
     assert main(["snapshot", *arguments, "-o", "out.png"]) == 0
-    return imread("out.png")
+    return np.asarray(Image.open("out.png")) / 255
 
 
 def test_models_in_a_process_of_its_own(tmp_path: Path) -> None:
     done = urlab("snapshot", "quadruped", "arm", "--size", "160x90", cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (0, "snapshot.png: 160x90\n", "")
-    assert imread(tmp_path / "snapshot.png").shape == (90, 160, 4)
+    assert np.asarray(Image.open(tmp_path / "snapshot.png")).shape == (90, 160, 4)
 
 
 def test_modes_and_moments_differ() -> None:

@@ -16,9 +16,11 @@ from commands import DEADLINE_S, child, refusal, urlab
 from urlab_client.cli import main
 
 
-def test_help_needs_no_heavy_library(tmp_path: Path) -> None:
+def test_help_needs_no_heavy_library_and_a_command_none_of_the_others(tmp_path: Path) -> None:
     program = (
         "import sys; from urlab_client.cli import main\n"
+        "try: main(['serve', '--help'])\n"
+        "except SystemExit: print('urlab_client.aio' in sys.modules)\n"
         "try: main(['--help'])\n"
         "except SystemExit: print(sorted({'mujoco', 'rich', 'matplotlib'} & set(sys.modules)))"
     )
@@ -28,6 +30,7 @@ def test_help_needs_no_heavy_library(tmp_path: Path) -> None:
     *text, imported = done.stdout.splitlines()
     assert set(COMMANDS) <= set(" ".join(text).split())
     assert imported == "[]"
+    assert "False" in text, "a server loads the clients"
 
 
 COMMANDS = (

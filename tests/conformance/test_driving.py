@@ -10,6 +10,7 @@ import pytest
 
 from urlab_client import ModeLocked, NoSession, SessionTakenOver, UnknownKeyframe, UnknownName, URLabError
 from urlab_client.enums import ControlMode, StepMode
+from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.server import ControllerConfig, SimulatedServer
 
 MODELS = ["humanoid.xml", "ant.xml", "walker2d_v5.xml", "pusher_v5.xml"]
@@ -257,12 +258,54 @@ async def test_discover_again_keeps_what_the_user_holds(connect: Any) -> None:
         actuator = next(iter(arm.actuators.values()))
         actuator.set_control(0.2)
         old_session = client.session_id
+        assert (await client.step(3)).step == client.step_count == 3
         await client.discover()
         assert client.session_id != old_session
         assert client.articulations[arm.prefix] == arm
-        await client.step()
+        assert client.step_count == 0, "steps are counted from the handshake on"
+        assert (await client.step()).step == client.step_count == 1
         assert arm.last_applied_ctrl[0] == np.float32(0.2)
         assert actuator.value == 0.2
+
+
+@pytest.mark.parametrize("on", [True, False])
+async def test_options_are_those_of_the_server_in_the_local_model(connect: Any, on: bool) -> None:
+    with SimulatedServer("ball", play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        opt = client.model.opt
+        for switch in (not on, on):
+            options = await client.runtime.set_sim_options(
+                enable_multiccd=switch, enable_sleep=switch, gravity=(0, 0, -1.5), integrator="rk4"
+            )
+        assert (opt.disableflags, opt.enableflags) == (options.disableflags, options.enableflags)
+        assert bool(opt.disableflags & mujoco.mjtDisableBit.mjDSBL_MULTICCD) is not on
+        assert bool(opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP) is on
+        assert (opt.gravity.tolist(), opt.integrator) == ([0.0, 0.0, -1.5], mujoco.mjtIntegrator.mjINT_RK4)
+
+
+async def test_closing_takes_back_the_mode_that_discover_promoted_and_no_other(connect: Any) -> None:
+    with SimulatedServer("ball", play=True) as server:
+
+        async def mode_after(client: Any) -> str:
+            await client.close()
+            other = connect(server)
+            await other.discover()
+            return (await other.call(SetMode(mode="live"))).previous_mode
+
+        promoting = connect(server, step_mode="direct")
+        await promoting.discover()
+        assert await mode_after(promoting) == "live"
+
+        finding = connect(server, step_mode="direct")
+        await finding.discover()
+        await finding.sim.stop()
+        other = connect(server)
+        await other.discover()
+        await other.sim.start()
+        await other.runtime.set_mode("direct")
+        await finding.discover()
+        assert await mode_after(finding) == "direct", "somebody else's choice"
 
 
 async def test_a_second_client_takes_over_and_the_first_is_told(connect: Any) -> None:

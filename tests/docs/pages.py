@@ -10,8 +10,10 @@ and on `docs/adding-an-op.md`, for `test_docs_adding_an_op.py`:
 
     <!-- append: FILE -->                write it at the end of FILE
     <!-- insert: FILE before: LINE -->   write it above the only line of FILE that reads LINE
+    <!-- insert: FILE after: LINE -->    write it below that line
     <!-- shows: FILE -->                 stands in FILE afterwards
     <!-- use -->                         runs afterwards
+    <!-- tests -->                       tests that pass afterwards
 """
 
 from __future__ import annotations

@@ -36,20 +36,23 @@ def run(tree: Path, arguments: Sequence[str]) -> subprocess.CompletedProcess[str
 
 def apply(tree: Path, block: Block) -> None:
     kind, _, rest = block.directive.partition(": ")
-    name, _, anchor = rest.partition(" before: ")
+    name, before, anchor = rest.partition(" before: ")
+    if not before:
+        name, _, anchor = rest.partition(" after: ")
     path = tree / name
     lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
     where, gap = len(lines), "\n\n" if path.suffix == ".py" else ""
     if kind == "insert":
-        (where,), gap = [number for number, line in enumerate(lines) if line.strip() == anchor], ""
-    path.write_text("".join([*lines[:where], gap, block.code, *lines[where:]]), encoding="utf-8")
+        (where,), gap = [number for number, line in enumerate(lines, 0 if before else 1) if line.strip() == anchor], ""
+    end = "\n\n" if before and block.code.startswith("class ") else ""
+    path.write_text("".join([*lines[:where], gap, block.code, end, *lines[where:]]), encoding="utf-8")
 
 
 @pytest.fixture(scope="module")
 def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a copy of the repository after all edits, with everything generated."""
     copy = tmp_path_factory.mktemp("walkthrough")
-    for folder in ("src", "tools", "docs", "tests/data", "tests/server"):
+    for folder in ("src", "tools", "docs", "tests/data", "tests/protocol", "tests/server"):
         shutil.copytree(ROOT / folder, copy / folder, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(ROOT / "pyproject.toml", copy)
     for block in blocks(PAGE):
@@ -65,12 +68,12 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_page_has_all_kinds_of_steps() -> None:
     assert {kind: len(of(kind)) for kind in ("append", "insert", "shows", "use")} == {
-        "append": 3,
-        "insert": 3,
+        "append": 2,
+        "insert": 4,
         "shows": 2,
         "use": 1,
     }
-    commands = "".join(block.code for block in blocks(PAGE) if block.language == "console")
+    commands = "".join(block.code for block in blocks(PAGE) if block.language == "console" and not block.directive)
     assert [line.rpartition("/")[2] for line in commands.splitlines()] == list(TOOLS)
 
 
@@ -105,8 +108,13 @@ def test_meta_and_the_reference_have_their_row(tree: Path) -> None:
     row = next(line for line in reference.splitlines() if line.startswith("| [`get_mass`]("))
     assert "`get_mass()`" in row
     assert "| play | read |" in row
-    catalogue = run(tree, ["-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/server/test_meta.py"])
-    assert catalogue.returncode == 0, catalogue.stdout
+
+
+def test_the_tests_that_the_page_names_pass(tree: Path) -> None:
+    (block,) = of("tests")
+    files = block.code.split("-m pytest ")[1].split()
+    done = run(tree, ["-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", *files])
+    assert done.returncode == 0, done.stdout
 
 
 def test_what_is_written_passes_the_linter(tree: Path) -> None:

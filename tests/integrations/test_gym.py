@@ -68,6 +68,18 @@ def test_a_registered_task_passes_the_checker_and_closes_its_server(task_id: str
         env.reset()
 
 
+def test_a_reset_sets_the_set_points_to_zero(make_env: MakeEnv) -> None:
+    env = make_env()
+    env.reset(seed=0)
+    env.step(env.action_space.high)
+    env.reset(seed=0)
+    for articulation in env.client.articulations.values():
+        assert not articulation.ctrl_array.any()
+    env.client.step()  # by somebody who does without actions
+    for articulation in env.client.articulations.values():
+        assert not articulation.last_applied_ctrl.any()
+
+
 def test_flat_and_dict_hold_the_same_values_in_the_documented_order(make_env: MakeEnv) -> None:
     flat = make_env()
     a, _ = flat.reset(seed=0)

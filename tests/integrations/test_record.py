@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
+import gc
 import json
 import math
 import os
@@ -23,6 +25,7 @@ from mcap.reader import make_reader
 from waiting import until
 
 import urlab_client
+from urlab_client import NotReady
 from urlab_client.aio import URLabClient as AsyncClient
 from urlab_client.integrations._feed.messages import (
     ArticulationMessage,
@@ -38,7 +41,7 @@ from urlab_client.integrations._feed.messages import (
 from urlab_client.integrations.record import RecordingError, Run, read_run, record
 from urlab_client.integrations.record import writer as writing
 from urlab_client.integrations.record.reader import _state
-from urlab_client.server import SimulatedServer
+from urlab_client.server import Faults, Refuse, SimulatedServer
 
 # Fields of Foxglove's schemas of these names.
 FOXGLOVE = {
@@ -277,6 +280,37 @@ def test_pictures_come_when_due_and_are_those_of_the_client(client: urlab_client
 # Live mode
 
 
+def test_a_step_that_fails_costs_no_picture(tmp_path: Path) -> None:
+    faults = Faults()
+    with (
+        SimulatedServer("arm", play=True, faults=faults, camera_size=(16, 12)) as server,
+        urlab_client.URLabClient(**server.client_options(), step_mode="direct") as client,
+    ):
+        client.discover()
+        with record(client, tmp_path / "run.mcap", cameras=["arm/wrist"], camera_hz=1) as recorder:
+            for _ in range(2):
+                with faults.add(Refuse("step", code="not_ready", times=1)), pytest.raises(NotReady):
+                    client.step()
+            assert client.step().cameras
+            assert not client.step().cameras
+        assert recorder.stats.frames == 1
+
+
+async def test_ended_streams_are_not_kept(server: SimulatedServer, tmp_path: Path) -> None:
+    async with AsyncClient(**server.client_options()) as client:
+        await client.discover()
+        async with record(client, tmp_path / "run.mcap"):
+            for _ in range(5):
+                await client.runtime.set_mode("direct")
+                await client.step()
+                await client.runtime.set_mode("live")
+                await client.step()
+            await until(lambda: sum(task.get_name() == "urlab-feed" for task in asyncio.all_tasks()) == 1)
+            gc.collect()
+            kept = [found for found in gc.get_objects() if isinstance(found, asyncio.Task)]
+            assert sum(task.get_name() == "urlab-feed" for task in kept) == 1
+
+
 async def test_live_mode_records_every_snapshot_and_modes_may_change(tmp_path: Path) -> None:
     with SimulatedServer("arm", play=True) as server:
         async with AsyncClient(**server.client_options(), step_mode="live") as client:
@@ -383,8 +417,8 @@ def test_a_full_disk_is_told_and_costs_the_simulation_nothing(
     rng = np.random.default_rng(0)
     try:
         with pytest.raises(RecordingError, match=r"broke off: File too large.*can be read") as caught, recorder:  # noqa: PT012
-            start = recorder.stats.file_bytes
-            for _ in range(200_000):
+            start, steps = recorder.stats.file_bytes, 0
+            for steps in range(1, 200_001):  # noqa: B007
                 for art in client.articulations.values():
                     art.ctrl_array[:] = rng.uniform(-1, 1, len(art.ctrl_array))
                 client.step()
@@ -401,7 +435,9 @@ def test_a_full_disk_is_told_and_costs_the_simulation_nothing(
     assert isinstance(cause, OSError)
     assert cause.errno == errno.EFBIG
     assert recorder.stats.states == written
-    assert recorder.stats.dropped_states > 0
+    # Each state is one or the other; only the one that met the full disk may be neither.
+    assert steps <= recorder.stats.states + recorder.stats.dropped_states <= steps + 1
+    assert recorder.stats.dropped_frames == 0
     assert "recording stopped" in caplog.text
     run = read_run(path)
     table = run.table()

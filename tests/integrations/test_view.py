@@ -21,7 +21,7 @@ from waiting import DEADLINE_S, eventually, until
 import urlab_client
 from urlab_client.aio import URLabClient as AsyncClient
 from urlab_client.integrations._feed.messages import CompressedImage, RawImage, Time
-from urlab_client.integrations._feed.samples import Picture, picture_message
+from urlab_client.integrations._feed.samples import CameraPicture, picture_message
 from urlab_client.integrations.view import foxglove_view, rerun_view, window_view
 from urlab_client.integrations.view import view as viewing
 from urlab_client.integrations.view.geometry import Kind, shapes_of
@@ -336,7 +336,7 @@ async def test_pictures_are_compressed_only_for_somebody_who_looks(monkeypatch: 
 
     made: list[CompressedImage | RawImage] = []
 
-    def compressing(picture: Picture, stamp: Time, quality: int | None) -> CompressedImage | RawImage:
+    def compressing(picture: CameraPicture, stamp: Time, quality: int | None) -> CompressedImage | RawImage:
         made.append(picture_message(picture, stamp, quality))
         return made[-1]
 

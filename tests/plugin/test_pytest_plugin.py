@@ -116,6 +116,42 @@ def test_faults_go_with_the_test(pytester: pytest.Pytester) -> None:
     run(pytester, text).assert_outcomes(passed=2)
 
 
+def test_a_server_with_a_dead_thread_is_replaced_and_told_of(pytester: pytest.Pytester) -> None:
+    text = """
+        import ctypes
+        import threading
+
+        import pytest
+
+        def strike(server=None):
+            (physics,) = [thread for thread in threading.enumerate() if thread.name == "urlab-physics"]
+            ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(physics.ident), ctypes.py_object(SystemExit))
+            physics.join()
+
+        def test_that_breaks_it(urlab_client, urlab_server):
+            strike()
+            assert urlab_server.failure
+
+        @pytest.fixture
+        def breaks_it_before():
+            strike()
+
+        def test_that_finds_it_broken(breaks_it_before, urlab_client):
+            urlab_client.runtime.forward()
+
+        def test_after_that(urlab_client):
+            urlab_client.runtime.forward()
+        """
+    result = run(pytester, text, "-W", "default::pytest.PytestWarning")
+    result.assert_outcomes(passed=3, warnings=2)
+    result.stdout.fnmatch_lines(
+        [
+            "*the simulated server failed during this test*'urlab-physics' died of SystemExit*",
+            "*the simulated server failed after the test before this one*'urlab-physics' died of SystemExit*",
+        ]
+    )
+
+
 def test_files_lie_beside_the_test_and_the_default_is_chosen_in_conftest(pytester: pytest.Pytester) -> None:
     pytester.makeconftest(
         """

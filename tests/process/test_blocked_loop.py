@@ -8,10 +8,10 @@ import sys
 BLOCKED = """
 import asyncio, time
 from urlab_client.aio import URLabClient
-from urlab_client.aio.transport import line, subscriber
+from urlab_client.aio.transport import connection_status, subscriber
 from urlab_client.server import SimulatedServer
 
-line.HEARTBEAT_MS, line.SILENCE_MS, subscriber._QUEUED_MESSAGES = 100, 300, 10
+connection_status.HEARTBEAT_MS, connection_status.SILENCE_MS, subscriber._QUEUED_MESSAGES = 100, 300, 10
 
 async def main():
     async with SimulatedServer("arm", play=True) as server, URLabClient(**server.client_options()) as client:

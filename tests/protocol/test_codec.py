@@ -270,3 +270,10 @@ def test_json_numbers_have_17_significant_digits(number: float) -> None:
 def test_json_numbers_that_are_whole_have_no_point() -> None:
     assert b'"percent":42}' in encode_reply(OPS["set_sim_speed"].reply(percent=42.0), json=True)  # type: ignore[call-arg]
     assert b"0.10000000000000001" in encode_reply(OPS["set_sim_speed"].reply(percent=0.1), json=True)  # type: ignore[call-arg]
+
+
+def test_an_integer_beyond_any_float_is_a_protocol_error() -> None:
+    state = b'{"qpos":[1%b],"qvel":[]}' % (b"0" * 400)
+    frame = b'{"op":"step_ok","time":0,"step":1,"per_articulation":{"bot":%b}}' % state
+    with pytest.raises(ProtocolError, match="step: the server's answer is not a valid step_ok"):
+        decode_reply(OPS["step"], StepOk, frame)

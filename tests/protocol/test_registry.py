@@ -8,7 +8,7 @@ import pytest
 
 from urlab_client.protocol.base import Needs, Op, Reply, Request, doc
 from urlab_client.protocol.errors import RPC_ERRORS, URLabRPCError, rpc_error
-from urlab_client.protocol.registry import ENVELOPE_ERRORS, OPS, registry
+from urlab_client.protocol.registry import ENVELOPE_ERRORS, OPS, dialect_ops, registry
 
 
 class PokeOk(Reply, tag="poke_ok", kw_only=True):
@@ -66,9 +66,38 @@ def test_a_good_one_carries_everything() -> None:
     )
 
 
-def test_the_wire_has_64_ops() -> None:
-    assert len(OPS) == 64
-    assert sum(op.needs is Needs.EDITOR for op in OPS.values()) == 38
+def test_what_only_one_dialect_offers() -> None:
+    alpha, beta = dialect_ops("alpha").keys(), dialect_ops("beta").keys()
+    assert alpha | beta == OPS.keys()
+    assert alpha - beta == {"destroy_actor"}
+    assert beta - alpha == {
+        "acquire_lease",
+        "claim_control",
+        "op_status",
+        "release_control",
+        "release_lease",
+        "remove_actor",
+        "set_camera_delay",
+        "set_camera_streaming",
+        "set_user_channels",
+        "upload_model_manifest",
+        "upload_model_chunk",
+        "upload_model_commit",
+    }
+
+
+def test_ops_that_may_be_jobs() -> None:
+    assert {op for op in OPS if OPS[op].job} == {
+        "import_xml",
+        "create_level",
+        "load_level",
+        "save_level",
+        "spawn_actor",
+        "spawn_grid",
+        "spawn_light",
+        "remove_actor",
+        "duplicate_actor",
+    }
 
 
 def test_every_code_of_the_envelope_has_its_class() -> None:

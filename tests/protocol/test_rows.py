@@ -25,7 +25,7 @@ from urlab_client.protocol.rows import (
     JointRow,
     SceneRow,
     SensorRow,
-    Topic,
+    StreamTopic,
     TopicKind,
     TwistRow,
 )
@@ -51,35 +51,35 @@ def same(a: np.ndarray, b: np.ndarray) -> bool:
 class TestTopics:
     @given(
         st.one_of(
-            st.builds(Topic, st.sampled_from(OF_COMPONENT), keys, names),
-            st.builds(Topic, st.sampled_from(OF_ARTICULATION), keys),
-            st.builds(Topic, st.sampled_from(list(OF_SCENE)), names),
-            st.just(Topic(TopicKind.STATE_FULL)),
+            st.builds(StreamTopic, st.sampled_from(OF_COMPONENT), keys, names),
+            st.builds(StreamTopic, st.sampled_from(OF_ARTICULATION), keys),
+            st.builds(StreamTopic, st.sampled_from(list(OF_SCENE)), names),
+            st.just(StreamTopic(TopicKind.STATE_FULL)),
         ).filter(lambda topic: topic.owner != "scene" or topic.kind in OF_SCENE)
     )
-    def test_round_trip(self, topic: Topic) -> None:
+    def test_round_trip(self, topic: StreamTopic) -> None:
         frame = topic.encode()
-        assert Topic.parse(frame) == topic
-        assert Topic.parse(memoryview(frame)) == topic
+        assert StreamTopic.parse(frame) == topic
+        assert StreamTopic.parse(memoryview(frame)) == topic
         assert frame.endswith(b" ") == (topic.kind in {TopicKind.CONTROL, TopicKind.SET_GAINS, TopicKind.CAMERA})
 
     @pytest.mark.parametrize(
         ("frame", "topic"),
         [
-            (b"scene/joint/knee", Topic(TopicKind.JOINT, "scene", "knee")),
-            (b"scene/twist", Topic(TopicKind.TWIST, "scene")),
-            (b"scene/camera/head ", Topic(TopicKind.CAMERA, "scene", "head")),
-            (b"scene/joint/xpos", Topic(TopicKind.XPOS, "joint")),
-            (b"scene/scene/qvel", Topic(TopicKind.QVEL, "scene")),
-            (b"state/twist", Topic(TopicKind.TWIST, "state")),
-            (b"joint/joint/joint", Topic(TopicKind.JOINT, "joint", "joint")),
-            (b"g1/joint/left/knee", Topic(TopicKind.JOINT, "g1", "left/knee")),
-            (b"g1/joint//", Topic(TopicKind.JOINT, "g1", "/")),
-            (b"scene/kitchen/box/qpos", Topic(TopicKind.QPOS, "kitchen/box")),
+            (b"scene/joint/knee", StreamTopic(TopicKind.JOINT, "scene", "knee")),
+            (b"scene/twist", StreamTopic(TopicKind.TWIST, "scene")),
+            (b"scene/camera/head ", StreamTopic(TopicKind.CAMERA, "scene", "head")),
+            (b"scene/joint/xpos", StreamTopic(TopicKind.XPOS, "joint")),
+            (b"scene/scene/qvel", StreamTopic(TopicKind.QVEL, "scene")),
+            (b"state/twist", StreamTopic(TopicKind.TWIST, "state")),
+            (b"joint/joint/joint", StreamTopic(TopicKind.JOINT, "joint", "joint")),
+            (b"g1/joint/left/knee", StreamTopic(TopicKind.JOINT, "g1", "left/knee")),
+            (b"g1/joint//", StreamTopic(TopicKind.JOINT, "g1", "/")),
+            (b"scene/kitchen/box/qpos", StreamTopic(TopicKind.QPOS, "kitchen/box")),
         ],
     )
-    def test_articulations_named_like_a_part_of_the_grammar(self, frame: bytes, topic: Topic) -> None:
-        assert Topic.parse(frame) == topic
+    def test_articulations_named_like_a_part_of_the_grammar(self, frame: bytes, topic: StreamTopic) -> None:
+        assert StreamTopic.parse(frame) == topic
 
     @pytest.mark.parametrize(
         ("frame", "problem"),
@@ -106,13 +106,13 @@ class TestTopics:
     )
     def test_refused(self, frame: bytes, problem: str) -> None:
         with pytest.raises(ProtocolError, match=problem) as caught:
-            Topic.parse(frame)
+            StreamTopic.parse(frame)
         assert caught.value.raw == frame
 
     @given(st.binary(max_size=40))
     def test_any_bytes_give_a_topic_that_encodes_alike_or_an_error(self, frame: bytes) -> None:
         try:
-            topic = Topic.parse(frame)
+            topic = StreamTopic.parse(frame)
         except ProtocolError:
             return
         assert topic.encode() == frame
@@ -120,17 +120,17 @@ class TestTopics:
     @pytest.mark.parametrize(
         "topic",
         [
-            Topic(TopicKind.JOINT, "g1"),
-            Topic(TopicKind.JOINT, "", "knee"),
-            Topic(TopicKind.TWIST, "g1", "knee"),
-            Topic(TopicKind.XPOS),
-            Topic(TopicKind.STATE_FULL, "g1"),
-            Topic(TopicKind.JOINT, "a/b", "knee"),
-            Topic(TopicKind.TWIST, "g1 "),
-            Topic(TopicKind.CAMERA, "g1", "wrist "),
+            StreamTopic(TopicKind.JOINT, "g1"),
+            StreamTopic(TopicKind.JOINT, "", "knee"),
+            StreamTopic(TopicKind.TWIST, "g1", "knee"),
+            StreamTopic(TopicKind.XPOS),
+            StreamTopic(TopicKind.STATE_FULL, "g1"),
+            StreamTopic(TopicKind.JOINT, "a/b", "knee"),
+            StreamTopic(TopicKind.TWIST, "g1 "),
+            StreamTopic(TopicKind.CAMERA, "g1", "wrist "),
         ],
     )
-    def test_encode_refuses_what_could_not_be_read_back(self, topic: Topic) -> None:
+    def test_encode_refuses_what_could_not_be_read_back(self, topic: StreamTopic) -> None:
         with pytest.raises(ValueError, match=r"topic"):
             topic.encode()
 
@@ -140,23 +140,23 @@ class TestFilters:
     def test_an_articulation_never_brings_in_another(self, key: str, other: str, kind: TopicKind | None) -> None:
         chosen = rows.articulation_filter(key, kind)
         for topic in (
-            *(Topic(of, other, "knee") for of in OF_COMPONENT),
-            *(Topic(of, other) for of in OF_ARTICULATION),
+            *(StreamTopic(of, other, "knee") for of in OF_COMPONENT),
+            *(StreamTopic(of, other) for of in OF_ARTICULATION),
         ):
             wanted = other == key and kind in {None, topic.kind}
             assert topic.encode().startswith(chosen) == wanted
 
     def test_scene(self) -> None:
-        assert Topic(TopicKind.XPOS, "box").encode().startswith(rows.scene_filter())
-        assert Topic(TopicKind.XPOS, "box").encode().startswith(rows.scene_filter("box"))
-        assert not Topic(TopicKind.XPOS, "box2").encode().startswith(rows.scene_filter("box"))
+        assert StreamTopic(TopicKind.XPOS, "box").encode().startswith(rows.scene_filter())
+        assert StreamTopic(TopicKind.XPOS, "box").encode().startswith(rows.scene_filter("box"))
+        assert not StreamTopic(TopicKind.XPOS, "box2").encode().startswith(rows.scene_filter("box"))
 
     def test_camera(self) -> None:
         # As the handshake gives it, without the trailing space, and as published, with it.
         for zmq_topic in ("arm0/camera/wrist", "arm0/camera/wrist "):
             chosen = rows.camera_filter(zmq_topic)
-            assert chosen == Topic(TopicKind.CAMERA, "arm0", "wrist").encode()
-            assert not Topic(TopicKind.CAMERA, "arm0", "wrist2").encode().startswith(chosen)
+            assert chosen == StreamTopic(TopicKind.CAMERA, "arm0", "wrist").encode()
+            assert not StreamTopic(TopicKind.CAMERA, "arm0", "wrist2").encode().startswith(chosen)
 
     @pytest.mark.parametrize(
         ("key", "kind"),
@@ -262,9 +262,9 @@ class TestStateRows:
 
     def test_decoded_arrays_are_the_callers_own(self) -> None:
         for topic, row in (
-            (Topic(TopicKind.BASE_STATE, "g1", "root"), BaseStateRow(*map(np.ones, (3, 4, 3, 3)))),
-            (Topic(TopicKind.SENSOR, "g1", "imu"), SensorRow(1, np.ones(3))),
-            (Topic(TopicKind.QPOS, "box"), SceneRow(TopicKind.QPOS, np.ones(7))),
+            (StreamTopic(TopicKind.BASE_STATE, "g1", "root"), BaseStateRow(*map(np.ones, (3, 4, 3, 3)))),
+            (StreamTopic(TopicKind.SENSOR, "g1", "imu"), SensorRow(1, np.ones(3))),
+            (StreamTopic(TopicKind.QPOS, "box"), SceneRow(TopicKind.QPOS, np.ones(7))),
         ):
             buffer = bytearray(row.encode())
             decoded = rows.decode_row(topic, buffer)
@@ -291,7 +291,7 @@ class TestStateRows:
     )
     def test_wrong_size(self, topic: bytes, size: int, expected: str) -> None:
         with pytest.raises(ProtocolError, match=expected) as caught:
-            rows.decode_row(Topic.parse(topic), bytes(size))
+            rows.decode_row(StreamTopic.parse(topic), bytes(size))
         assert repr(topic.decode()) in str(caught.value)
 
     @pytest.mark.parametrize(("dim", "problem"), [(-1, "dim is -1"), (2, "expected 16"), (2**31 - 1, "expected 85899")])
@@ -301,7 +301,7 @@ class TestStateRows:
 
     def test_a_topic_without_row(self) -> None:
         with pytest.raises(ProtocolError, match="'g1/camera/head ': a camera topic carries none"):
-            rows.decode_row(Topic.parse(b"g1/camera/head "), b"")
+            rows.decode_row(StreamTopic.parse(b"g1/camera/head "), b"")
 
     def test_encode_refuses_wrong_shapes(self) -> None:
         with pytest.raises(ValueError, match=r"quat_xyzw has shape \(3,\), expected \(4,\)"):
@@ -344,7 +344,7 @@ class TestControl:
     )
     def test_refused(self, payload: bytes, problem: str) -> None:
         with pytest.raises(ProtocolError, match=f"on 'g1/control ': .*{problem}"):
-            ControlPayload.decode(payload, Topic(TopicKind.CONTROL, "g1"))
+            ControlPayload.decode(payload, StreamTopic(TopicKind.CONTROL, "g1"))
 
     @pytest.mark.parametrize(
         ("ids", "values"),
@@ -497,7 +497,7 @@ class TestCamera:
     @pytest.mark.parametrize("size", [0, 15, 17, 24, 47, 49, 64])
     def test_wrong_size_is_never_reshaped(self, size: int) -> None:
         with pytest.raises(ProtocolError, match=rf"'arm/camera/wrist ': {size} bytes, expected 16 \(2x2 pixels"):
-            rows.decode_camera(bytes(size), "real", 2, 2, where=Topic(TopicKind.CAMERA, "arm", "wrist"))
+            rows.decode_camera(bytes(size), "real", 2, 2, where=StreamTopic(TopicKind.CAMERA, "arm", "wrist"))
 
     def test_header_says_when(self) -> None:
         frame = rows.decode_camera(header(2, 2, 2) + bytes(16), "semantic", 2, 2)

@@ -15,7 +15,7 @@ import vectors
 from urlab_client.protocol import rows, shm
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.errors import ProtocolError
-from urlab_client.protocol.rows import Topic, TopicKind
+from urlab_client.protocol.rows import StreamTopic, TopicKind
 
 # What the codec, not these layouts, is responsible for.
 CODEC_FAMILIES = ("rpc_", "msgpack_", "msg_state_full")
@@ -148,7 +148,7 @@ def test_row(name: str) -> None:
     assert golden.decoded(row) == expected
     assert golden.encode(row) == vector.data
     if topic is not None and golden.kind is not TopicKind.CONTROL:
-        parsed = Topic.parse(topic.encode())
+        parsed = StreamTopic.parse(topic.encode())
         assert parsed.kind is golden.kind
         assert golden.decoded(rows.decode_row(parsed, vector.data)) == expected
 
@@ -158,7 +158,7 @@ def test_message(name: str) -> None:
     vector, golden = vectors.load(name), MESSAGES[name]
     expected = dict(vector.decoded)
     topic, payload = vector.frames
-    parsed = Topic.parse(topic)
+    parsed = StreamTopic.parse(topic)
     assert str(parsed) == expected.pop("topic")
     assert parsed.encode() == topic
     assert parsed.kind is (golden.kind or TopicKind.CAMERA)
@@ -186,8 +186,8 @@ def test_rejected_row(name: str) -> None:
 def test_set_gains() -> None:
     vector = vectors.load("msg_set_gains")
     topic, payload = vector.frames
-    assert Topic.parse(topic) == Topic(TopicKind.SET_GAINS, "g1")
-    assert Topic.parse(topic).encode() == topic
+    assert StreamTopic.parse(topic) == StreamTopic(TopicKind.SET_GAINS, "g1")
+    assert StreamTopic.parse(topic).encode() == topic
     gains = rows.decode_gains(payload)
     assert rows.gains_by_parameter(gains) == vector.decoded["reshaped"]
     assert (

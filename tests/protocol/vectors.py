@@ -1,4 +1,4 @@
-"""Golden bytes of the wire, from `data/vectors.json`.
+"""Golden bytes of the wire, from the files in `data`, one for each generation of the plugin.
 
 Test directories are no packages: pytest puts each on `sys.path`, so test modules need unique names and import this
 one as `import vectors`, or take the `vector` fixture.
@@ -19,7 +19,7 @@ class Vector(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         name: Unique name.
         hex: All bytes; of a multi-frame message, its frames joined.
         origin: `plugin` (it sends or must read these bytes), `client` (a client sends them), `derived` (own text in
-            free-form places) or `later-peer` (a newer server sends them).
+            free-form places) or the name of a later server (it sends them).
         expect: Whether a reader must `accept` or `reject` the bytes.
         decoded: What the bytes mean; for a reject, the `reason`.
         frames_hex: The frames of a multi-frame message.
@@ -43,15 +43,20 @@ class Vector(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         return [bytes.fromhex(frame) for frame in self.frames_hex]
 
 
-_VECTORS = {
-    vector.name: vector
-    for vector in msgspec.json.decode((Path(__file__).parent / "data" / "vectors.json").read_bytes(), type=list[Vector])
-}
+_FILES = {"alpha": "vectors.json", "june": "vectors-2.json", "beta": "vectors-beta.json"}
 
 
-def load(name: str) -> Vector:
-    return _VECTORS[name]
+def _read(file: str) -> dict[str, Vector]:
+    found = msgspec.json.decode((Path(__file__).parent / "data" / file).read_bytes(), type=list[Vector])
+    return {vector.name: vector for vector in found}
 
 
-def all() -> list[Vector]:  # noqa: A001
-    return list(_VECTORS.values())
+_VECTORS = {generation: _read(file) for generation, file in _FILES.items()}
+
+
+def load(name: str, generation: str = "alpha") -> Vector:
+    return _VECTORS[generation][name]
+
+
+def all(generation: str = "alpha") -> list[Vector]:  # noqa: A001
+    return list(_VECTORS[generation].values())

@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 from hypothesis import strategies as st
 
-from urlab_client.protocol.registry import OPS
+from urlab_client.protocol.dialects import ALPHA
 
 every_kind = st.recursive(
     st.none()
@@ -62,13 +62,13 @@ def plausible(annotation: msgspec.inspect.Type) -> st.SearchStrategy[Any]:
 
 
 def plain_request(name: str) -> st.SearchStrategy[dict[str, Any]]:
-    op = OPS[name]
+    op = ALPHA.ops[name]
     info = {f.encode_name: plausible(msgspec.inspect.type_info(f.type)) for f in msgspec.structs.fields(op.request)}
     required = {field: info.pop(field) for field in op.required}
     return st.fixed_dictionaries({"op": st.just(name), **required}, optional=info)
 
 
-plain_requests = st.sampled_from(sorted(OPS)).flatmap(plain_request)
+plain_requests = st.sampled_from(sorted(ALPHA.ops)).flatmap(plain_request)
 
 
 def mangle(request: dict[str, Any], key: str, value: object, where: int) -> dict[str, Any]:

@@ -12,10 +12,10 @@ from typing import Any
 
 import gymnasium
 
-from urlab_client.server.actors import Actor, ActorKind
-from urlab_client.server.content import Blueprint, ContentRoot
-from urlab_client.server.engine import Engine
-from urlab_client.server.scene import Scene, compile_scene
+from urlab_client.server.assets.actors import Actor, ActorKind
+from urlab_client.server.assets.content import Blueprint, ContentRoot
+from urlab_client.server.compile.scene import CompiledScene, compile_scene
+from urlab_client.server.physics.engine import Engine
 
 ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 
@@ -77,7 +77,7 @@ def blueprint(source: str | Path) -> Blueprint:
     return _content().import_xml(str(source), trusted=True)[0]
 
 
-def make_scene(*others: Actor, **robots: str | Path) -> Scene:
+def make_scene(*others: Actor, **robots: str | Path) -> CompiledScene:
     """Compile robots by articulation key, 2 m apart along x, and other actors."""
     actors = [
         Actor(

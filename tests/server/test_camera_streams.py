@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import zmq
 from wire import Wire
 
 from urlab_client.server import SimulatedServer
+from urlab_client.server.render.camera_renderer import CameraRenderer
 
 ROBOT = """
 <mujoco model="robot">
@@ -114,6 +116,29 @@ def test_stepped_modes_publish_nothing(
     topic, data = socket.recv_multipart()
     assert topic == b"robot/camera/wrist "
     assert np.frombuffer(data, "<f4").min() >= last
+
+
+def test_images_go_on_after_one_that_failed(
+    server: SimulatedServer,
+    connect: Callable[[SimulatedServer], Wire],
+    subscribe: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    wrist = topics(connect(server))["wrist"]
+    with monkeypatch.context() as patch:
+        failed = threading.Event()
+
+        def fail(*_: object) -> None:
+            failed.set()
+            raise MemoryError("no room for pixels")
+
+        patch.setattr(CameraRenderer, "frames", fail)
+        socket = subscribe(wrist["zmq_endpoint"], wrist["zmq_topic"] + " ")
+        assert failed.wait(30.0)
+    assert socket.recv_multipart()[0] == b"robot/camera/wrist "
+    assert "no room for pixels" in caplog.text
+    assert server.failure is None
 
 
 def test_streams_survive_a_new_play_session(

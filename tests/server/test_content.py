@@ -1,8 +1,13 @@
 from __future__ import annotations
 
+import contextlib
+import errno
 import json
 import os
+import resource
+import shutil
 import threading
+from collections.abc import Generator
 from pathlib import Path
 
 import mujoco
@@ -10,18 +15,21 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from worlds import BALL_BODY, BOT, GYMNASIUM, Desk, mjcf, write_obj, write_stl
+from worlds import BALL_BODY, BOT, GYMNASIUM, Workspace, mjcf, write_obj, write_stl
 
-from urlab_client.server.bundled import bundled_models
-from urlab_client.server.content import Blueprint, ContentRoot, level_package, mujoco_messages, write_atomic
+from urlab_client.server.assets import content, sandbox
+from urlab_client.server.assets.bundled_robots import bundled_models
+from urlab_client.server.assets.content import Blueprint, ContentRoot, level_package, mujoco_messages, write_atomic
+from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
+from urlab_client.server.system.temporary_folder import working_in
 
 BALL = mjcf(BALL_BODY, model="ball")
 
 
 @pytest.fixture
-def desk(tmp_path: Path) -> Desk:
-    return Desk(tmp_path)
+def workspace(tmp_path: Path) -> Workspace:
+    return Workspace(tmp_path)
 
 
 def arrays(model: mujoco.MjModel) -> dict[str, np.ndarray]:
@@ -38,12 +46,12 @@ def compiled(blueprint: Blueprint) -> mujoco.MjModel:
 # Importing
 
 
-def test_an_import_is_named_after_the_file(desk: Desk) -> None:
-    path = str(desk.write("robot.xml", BOT))
+def test_an_import_is_named_after_the_file(workspace: Workspace) -> None:
+    path = str(workspace.write("robot.xml", BOT))
 
-    first, imported_first = desk.content.import_xml(path)
-    again, imported_again = desk.content.import_xml(path)
-    forced, imported_forced = desk.content.import_xml(path, force_reimport=True)
+    first, imported_first = workspace.content.import_xml(path)
+    again, imported_again = workspace.content.import_xml(path)
+    forced, imported_forced = workspace.content.import_xml(path, force_reimport=True)
 
     assert (imported_first, imported_again, imported_forced) == (True, False, True)
     assert first.class_path == again.class_path == forced.class_path == "/Game/MuJoCoImports/robot.robot_C"
@@ -56,15 +64,15 @@ def test_an_import_is_named_after_the_file(desk: Desk) -> None:
 @pytest.mark.parametrize(
     ("file", "stem"), [("my-robot v1.2.xml", "my_robot_v1_2"), ("ünïcode.xml", "ünïcode"), ("a+b.xml", "a_b")]
 )
-def test_odd_characters_of_a_file_name_become_underscores(desk: Desk, file: str, stem: str) -> None:
-    blueprint, _ = desk.content.import_xml(str(desk.write(file, BALL)))
+def test_odd_characters_of_a_file_name_become_underscores(workspace: Workspace, file: str, stem: str) -> None:
+    blueprint, _ = workspace.content.import_xml(str(workspace.write(file, BALL)))
 
     assert blueprint.short_name == stem
     assert compiled(blueprint).nbody == 2
 
 
-def test_mujocos_default_name_is_no_model_name(desk: Desk) -> None:
-    blueprint, _ = desk.content.import_xml(str(desk.write("nameless.xml", mjcf(BALL_BODY))))
+def test_mujocos_default_name_is_no_model_name(workspace: Workspace) -> None:
+    blueprint, _ = workspace.content.import_xml(str(workspace.write("nameless.xml", mjcf(BALL_BODY))))
 
     assert blueprint.model_name == ""
 
@@ -92,34 +100,34 @@ def test_bundled_models_need_no_root(tmp_path: Path) -> None:
     assert not imported_now
 
 
-def test_a_bundled_name_is_no_file(desk: Desk) -> None:
-    desk.write("ball", BOT)
-    desk.write("ball.xml", BOT)
+def test_a_bundled_name_is_no_file(workspace: Workspace) -> None:
+    workspace.write("ball", BOT)
+    workspace.write("ball.xml", BOT)
 
-    assert desk.content.import_xml("ball")[0].model_name == "ball"
+    assert workspace.content.import_xml("ball")[0].model_name == "ball"
 
 
 @pytest.mark.parametrize("way", ["absolute", "dots", "link"])
-def test_files_outside_the_model_roots_are_refused(tmp_path: Path, desk: Desk, way: str) -> None:
+def test_files_outside_the_model_roots_are_refused(tmp_path: Path, workspace: Workspace, way: str) -> None:
     secret = tmp_path / "secret.xml"
     secret.write_text(BALL)
-    (desk.models / "link.xml").symlink_to(secret)
+    (workspace.models / "link.xml").symlink_to(secret)
     path = {"absolute": str(secret), "dots": "../secret.xml", "link": "link.xml"}[way]
 
     with pytest.raises(Refusal) as refused:
-        desk.content.import_xml(path)
+        workspace.content.import_xml(path)
 
     assert refused.value.code == "import_failed"
-    assert str(desk.models) in refused.value.message
+    assert str(workspace.models) in refused.value.message
     assert "--model-root" in refused.value.message
-    assert desk.content.import_xml(str(secret), trusted=True)[1]
+    assert workspace.content.import_xml(str(secret), trusted=True)[1]
 
 
-def test_a_link_within_the_model_roots_may_be_followed(desk: Desk) -> None:
-    desk.write("versions/ball-2.xml", BALL)
-    (desk.models / "ball.xml").symlink_to(desk.models / "versions" / "ball-2.xml")
+def test_a_link_within_the_model_roots_may_be_followed(workspace: Workspace) -> None:
+    workspace.write("versions/ball-2.xml", BALL)
+    (workspace.models / "ball.xml").symlink_to(workspace.models / "versions" / "ball-2.xml")
 
-    assert desk.content.import_xml("ball.xml")[0].short_name == "ball_2"
+    assert workspace.content.import_xml("ball.xml")[0].short_name == "ball_2"
 
 
 @pytest.mark.parametrize(
@@ -133,9 +141,9 @@ def test_a_link_within_the_model_roots_may_be_followed(desk: Desk) -> None:
         ("bundled:rocket", "import_failed", "quadruped"),
     ],
 )
-def test_unusable_paths_are_refused(desk: Desk, path: str, code: str, text: str) -> None:
+def test_unusable_paths_are_refused(workspace: Workspace, path: str, code: str, text: str) -> None:
     with pytest.raises(Refusal) as refused:
-        desk.content.import_xml(path)
+        workspace.content.import_xml(path)
 
     assert refused.value.code == code
     assert text in refused.value.message
@@ -152,29 +160,29 @@ def test_unusable_paths_are_refused(desk: Desk, path: str, code: str, text: str)
         ("", "empty"),
     ],
 )
-def test_mujocos_reason_for_rejecting_a_file_is_passed_on(desk: Desk, text: str, cause: str) -> None:
-    path = desk.write("broken.xml", text)
+def test_mujocos_reason_for_rejecting_a_file_is_passed_on(workspace: Workspace, text: str, cause: str) -> None:
+    path = workspace.write("broken.xml", text)
 
     with pytest.raises(Refusal) as refused:
-        desk.content.import_xml(str(path))
+        workspace.content.import_xml(str(path))
 
     assert refused.value.code == "import_failed"
     assert cause in refused.value.message
     assert str(path) in refused.value.message
     assert "\n" not in refused.value.message
-    assert not desk.content.blueprints
-    assert not list(desk.saved.glob("MuJoCoImports/*"))
+    assert not workspace.content.blueprints
+    assert not list(workspace.saved.glob("MuJoCoImports/*"))
 
 
-def test_a_failed_reimport_leaves_the_blueprint_as_it_was(desk: Desk) -> None:
-    path = desk.write("ball.xml", BALL)
-    before, _ = desk.content.import_xml(str(path))
+def test_a_failed_reimport_leaves_the_blueprint_as_it_was(workspace: Workspace) -> None:
+    path = workspace.write("ball.xml", BALL)
+    before, _ = workspace.content.import_xml(str(path))
     path.write_text("broken")
 
     with pytest.raises(Refusal):
-        desk.content.import_xml(str(path), force_reimport=True)
+        workspace.content.import_xml(str(path), force_reimport=True)
 
-    assert desk.content.blueprints["ball"] is before
+    assert workspace.content.blueprints["ball"] is before
     assert compiled(before).nbody == 2
 
 
@@ -182,13 +190,13 @@ def test_a_failed_reimport_leaves_the_blueprint_as_it_was(desk: Desk) -> None:
 
 
 @pytest.fixture
-def workshop(desk: Desk) -> Path:
+def workshop(workspace: Workspace) -> Path:
     """A model with an include, an attached part, and meshes of one name in two folders."""
-    write_obj(desk.models / "robot" / "meshes" / "part.obj", 0.1)
-    write_stl(desk.models / "robot" / "meshes" / "shell.stl", 0.2)
-    write_obj(desk.models / "gripper" / "meshes" / "part.obj", 0.3)
-    desk.write("robot/limits.xml", '<mujocoinclude><default><joint range="-90 90"/></default></mujocoinclude>')
-    desk.write(
+    write_obj(workspace.models / "robot" / "meshes" / "part.obj", 0.1)
+    write_stl(workspace.models / "robot" / "meshes" / "shell.stl", 0.2)
+    write_obj(workspace.models / "gripper" / "meshes" / "part.obj", 0.3)
+    workspace.write("robot/limits.xml", '<mujocoinclude><default><joint range="-90 90"/></default></mujocoinclude>')
+    workspace.write(
         "gripper/gripper.xml",
         mjcf(
             '<body name="hand"><joint name="grip"/><geom type="mesh" mesh="part"/></body>',
@@ -197,7 +205,7 @@ def workshop(desk: Desk) -> Path:
             tail='<actuator><position name="grip" joint="grip" kp="3"/></actuator>',
         ),
     )
-    return desk.write(
+    return workspace.write(
         "robot/robot.xml",
         mjcf(
             '<body name="base" euler="10 20 30"><joint name="turn"/><geom type="mesh" mesh="part"/>'
@@ -211,12 +219,13 @@ def workshop(desk: Desk) -> Path:
     )
 
 
-def test_a_snapshot_needs_nothing_of_its_source(desk: Desk, workshop: Path) -> None:
+@pytest.mark.mujoco("3.16")
+def test_a_snapshot_needs_nothing_of_its_source(workspace: Workspace, workshop: Path) -> None:
     original = mujoco.MjModel.from_xml_path(str(workshop))
-    blueprint, _ = desk.content.import_xml(str(workshop))
-    desk.models.rename(desk.models.with_name("gone"))
+    blueprint, _ = workspace.content.import_xml(str(workshop))
+    workspace.models.rename(workspace.models.with_name("gone"))
 
-    found = ContentRoot(desk.saved).find_blueprint(blueprint.class_path)
+    found = ContentRoot(workspace.saved).find_blueprint(blueprint.class_path)
 
     assert found is not None
     copies = arrays(compiled(found))
@@ -226,39 +235,40 @@ def test_a_snapshot_needs_nothing_of_its_source(desk: Desk, workshop: Path) -> N
     assert found.model_name == "robot"
 
 
+@pytest.mark.mujoco("3.16")
 def test_later_edits_of_the_source_change_nothing_until_forced(
-    desk: Desk, workshop: Path, caplog: pytest.LogCaptureFixture
+    workspace: Workspace, workshop: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    blueprint, _ = desk.content.import_xml(str(workshop))
+    blueprint, _ = workspace.content.import_xml(str(workshop))
     before = compiled(blueprint).mesh_vert.copy()
-    write_obj(desk.models / "robot" / "meshes" / "part.obj", 0.7)
+    write_obj(workspace.models / "robot" / "meshes" / "part.obj", 0.7)
     workshop.write_text(workshop.read_text().replace('name="turn"/>', 'name="turn"/><site name="new"/>'))
 
-    kept, _ = desk.content.import_xml(str(workshop))
+    kept, _ = workspace.content.import_xml(str(workshop))
     assert "has changed since it was imported" in caplog.text
     np.testing.assert_array_equal(compiled(kept).mesh_vert, before)
 
-    renewed, _ = desk.content.import_xml(str(workshop), force_reimport=True)
+    renewed, _ = workspace.content.import_xml(str(workshop), force_reimport=True)
     assert compiled(renewed).nsite == 1
     assert compiled(renewed).mesh_vert.max() > 2 * before.max()
     np.testing.assert_array_equal(compiled(blueprint).mesh_vert, before)  # a play session may still run on it
 
 
-def test_two_files_of_one_stem_are_one_blueprint(desk: Desk, caplog: pytest.LogCaptureFixture) -> None:
-    first, _ = desk.content.import_xml(str(desk.write("a/robot.xml", BOT)))
+def test_two_files_of_one_stem_are_one_blueprint(workspace: Workspace, caplog: pytest.LogCaptureFixture) -> None:
+    first, _ = workspace.content.import_xml(str(workspace.write("a/robot.xml", BOT)))
 
-    second, imported_now = desk.content.import_xml(str(desk.write("b/robot.xml", BALL)))
+    second, imported_now = workspace.content.import_xml(str(workspace.write("b/robot.xml", BALL)))
 
     assert second is first
     assert not imported_now
     assert "blueprint 'robot'" in caplog.text
 
 
-def test_only_the_last_two_snapshots_are_kept(desk: Desk) -> None:
-    path = desk.write("ball.xml", BALL)
+def test_only_the_last_two_snapshots_are_kept(workspace: Workspace) -> None:
+    path = workspace.write("ball.xml", BALL)
     for size in (0.1, 0.2, 0.3, 0.4):
         path.write_text(BALL.replace('size="0.1"', f'size="{size}"'))
-        blueprint, _ = desk.content.import_xml(str(path), force_reimport=True)
+        blueprint, _ = workspace.content.import_xml(str(path), force_reimport=True)
 
     folders = [entry for entry in blueprint.folder.parent.iterdir() if entry.is_dir()]
 
@@ -266,48 +276,136 @@ def test_only_the_last_two_snapshots_are_kept(desk: Desk) -> None:
     assert blueprint.folder in folders
 
 
-def test_importing_the_same_content_makes_the_same_snapshot(desk: Desk, workshop: Path) -> None:
-    first, _ = desk.content.import_xml(str(workshop))
-    second, _ = desk.content.import_xml(str(workshop), force_reimport=True)
+@pytest.mark.mujoco("3.16")
+def test_importing_the_same_content_makes_the_same_snapshot(workspace: Workspace, workshop: Path) -> None:
+    first, _ = workspace.content.import_xml(str(workshop))
+    second, _ = workspace.content.import_xml(str(workshop), force_reimport=True)
 
     assert second.folder == first.folder
 
 
 @pytest.mark.parametrize("damage", ["record", "snapshot"])
-def test_a_damaged_blueprint_is_left_out(desk: Desk, damage: str, caplog: pytest.LogCaptureFixture) -> None:
-    good, _ = desk.content.import_xml(str(desk.write("good.xml", BALL)))
-    bad, _ = desk.content.import_xml(str(desk.write("bad.xml", BALL)))
-    record = desk.content.snapshot_record(bad)
+def test_a_damaged_blueprint_is_left_out(workspace: Workspace, damage: str, caplog: pytest.LogCaptureFixture) -> None:
+    good, _ = workspace.content.import_xml(str(workspace.write("good.xml", BALL)))
+    bad, _ = workspace.content.import_xml(str(workspace.write("bad.xml", BALL)))
+    record = workspace.content.snapshot_record(bad)
     if damage == "record":
         record.write_text("{")
     else:
         (bad.folder / "model.xml").unlink()
 
-    assert list(ContentRoot(desk.saved).blueprints) == [good.stem]
+    assert list(ContentRoot(workspace.saved).blueprints) == [good.stem]
     assert str(record) in caplog.text
 
 
-def test_a_removed_blueprint_stays_away(desk: Desk) -> None:
-    desk.content.import_xml(str(desk.write("ball.xml", BALL)))
+def test_a_removed_blueprint_stays_away(workspace: Workspace) -> None:
+    workspace.content.import_xml(str(workspace.write("ball.xml", BALL)))
 
-    desk.content.remove_blueprint("ball")
+    workspace.content.remove_blueprint("ball")
 
-    assert not desk.content.blueprints
-    assert not ContentRoot(desk.saved).blueprints
+    assert not workspace.content.blueprints
+    assert not ContentRoot(workspace.saved).blueprints
 
 
 def test_a_content_root_that_cannot_be_written_refuses_imports(tmp_path: Path) -> None:
     (tmp_path / "saved").write_text("a file where the folder should be")
-    content = ContentRoot(tmp_path / "saved")
+    blocked = ContentRoot(tmp_path / "saved")
 
     with pytest.raises(Refusal, match="import_failed: cannot store"):
-        content.import_xml("ball")
+        blocked.import_xml("ball")
+
+
+@contextlib.contextmanager
+def files_of_at_most(size: int) -> Generator[None]:
+    """Let no file of this process grow beyond a size: to a program that is much like a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+@pytest.mark.parametrize("size", [0, 100, 1000])  # the archive, the model in it, or the record does not fit
+def test_an_import_onto_a_full_disk_is_refused_and_leaves_nothing(workspace: Workspace, size: int) -> None:
+    workspace.content.import_xml(str(workspace.write("bot.xml", BOT)))
+    before = tree(workspace.saved)
+    text = "".join(f'<geom name="more{n}" pos="{n} 0 0" size="0.1"/>' for n in range(200))
+    workspace.write("bot.xml", BOT.replace("</worldbody>", f"{text}</worldbody>"))
+    other = workspace.write("other.xml", mjcf(f'<body name="b"><joint/>{text}</body>'))
+
+    with files_of_at_most(size):
+        for path in (str(other), "arm", str(workspace.models / "bot.xml")):
+            with pytest.raises(Refusal, match="import_failed: cannot store the snapshot"):
+                workspace.content.import_xml(path, force_reimport=True, trusted=True)
+        (workspace.saved / "snapshot").mkdir()
+        order = sandbox._SandboxJob(
+            str(other), str(workspace.saved / "snapshot" / "s"), [str(workspace.models)], Limits()
+        )
+        outcome = sandbox._work(order)  # of a child, whose files have a limit of their own
+        shutil.rmtree(workspace.saved / "snapshot")
+
+    assert outcome.done is None
+    assert outcome.subject.startswith("cannot store the snapshot")
+    assert tree(workspace.saved) == before
+    assert list(workspace.content.blueprints) == list(ContentRoot(workspace.saved).blueprints) == ["bot"]
+    assert workspace.content.import_xml("arm")[1]
+
+
+def test_a_snapshot_whose_record_cannot_be_written_does_not_stay(
+    workspace: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, data: bytes) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    monkeypatch.setattr(content, "write_atomic", full)
+    with pytest.raises(Refusal, match=r"import_failed: cannot store .* No space left"):
+        workspace.content.import_xml("arm")
+    assert tree(workspace.saved) == {}
+    assert not workspace.content.blueprints
+
+
+def test_what_a_killed_server_left_is_swept_at_the_start(workspace: Workspace) -> None:
+    workspace.content.import_xml("ball")
+    before = tree(workspace.saved)
+    imports = workspace.saved / "MuJoCoImports"
+    for left in ("ball/.import-abc", "arm/.import-def", ".import-gone"):
+        (imports / left / "snapshot").mkdir(parents=True)
+        (imports / left / "snapshot" / "model.xml").write_text("<mujoco/>")
+
+    with working_in(imports):  # another server imports
+        ContentRoot(workspace.saved)
+    assert (imports / "arm/.import-def").exists()
+    assert list(ContentRoot(workspace.saved).blueprints) == ["ball"]
+
+    assert tree(workspace.saved) == before
+    assert [folder.name for folder in imports.iterdir()] == ["ball"]
+    assert not [*imports.rglob(".import-*")]
+
+
+@pytest.mark.parametrize("field", ["digest", "stem"])
+@pytest.mark.parametrize("name", ["../../elsewhere", "..", "/elsewhere", ""])
+def test_records_name_no_folders_elsewhere(
+    workspace: Workspace, field: str, name: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    blueprint, _ = workspace.content.import_xml("ball")
+    (workspace.saved / "elsewhere").mkdir()
+    shutil.copy(blueprint.folder / "model.xml", workspace.saved / "elsewhere")
+    record = workspace.content.snapshot_record(blueprint)
+    record.write_text(json.dumps(json.loads(record.read_text()) | {field: name}))
+
+    assert not ContentRoot(workspace.saved).blueprints
+    assert "cannot be the names of folders" in caplog.text
 
 
 # Names and keyframes
 
 
-def test_every_element_gets_a_name(desk: Desk) -> None:
+def test_every_element_gets_a_name(workspace: Workspace) -> None:
     body = (
         "<body><joint/><joint axis='0 1 0'/><geom size='0.1'/><geom type='box' size='0.1 0.1 0.1'/><site/><camera/>"
         "<body><joint type='slide'/><geom size='0.1'/></body></body>"
@@ -319,7 +417,7 @@ def test_every_element_gets_a_name(desk: Desk) -> None:
     )
     body = body.replace("<joint/>", "<joint name='j'/>").replace("<site/>", "<site name='tip'/><site/>")
     tail = tail.replace("HingeJoint", "j")
-    blueprint, _ = desk.content.import_xml(str(desk.write("plain.xml", mjcf(body, tail=tail))))
+    blueprint, _ = workspace.content.import_xml(str(workspace.write("plain.xml", mjcf(body, tail=tail))))
     spec = blueprint.spec
 
     assert [item.name for item in spec.bodies[1:]] == ["worldbody_Body", "worldbody_Body_Body", "named"]
@@ -334,7 +432,7 @@ def test_every_element_gets_a_name(desk: Desk) -> None:
     assert blueprint.actuators == ("MotorActuator",)
 
 
-def test_actuators_are_reported_as_the_element_that_authored_them(desk: Desk) -> None:
+def test_actuators_are_reported_as_the_element_that_authored_them(workspace: Workspace) -> None:
     elements = {
         "motor": "",
         "general": "",
@@ -353,9 +451,9 @@ def test_actuators_are_reported_as_the_element_that_authored_them(desk: Desk) ->
         head='<default><default class="servo"><position kp="7"/></default></default>',
         tail=f"<actuator>{actuators}</actuator>",
     )
-    desk.content.import_xml(str(desk.write("kinds.xml", text)))
+    workspace.content.import_xml(str(workspace.write("kinds.xml", text)))
 
-    types = ContentRoot(desk.saved).blueprints["kinds"].actuator_types
+    types = ContentRoot(workspace.saved).blueprints["kinds"].actuator_types
 
     assert dict(types) == {kind: kind for kind in elements} | {
         "general": "motor",
@@ -378,17 +476,18 @@ CHILD = mjcf(
 )
 
 
+@pytest.mark.mujoco("3.10")
 def test_importing_prints_nothing_and_logs_once(
-    desk: Desk,
+    workspace: Workspace,
     capfd: pytest.CaptureFixture[str],
     caplog: pytest.LogCaptureFixture,
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    desk.write("child.xml", CHILD)
+    workspace.write("child.xml", CHILD)
 
-    desk.content.import_xml(str(desk.write("parent.xml", CONFLICT)))
+    workspace.content.import_xml(str(workspace.write("parent.xml", CONFLICT)))
 
     assert capfd.readouterr() == ("", "")
     assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
@@ -396,8 +495,11 @@ def test_importing_prints_nothing_and_logs_once(
     assert "Attach conflict" in caplog.text
 
 
-def test_a_deprecated_attribute_is_logged_and_not_raised(desk: Desk, caplog: pytest.LogCaptureFixture) -> None:
-    content = ContentRoot(desk.saved, model_roots=[GYMNASIUM])
+@pytest.mark.mujoco("3.16")
+def test_a_deprecated_attribute_is_logged_and_not_raised(
+    workspace: Workspace, caplog: pytest.LogCaptureFixture
+) -> None:
+    content = ContentRoot(workspace.saved, model_roots=[GYMNASIUM])
 
     blueprint, _ = content.import_xml("half_cheetah.xml")
 
@@ -405,6 +507,7 @@ def test_a_deprecated_attribute_is_logged_and_not_raised(desk: Desk, caplog: pyt
     assert compiled(blueprint).nu == 6
 
 
+@pytest.mark.mujoco("3.10")
 def test_warnings_that_other_threads_cause_reach_the_handler_that_was_there() -> None:
     theirs: list[str] = []
     before = mujoco.get_mju_user_warning()
@@ -507,11 +610,11 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pyt
     assert os.listdir(tmp_path) == ["level.json"]
 
 
-def test_the_record_is_readable_json(desk: Desk) -> None:
-    blueprint, _ = desk.content.import_xml(str(desk.write("bot.xml", BOT)))
+def test_the_record_is_readable_json(workspace: Workspace) -> None:
+    blueprint, _ = workspace.content.import_xml(str(workspace.write("bot.xml", BOT)))
 
-    record = json.loads(desk.content.snapshot_record(blueprint).read_text())
+    record = json.loads(workspace.content.snapshot_record(blueprint).read_text())
 
     assert record["format"] == "urlab-blueprint"
-    assert record["source"] == str(desk.models / "bot.xml")
+    assert record["source"] == str(workspace.models / "bot.xml")
     assert record["actuator_types"] == {"m": "motor"}

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scenes import BOT, make_scene
 
 from urlab_client.protocol.enums import ControllerKind
-from urlab_client.server.controllers import (
+from urlab_client.server.physics.controllers import (
     ArticulationControl,
     ControllerConfig,
     ControlSource,
@@ -107,6 +107,7 @@ def test_positions_beyond_the_controls_are_ignored_and_missing_ones_keep_their_v
     np.testing.assert_array_equal(points.network, expected)
 
 
+@pytest.mark.mujoco("3.11")
 @pytest.mark.parametrize("name", ["by_hinge", "bot_by_hinge", "BY_Hinge", "BOT_by_HINGE"])
 def test_a_named_set_point_takes_short_and_compiled_names_in_any_case(name: str) -> None:
     rig = Rig(MIXED)
@@ -122,6 +123,7 @@ def test_names_that_differ_in_case_only_stay_apart() -> None:
     assert points.network.tolist() == [1.0, 2.0]
 
 
+@pytest.mark.mujoco("3.11")
 def test_set_points_begin_neutral_so_an_orientation_servo_holds_still() -> None:
     rig = Rig(MIXED)
     assert rig.ctrl() == [0, 0, 0, 0, 1, 0, 0, 0, 0]
@@ -140,11 +142,13 @@ def test_the_ui_source_hides_network_values_without_losing_them() -> None:
     assert rig.ctrl() == [0.75]
 
 
+@pytest.mark.mujoco("3.11")
 def test_only_single_control_actuators_on_hinges_and_slides_are_bound() -> None:
     rig = Rig(MIXED, ControllerConfig())
     assert rig.controller.bound == ("by_hinge", "by_parent")
 
 
+@pytest.mark.mujoco("3.11")
 def test_actuators_that_are_not_bound_are_not_written() -> None:
     rig = Rig(MIXED, ControllerConfig(kind=ControllerKind.PASSTHROUGH))
     rig.data.ctrl[:] = 7.0
@@ -218,6 +222,7 @@ def test_numbers_beyond_single_precision_follow_ieee_without_a_warning(values: l
     rig.ctrl()
 
 
+@pytest.mark.mujoco("3.11")
 def test_pd_parameters_start_from_the_configuration() -> None:
     rig = Rig(MIXED, ControllerConfig(kp=0.1, kv=2.0, torque_limit=3.0))
     assert rig.controller.params() == {

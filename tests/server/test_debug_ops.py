@@ -11,9 +11,9 @@ import pytest
 from wire import Wire
 
 from urlab_client.server import SimulatedServer
+from urlab_client.server.editor.markers import DebugLine, Drawings, Sphere
 from urlab_client.server.handlers.debug import _color
 from urlab_client.server.limits import Limits
-from urlab_client.server.markers import Drawings, Line, Sphere
 
 COLOR = [1, 0, 0]
 VALID: dict[str, dict[str, Any]] = {
@@ -136,7 +136,7 @@ def test_overlay_lasts_ten_seconds() -> None:
 
 def test_the_oldest_gives_way(caplog: pytest.LogCaptureFixture) -> None:
     drawings = Drawings(Clock())
-    line = Line(start=(0.0, 0.0, 0.0), end=(1.0, 0.0, 0.0), color=(1.0, 1.0, 1.0))
+    line = DebugLine(start=(0.0, 0.0, 0.0), end=(1.0, 0.0, 0.0), color=(1.0, 1.0, 1.0))
     drawings.add([sphere(0)], ttl=-1.0, in_play=False)
     with caplog.at_level(logging.WARNING, logger="urlab_client.server"):
         drawings.add([line] * Limits.markers, ttl=-1.0, in_play=False)

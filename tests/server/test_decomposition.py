@@ -10,7 +10,7 @@ import pytest
 
 from urlab_client import AddQuickConvertFailed, URLabClient
 from urlab_client.server import ModelError, SimulatedServer
-from urlab_client.server.decomposition import convex_parts
+from urlab_client.server.assets.decomposition import convex_parts
 
 # A trough along y: two walls and a floor, 0.4 m high, the inside 0.4 m wide and 0.3 m deep.
 PROFILE = ((-0.3, 0.0), (0.3, 0.0), (0.3, 0.4), (0.2, 0.4), (0.2, 0.1), (-0.2, 0.1), (-0.2, 0.4), (-0.3, 0.4))
@@ -87,7 +87,7 @@ def test_parts_are_convex_cover_the_mesh_and_come_out_the_same_again(tmp_path: P
 
 
 def test_without_the_library_it_is_refused_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("world", "level"):
+    for module in ("editor.world", "assets.level"):
         monkeypatch.setattr(f"urlab_client.server.{module}.is_available", lambda: False)
     with pytest.raises(ModelError, match=r"urlab-client\[coacd\]"), SimulatedServer(level(tmp_path, complex_mesh=True)):
         pass

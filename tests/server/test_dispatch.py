@@ -17,18 +17,18 @@ from wire import Wire, check_numbers, pack, write_level
 
 from urlab_client.protocol.base import Needs
 from urlab_client.protocol.codec import MAX_REQUEST_BYTES
+from urlab_client.protocol.dialects import ALPHA
 from urlab_client.protocol.enums import PIEState, Transport
 from urlab_client.protocol.messages.runtime import SetPaused, SetPausedOk
 from urlab_client.protocol.messages.scene import CurrentLevel, CurrentLevelOk
 from urlab_client.protocol.messages.session import Meta, MetaOk
-from urlab_client.protocol.registry import OPS
 from urlab_client.server import SimulatedServer
-from urlab_client.server.content import ContentRoot
+from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.core import PhysicsConfig, ServerCore
-from urlab_client.server.dispatch import Dispatcher, HandlerTable
+from urlab_client.server.editor.world import EditorWorld
 from urlab_client.server.handlers import HANDLERS
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.world import World
+from urlab_client.server.rpc.dispatch import Dispatcher, HandlerTable
 
 Serve = Callable[..., Wire]
 
@@ -91,7 +91,7 @@ def test_no_session_before_the_first_hello(models: Path, connect: Callable[[Simu
             assert code(wire.raw({"op": "current_level", **session})) == "session_expired"
 
 
-@pytest.mark.parametrize("op", [op for op in OPS.values() if op.declared_required])
+@pytest.mark.parametrize("op", [op for op in ALPHA.ops.values() if op.declared_required])
 def test_declared_fields_before_the_manager(idle: Wire, op: Any) -> None:
     for absent in op.declared_required:
         fields = dict.fromkeys(op.declared_required)
@@ -106,7 +106,7 @@ def test_the_first_missing_field_is_named(idle: Wire) -> None:
     assert "'blueprint'" in idle.refusal("spawn_grid", count_x=1)[1]
 
 
-@pytest.mark.parametrize("op", [op for op in OPS.values() if op.needs is Needs.MANAGER])
+@pytest.mark.parametrize("op", [op for op in ALPHA.ops.values() if op.needs is Needs.MANAGER])
 def test_the_manager_before_the_handler(idle: Wire, op: Any) -> None:
     # Null satisfies the presence check, and fields that only the handler knows are not looked at yet.
     got, message = idle.refusal(op.name, **dict.fromkeys(op.declared_required))
@@ -120,7 +120,7 @@ def test_not_ready_without_a_model(connect: Callable[[SimulatedServer], Wire], t
         wire.hello()
         assert wire.ask("begin_pie")["state"] == "compile_failed"
         error = wire.ask("pie_status")["compile_error"]
-        for op in OPS.values():
+        for op in ALPHA.ops.values():
             if op.needs is Needs.MANAGER and op.name in HANDLERS.handlers:
                 got, message = wire.refusal(op.name, **dict.fromkeys(op.declared_required))
                 assert got == "not_ready"
@@ -141,7 +141,7 @@ def test_ops_in_another_case_need_a_manager_first(idle: Wire) -> None:
 
 
 def test_every_op_is_served() -> None:
-    assert set(HANDLERS.handlers) == set(OPS)
+    assert set(HANDLERS.handlers) == set(ALPHA.ops)
 
 
 # Sessions and encodings
@@ -240,7 +240,7 @@ def test_a_frame_beyond_the_limit_is_answered(idle: Wire) -> None:
 
 @pytest.fixture
 def core(tmp_path: Path) -> ServerCore:
-    world = World(ContentRoot(tmp_path))
+    world = EditorWorld(ContentRoot(tmp_path))
     return ServerCore(world=world, physics=PhysicsConfig(), camera_endpoint=lambda *_: "tcp://127.0.0.1:5558")
 
 
@@ -250,7 +250,7 @@ def ask(dispatcher: Dispatcher, transport: Transport = Transport.ZMQ, **request:
     return msgspec.msgpack.decode(frame)
 
 
-@pytest.mark.parametrize("op", [op.name for op in OPS.values() if op.needs is Needs.EDITOR])
+@pytest.mark.parametrize("op", [op.name for op in ALPHA.ops.values() if op.needs is Needs.EDITOR])
 def test_shared_memory_takes_no_editor_ops(core: ServerCore, op: str) -> None:
     dispatcher = Dispatcher(core, HANDLERS)
     assert code(ask(dispatcher, Transport.SHM, op=op)) == "wrong_transport"

@@ -20,9 +20,9 @@ from scenes import ASSETS, BALL, BOT, hasty, make_scene
 
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.messages.session import ArticulationCommand, Step
-from urlab_client.server import engine as engine_module
-from urlab_client.server.controllers import ControllerConfig, ControlSource
-from urlab_client.server.engine import Engine, parse_control_source, parse_mode
+from urlab_client.server.physics import engine as engine_module
+from urlab_client.server.physics.controllers import ControllerConfig, ControlSource
+from urlab_client.server.physics.engine import Engine, parse_control_source, parse_mode
 from urlab_client.server.refusal import Refusal
 
 DT = 0.002
@@ -701,6 +701,16 @@ def test_a_wrench_holds_for_its_request_and_no_longer(start: Start, way: InlineO
     assert not sim.data.xfrc_applied.any()
     sim.step(50)
     assert sim.data.body("PB_ball").xpos[2] < 0.999
+
+
+def test_a_wrench_finds_the_body_of_its_articulation_before_one_that_is_called_so_in_full(start: Start) -> None:
+    """`crane_hook` is the hook of `crane`, and a body of `big`, where it is compiled as `big_crane_hook`."""
+    body = '<mujoco><worldbody><body name="{}"><freejoint/><geom size=".1" mass="1"/></body></worldbody></mujoco>'
+    sim = start(big=body.format("crane_hook"), crane=body.format("hook"))
+    before = {name: sim.data.body(name).xpos[0] for name in ("big_crane_hook", "crane_hook")}
+    sim.command("big", 10, xfrc_applied={"crane_hook": [100, 0, 0, 0, 0, 0]})
+    assert sim.data.body("big_crane_hook").xpos[0] > before["big_crane_hook"]
+    assert sim.data.body("crane_hook").xpos[0] == before["crane_hook"]
 
 
 @given(st.lists(st.floats(-10, 10), max_size=8).filter(lambda wrench: len(wrench) != 6))

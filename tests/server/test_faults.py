@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -195,3 +196,62 @@ def test_faults_that_are_none(kind: type[Fault], options: dict[str, Any], compla
 def test_a_fault_is_of_some_kind() -> None:
     with pytest.raises(TypeError, match="Delay, Drop"):
         Fault()
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "complaint"),
+    [
+        (Drop, {"op": 3}, "op: Expected `str | null`"),
+        (Drop, {"topic": b"state/full"}, "topic: Expected `str | null`"),
+        (Drop, {"after": 0.5}, "after: Expected `int`"),
+        (Corrupt, {"flips": 2.5}, "flips: Expected `int`"),
+        (Delay, {"seconds": "1"}, "seconds: Expected `float`"),
+        (Refuse, {"code": 7}, "code: Expected `str`"),
+    ],
+)
+def test_what_describes_a_fault_has_its_types(kind: type[Fault], options: dict[str, Any], complaint: str) -> None:
+    with pytest.raises(TypeError, match=f"{kind.__name__}: {re.escape(complaint)}"):
+        kind(**options)
+
+
+def test_what_is_not_a_fault_is_refused_and_harms_nobody(client: URLabClient, faults: Faults) -> None:
+    for nonsense in ("step", None, Drop):
+        with pytest.raises(TypeError, match=re.escape("is not a fault: make a Delay, Drop")):
+            faults.add(nonsense)  # type: ignore[arg-type]
+        with pytest.raises(TypeError, match="is not a fault"):
+            Faults(nonsense)  # type: ignore[arg-type]
+    assert client.step().step == 1
+
+
+class Clumsy(Drop):
+    def concerns_request(self, op: str) -> bool:
+        raise LookupError(op)
+
+
+def test_a_fault_of_a_users_own_that_fails_is_removed(
+    client: URLabClient, faults: Faults, caplog: pytest.LogCaptureFixture
+) -> None:
+    faults.add(Clumsy())
+    assert client.step().step == 1
+    assert faults.active == ()
+    assert "Clumsy" in caplog.text
+
+
+def test_shared_memory_gets_what_subscribers_do_not(models: Path, tmp_path: Path) -> None:
+    faults = Faults(Drop(topic="state/full"), Corrupt(topic="bot/camera"))
+    options: dict[str, Any] = {"play": True, "faults": faults, "shm_dir": tmp_path}
+    with (
+        SimulatedServer(models / "bot.xml", **options) as server,
+        URLabClient(**server.client_options(), transport="shm") as near,
+        URLabClient(**server.client_options()) as far,
+    ):
+        far.discover()
+        near.discover()
+        with near.state_stream() as states, far.state_stream() as lost:
+            assert lost.receive_nowait() is None
+            assert states.receive(timeout=30.0).time == 0.0
+            with pytest.raises(URLabTimeoutError):
+                lost.receive(timeout=0.05)
+            (drop, _) = faults.active
+            assert drop.wait(timeout=30.0)
+            assert states.receive(timeout=30.0).per_articulation

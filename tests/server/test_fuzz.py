@@ -22,21 +22,21 @@ from wire import Wire, pack
 
 from urlab_client import ProtocolError, URLabRPCError
 from urlab_client.protocol.codec import decode_reply
+from urlab_client.protocol.dialects import ALPHA
 from urlab_client.protocol.errors import RPC_ERRORS
 from urlab_client.protocol.messages.session import HelloOk, StepOk
-from urlab_client.protocol.registry import OPS
 from urlab_client.protocol.rows import (
     STATE_FULL,
     ActuatorInfo,
     ControlPayload,
-    Topic,
+    StreamTopic,
     TopicKind,
     decode_gains,
     decode_row,
 )
 from urlab_client.server import Limits, SimulatedServer
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.requests import Incoming, RequestReader
+from urlab_client.server.rpc.requests import Incoming, RequestReader
 
 FRAMES = 5_000 * FACTOR
 """For each direction of the codec."""
@@ -61,7 +61,7 @@ def test_requests_are_read_or_refused() -> None:
 
 
 def test_replies_are_read_or_raise_what_callers_expect() -> None:
-    ops = list(OPS.values())
+    ops = list(ALPHA.ops.values())
     read = raised = 0
     for number, frame in enumerate(mutated(golden_replies(), 2, FRAMES)):
         op = ops[number % len(ops)]
@@ -86,7 +86,7 @@ def test_stream_payloads_are_read_or_raise_what_callers_expect() -> None:
     readers: list[Callable[[bytes], Any]] = [ControlPayload.decode, decode_gains, ActuatorInfo.decode]
 
     def reader_of(kind: TopicKind) -> Callable[[bytes], Any]:
-        return lambda payload: decode_row(Topic(kind, "bot", "x"), payload)
+        return lambda payload: decode_row(StreamTopic(kind, "bot", "x"), payload)
 
     readers += [reader_of(kind) for kind in kinds]
     done = 0
@@ -151,7 +151,7 @@ def test_a_live_server_answers_every_frame(
     # Some frames pause physics, and then each step waits for its whole time.
     monkeypatch.setattr("urlab_client.server.core.Engine", hasty(0.01))
     codes = {*RPC_ERRORS} - {"internal_error"}
-    replies = {op.reply_name for op in OPS.values()}
+    replies = {op.reply_name for op in ALPHA.ops.values()}
     refused = served = 0
     caplog.set_level("ERROR")
     with (
@@ -200,12 +200,12 @@ def test_frames_on_the_other_sockets_leave_the_server_well(models: Path) -> None
 def test_binary_values_that_are_not_base64() -> None:
     frame = b'{"op":"hello_ok","session_id":"","urlab_version":"","mujoco_version":"","mjb__b64__":"x"}'
     with pytest.raises(ProtocolError, match="base64"):
-        decode_reply(OPS["hello"], HelloOk, frame)
+        decode_reply(ALPHA.ops["hello"], HelloOk, frame)
 
 
 def test_golden_frames_are_good() -> None:
     """Or the mutations would start from noise."""
     reader = RequestReader()
-    assert {reader.read(frame).name for frame in golden_requests()} == {*OPS}
+    assert {reader.read(frame).name for frame in golden_requests()} == {*ALPHA.ops}
     assert STATE_FULL
-    assert {HelloOk, StepOk} <= {op.reply for op in OPS.values()}
+    assert {HelloOk, StepOk} <= {op.reply for op in ALPHA.ops.values()}

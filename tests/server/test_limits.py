@@ -15,8 +15,9 @@ import zmq
 from waiting import eventually
 from wire import Wire, pack
 
-from urlab_client.protocol.registry import OPS
-from urlab_client.server import Limits, SimulatedServer, endpoint
+from urlab_client.protocol.dialects import ALPHA
+from urlab_client.server import Limits, SimulatedServer
+from urlab_client.server.transport import endpoint
 
 Serve = Callable[..., Wire]
 SMALL = Limits(
@@ -135,7 +136,7 @@ def test_a_frame_beyond_all_limits_costs_its_sender_the_connection(small: Wire) 
 
 
 def test_no_reply_tells_of_the_program(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
-    from urlab_client.server.dispatch import Dispatcher
+    from urlab_client.server.rpc.dispatch import Dispatcher
 
     wire = serve("bot", play=True)
 
@@ -143,7 +144,7 @@ def test_no_reply_tells_of_the_program(serve: Serve, monkeypatch: pytest.MonkeyP
         raise RuntimeError("secret /home/ada/token")
 
     monkeypatch.setattr(Dispatcher, "_serve", broken)
-    for name in OPS:
+    for name in ALPHA.ops:
         reply = wire.raw({"op": name, "session_id": wire.session_id})
         assert reply == {
             "op": "error",

@@ -79,6 +79,7 @@ def test_095_raw_masks_stay_raw(ball: Wire) -> None:
     assert state["qvel"][2] == 0.0
 
 
+@pytest.mark.mujoco("3.10")
 def test_096_worker_threads(ball: Wire) -> None:
     assert options(ball, num_worker_threads=-5)["num_worker_threads"] == 0
     echo = options(ball, num_worker_threads=100000)

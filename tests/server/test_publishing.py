@@ -25,15 +25,16 @@ from urlab_client.protocol.rows import (
     JointRow,
     SceneRow,
     SensorRow,
-    Topic,
+    StreamTopic,
     TwistRow,
     decode_row,
     encode_gains,
 )
-from urlab_client.server import SimulatedServer, publishing
-from urlab_client.server.controllers import ControllerConfig
-from urlab_client.server.endpoint import bound_peers
-from urlab_client.server.engine import Engine
+from urlab_client.server import SimulatedServer
+from urlab_client.server.physics.controllers import ControllerConfig
+from urlab_client.server.physics.engine import Engine
+from urlab_client.server.streams import publishing
+from urlab_client.server.transport.endpoint import bound_peers
 
 Tick = list[tuple[bytes, bytes]]
 
@@ -136,7 +137,7 @@ def snapshot(tick: Tick) -> StateSnapshot:
 
 
 def rows(tick: Tick) -> list[Any]:
-    return [decode_row(Topic.parse(topic), payload) for topic, payload in tick[:-1]]
+    return [decode_row(StreamTopic.parse(topic), payload) for topic, payload in tick[:-1]]
 
 
 def stepped(topic: bytes, payload: bytes) -> bool:
@@ -289,7 +290,7 @@ def test_a_state_beyond_float32_does_not_stop_the_stream(play: Play) -> None:
     bench.wire.ask("step", qpos=[0, 0, 1, 1, 0, 0, 0, 1e300])
     bench.wire.ask("set_mode", mode="live")
     bench.wire.ask("set_paused", paused=True)
-    row = decode_row(Topic.parse(b"bot/joint/j"), bench.subscribe(b"bot/joint/j").recv_multipart()[1])
+    row = decode_row(StreamTopic.parse(b"bot/joint/j"), bench.subscribe(b"bot/joint/j").recv_multipart()[1])
     assert isinstance(row, JointRow)
 
 
@@ -388,6 +389,7 @@ def test_ids_are_global_whatever_the_topic_says(play: Play, models: Path) -> Non
             break
 
 
+@pytest.mark.mujoco("3.11")
 def test_an_actuator_of_several_inputs_takes_its_first_by_id(play: Play, tmp_path: Path) -> None:
     path = tmp_path / "multi.xml"
     path.write_text(MULTI)
@@ -491,6 +493,18 @@ def test_info_describes_every_articulation_in_one_frame_each(play: Play) -> None
         "camera_list": announced,
     }
     assert (limited["robot"], limited["ids"], limited["mins"], limited["maxs"]) == ("bot_1", [1], [-100.0], [100.0])
+
+
+@pytest.mark.mujoco("3.11")
+def test_info_tells_the_range_of_the_first_input_behind_an_actuator_of_several(play: Play, tmp_path: Path) -> None:
+    path = tmp_path / "multi.xml"
+    path.write_text(MULTI.replace('name="last"', 'name="last" ctrlrange="-2 3" ctrllimited="true"'))
+    bench = play(path)
+    bench.hurry()
+    socket = bench.open(zmq.SUB, bench.server.info_port)
+    socket.subscribe(b"")
+    info = json.loads(socket.recv())
+    assert (info["ids"], info["mins"], info["maxs"]) == ([0, 1, 2], [-100.0, -100.0, -2.0], [100.0, 100.0, 3.0])
 
 
 def test_info_pauses_outside_live_mode(play: Play) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from urlab_client import URLabClient
-from urlab_client.aio.layout import articulation_layouts
+from urlab_client.aio.model.layout import articulation_layouts
 from urlab_client.server import SimulatedServer
 
 ASSETS = sorted((Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets").glob("*.xml"))

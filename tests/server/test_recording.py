@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from wire import Wire
 
-from urlab_client.server.recording import Frame, Layout, decode_csv, decode_json, encode_json
+from urlab_client.server.physics.recording import Frame, JointLayout, decode_csv, decode_json, encode_json
 
 Serve = Callable[..., Wire]
 
@@ -125,7 +125,7 @@ joints = st.dictionaries(st.text(max_size=5), st.sampled_from([(7, 6), (4, 3), (
 
 @given(joints, st.lists(numbers, max_size=4), st.data())
 def test_what_is_saved_is_loaded(widths: dict[str, tuple[int, int]], times: list[float], data: Any) -> None:
-    layout = Layout.of((name, *width) for name, width in widths.items())
+    layout = JointLayout.of((name, *width) for name, width in widths.items())
     nq, nv = sum(width[0] for width in widths.values()), sum(width[1] for width in widths.values())
 
     def row(size: int) -> np.ndarray[Any, Any]:
@@ -221,10 +221,10 @@ SAVER = """
 import os, random, signal, sys, time
 from pathlib import Path
 import numpy as np
-from urlab_client.server.content import write_atomic
-from urlab_client.server.recording import Frame, Layout, encode_json
+from urlab_client.server.assets.content import write_atomic
+from urlab_client.server.physics.recording import Frame, JointLayout, encode_json
 
-layout = Layout.of([("j", 1, 1)])
+layout = JointLayout.of([("j", 1, 1)])
 file, chance = Path(sys.argv[1]), random.Random(0)
 
 def content(version):

@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from wire import Wire
 
-from urlab_client.server import SimulatedServer, rendering
-from urlab_client.server.rendering import NO_HIT_CM, find_backend, tint
+from urlab_client.server import SimulatedServer
+from urlab_client.server.render import camera_renderer
+from urlab_client.server.render.camera_renderer import NO_HIT_CM, find_backend, tint
 
 # Looks along +x at a wall 2 m away, whose upper half is red and whose lower half is blue.
 WALL = """
@@ -266,9 +267,9 @@ def test_without_opengl_frames_are_left_out(
 def test_a_machine_without_opengl_is_told_what_to_install(
     play: Play, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(rendering.sys, "platform", "linux")
-    monkeypatch.setattr(rendering, "_PROBE", "raise SystemExit('no {name} today')")
-    monkeypatch.setattr(rendering, "_find", rendering._find.__wrapped__)
+    monkeypatch.setattr(camera_renderer.sys, "platform", "linux")
+    monkeypatch.setattr(camera_renderer, "_PROBE", "raise SystemExit('no {name} today')")
+    monkeypatch.setattr(camera_renderer, "_find", camera_renderer._find.__wrapped__)
     wire = play("drop")
     with caplog.at_level(logging.WARNING, logger="urlab_client.server"):
         assert "cameras" not in wire.ask("step", include_cameras={"above": "sync"})
@@ -279,23 +280,36 @@ def test_a_machine_without_opengl_is_told_what_to_install(
 
 
 def test_a_driver_that_kills_its_process_kills_no_server(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rendering, "_PROBE", "import os; os.abort()  # {name}")
-    assert "ended with code" in str(rendering._probe("egl"))
+    monkeypatch.setattr(camera_renderer, "_PROBE", "import os; os.abort()  # {name}")
+    assert "ended with code" in str(camera_renderer._probe("egl"))
 
 
-def test_drawing_that_fails_later_leaves_frames_out(
+def fail(*arguments: object) -> None:
+    raise RuntimeError("the driver is gone")
+
+
+def test_a_frame_that_cannot_be_drawn_is_left_out_alone(play: Play, monkeypatch: pytest.MonkeyPatch) -> None:
+    wire = play("drop")
+    for _ in range(camera_renderer.MAX_FAILED):
+        with monkeypatch.context() as patch:
+            patch.setattr(camera_renderer._Stage, "draw", fail)
+            assert "cameras" not in wire.ask("step", include_cameras={"above": "sync"})
+        assert "cameras" in wire.ask("step", include_cameras={"above": "sync"})
+
+
+def test_drawing_that_fails_again_and_again_is_given_up(
     play: Play, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def fail(*arguments: object) -> None:
-        raise RuntimeError("the driver is gone")
-
     wire = play("drop")
-    monkeypatch.setattr(rendering._Stage, "draw", fail)
-    with caplog.at_level(logging.ERROR, logger="urlab_client.server"):
-        assert "cameras" not in wire.ask("step", include_cameras={"above": "sync"})
-        assert "cameras" not in wire.ask("step", include_cameras={"above": "sync"})
+    with monkeypatch.context() as patch, caplog.at_level(logging.ERROR, logger="urlab_client.server"):
+        patch.setattr(camera_renderer._Stage, "draw", fail)
+        for _ in range(camera_renderer.MAX_FAILED + 1):
+            assert "cameras" not in wire.ask("step", include_cameras={"above": "sync"})
     assert caplog.text.count("drawing failed") == 1
+    assert "cameras" not in wire.ask("step", include_cameras={"above": "sync"})
     wire.ask("stop_pie")
+    wire.ask("begin_pie")
+    assert "cameras" in wire.ask("step", include_cameras={"above": "sync"})
 
 
 def test_the_backend_is_looked_for_once() -> None:

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from scenes import BOT, make_scene
 from wire import Wire
 
-from urlab_client.server.recording import Frame, Layout
-from urlab_client.server.replay import Player
+from urlab_client.server.physics.recording import Frame, JointLayout
+from urlab_client.server.physics.replay import Player
 
 
 @pytest.fixture
@@ -72,6 +72,23 @@ def test_steps_play_a_file_in_a_loop(bot: Wire, mode: str) -> None:
     assert seen[3]["time"] == 0.0
     bot.ask("replay_stop")
     assert "replay" not in bot.ask("step")
+
+
+def test_a_free_body_turns_the_short_way(bot: Wire, replays: Path) -> None:
+    """A quaternion and its negative are one orientation: between frames of either sign nothing spins."""
+    half = np.sqrt(0.5)
+    turns = [[1, 0, 0, 0], [-half, 0, 0, -half]]  # from none to a quarter about z, which is written with the other sign
+    frames = [
+        {"timestamp": 0.004 * i, "jointStates": {"root": {"qPos": [0, 0, 0, *turn]}, "j": {"qPos": [0]}}}
+        for i, turn in enumerate(turns)
+    ]
+    (replays / "turn.json").write_text(json.dumps({"Frames": frames}))
+    bot.ask("set_mode", mode="direct")
+    bot.ask("replay_load", path="turn.json")
+    bot.ask("replay_start")
+    quaternion = np.array(state(bot.ask("step"))["qpos"][3:7])
+    eighth = np.array([np.cos(np.pi / 8), 0, 0, np.sin(np.pi / 8)])
+    assert abs(quaternion @ eighth) == pytest.approx(1.0, abs=1e-6)
 
 
 def test_a_live_recording_comes_back_exactly(bot: Wire) -> None:
@@ -156,7 +173,7 @@ def test_nothing_to_play_and_nothing_to_stop(bot: Wire) -> None:
 @given(st.lists(st.floats(-3, 3), min_size=2, max_size=6), st.integers(1, 200))
 def test_poses_lie_between_their_frames(values: list[float], n_steps: int) -> None:
     scene = make_scene(bot=BOT)
-    layout = Layout.of([("bot_j", 1, 1)])
+    layout = JointLayout.of([("bot_j", 1, 1)])
     frames = [Frame(0.01 * at, layout, np.array([value]), np.zeros(1)) for at, value in enumerate(values)]
     one, many = (Player(scene, frames, relative=False) for _ in range(2))
     for _ in range(n_steps):

@@ -16,12 +16,12 @@ from hypothesis import strategies as st
 from odd_requests import every_kind, mangled_requests, plain_requests
 
 from urlab_client.protocol.codec import MAX_REQUEST_BYTES, encode_request
+from urlab_client.protocol.dialects import ALPHA
 from urlab_client.protocol.messages import runtime, scene, session
 from urlab_client.protocol.messages.session import ArticulationCommand, Step
-from urlab_client.protocol.registry import OPS
 from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.requests import Incoming, RequestReader, need, usable
+from urlab_client.server.rpc.requests import Incoming, RequestReader, need, usable
 
 READER = RequestReader()
 DEPTH = Limits().request_depth
@@ -61,7 +61,7 @@ def same(one: Incoming, other: Incoming) -> bool:
 
 @pytest.mark.parametrize("lead", [b"", b" ", b"\t", b"\r", b"\n", b" \r\n\t"])
 def test_json_after_white_space(lead: bytes) -> None:
-    assert read(lead + b'{"op":"meta"}').op is OPS["meta"]
+    assert read(lead + b'{"op":"meta"}').op is ALPHA.ops["meta"]
 
 
 @pytest.mark.parametrize(
@@ -95,7 +95,7 @@ def test_neither_map_nor_object(frame: bytes) -> None:
 @pytest.mark.parametrize("surplus", [b"\x00", b"\xc1", b"{", pack({"op": "hello"}), b"\x00" * 1000])
 def test_bytes_after_a_msgpack_map_are_ignored(surplus: bytes) -> None:
     incoming = read(pack({"op": "set_paused", "session_id": "s", "paused": True}) + surplus)
-    assert incoming.op is OPS["set_paused"]
+    assert incoming.op is ALPHA.ops["set_paused"]
     assert incoming.session_id == "s"
 
 
@@ -125,7 +125,7 @@ def nested(depth: int) -> dict[str, Any]:
 
 
 def test_depth_limit() -> None:
-    assert read(nested(DEPTH - 1)).op is OPS["meta"]
+    assert read(nested(DEPTH - 1)).op is ALPHA.ops["meta"]
     assert "deeper" in refused(pack(nested(DEPTH)))
     assert "deeper" in refused(msgspec.json.encode(nested(DEPTH)))
 
@@ -165,7 +165,7 @@ def test_op_of_another_type_is_read_as_text() -> None:
 
 
 def test_op_names_in_another_case() -> None:
-    assert read({"op": "Set_Paused", "paused": True}).op is OPS["set_paused"]
+    assert read({"op": "Set_Paused", "paused": True}).op is ALPHA.ops["set_paused"]
     assert read({"op": "HELLO"}).op is None
     assert read({"op": "Meta"}).op is None
 
@@ -238,7 +238,7 @@ def test_the_last_of_several_spellings_wins() -> None:
     assert fields(twice, "n_steps") == 3
     assert fields(b'{"op":"step","n_steps":2,"n_steps":3}', "n_steps") == 3
     other_op = b"\x82\xa2op\xa4step\xa2op\xa4meta"
-    assert read(other_op).op is OPS["meta"]
+    assert read(other_op).op is ALPHA.ops["meta"]
 
 
 def test_names_in_maps_that_differ_in_case_only_collapse() -> None:
@@ -462,7 +462,7 @@ def agree(frame: bytes) -> None:
         return
     incoming = READER.read(frame)
     assert same(incoming, READER._read_loosely(frame))
-    assert isinstance(exact, OPS[str(incoming.name)].request)
+    assert isinstance(exact, ALPHA.ops[str(incoming.name)].request)
 
 
 @given(plain_requests)
@@ -475,7 +475,7 @@ def test_both_ways_agree_on_odd_requests(request: dict[str, Any]) -> None:
     agree(pack(request))
 
 
-@pytest.mark.parametrize("op", [op for op in OPS if op != "configure_controller"])
+@pytest.mark.parametrize("op", [op for op in ALPHA.ops if op != "configure_controller"])
 def test_what_our_client_sends_takes_the_fast_way(op: str) -> None:
     samples: dict[str, Any] = {
         "target": "a",
@@ -486,13 +486,13 @@ def test_what_our_client_sends_takes_the_fast_way(op: str) -> None:
         "percent": 5.0,
     }
     vectors = ("location", "color", "from_", "to", "center", "half_extents")
-    required = [f.name for f in msgspec.structs.fields(OPS[op].request) if f.required]
+    required = [f.name for f in msgspec.structs.fields(ALPHA.ops[op].request) if f.required]
     values = {name: samples.get(name, (1.0, 2.0, 3.0) if name in vectors else "x") for name in required}
     if op == "set_paused":
         values["paused"] = True
     if op == "set_sim_options":
         values["options"] = runtime.SimOptions(timestep=0.001)
-    request = OPS[op].request(**values)
+    request = ALPHA.ops[op].request(**values)
     frame = encode_request(request, "s")
     assert READER._decoder.decode(frame).session_id == "s"
 

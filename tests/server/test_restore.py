@@ -13,7 +13,7 @@ from samples import filled
 from wire import Wire, pack
 
 from urlab_client.protocol.codec import encode_request
-from urlab_client.protocol.registry import OPS
+from urlab_client.protocol.dialects import ALPHA
 from urlab_client.server import ControllerConfig, Delay, Drop, Faults, SimulatedServer
 
 Act = Callable[[Wire], object]
@@ -120,7 +120,7 @@ def speak_json(wire: Wire) -> None:
 
 
 def every_op(wire: Wire) -> None:
-    for op in OPS.values():
+    for op in ALPHA.ops.values():
         wire.exchange(encode_request(filled(op.request), wire.session_id))
         if op.name == "hello":
             wire.hello()

@@ -8,20 +8,20 @@ import mujoco
 import numpy as np
 import pytest
 
-from urlab_client.server.bundled import bundled_models
-from urlab_client.server.content import ContentRoot
-from urlab_client.server.scene import ArticulationIndex, Scene, compile_scene
-from urlab_client.server.world import World
+from urlab_client.server.assets.bundled_robots import bundled_models
+from urlab_client.server.assets.content import ContentRoot
+from urlab_client.server.compile.scene import ArticulationIndex, CompiledScene, compile_scene
+from urlab_client.server.editor.world import EditorWorld
 
 Place = tuple[str, tuple[float, float, float]]
 
 
 @pytest.fixture
-def scene_of(tmp_path: Path) -> Callable[..., Scene]:
+def scene_of(tmp_path: Path) -> Callable[..., CompiledScene]:
     """Compile bundled models placed at locations."""
 
-    def build(*placed: Place) -> Scene:
-        world = World(ContentRoot(tmp_path))
+    def build(*placed: Place) -> CompiledScene:
+        world = EditorWorld(ContentRoot(tmp_path))
         for name, location in placed:
             world.spawn_actor(world.import_xml(name)[0].class_path, location=location)
         return compile_scene(world.freeze())
@@ -29,7 +29,7 @@ def scene_of(tmp_path: Path) -> Callable[..., Scene]:
     return build
 
 
-def run(scene: Scene, seconds: float, control: Callable[[], None] = lambda: None) -> None:
+def run(scene: CompiledScene, seconds: float, control: Callable[[], None] = lambda: None) -> None:
     steps = round(seconds / scene.model.opt.timestep)
     for _ in range(steps):
         control()
@@ -38,13 +38,13 @@ def run(scene: Scene, seconds: float, control: Callable[[], None] = lambda: None
     assert np.isfinite(scene.data.qpos).all()
 
 
-def hold(scene: Scene, index: ArticulationIndex) -> None:
+def hold(scene: CompiledScene, index: ArticulationIndex) -> None:
     """Write what the server's PD controller would for set-points of zero, with its default gains."""
     position, velocity = scene.data.qpos[index.qpos_adr[7:]], scene.data.qvel[index.qvel_adr[6:]]
     scene.data.ctrl[index.ctrl_adr] = np.clip(-100.0 * position - 5.0 * velocity, -200.0, 200.0)
 
 
-def tilt(scene: Scene, body: int) -> float:
+def tilt(scene: CompiledScene, body: int) -> float:
     """Angle between a body's z axis and the world's, degrees."""
     return float(np.degrees(np.arccos(np.clip(scene.data.xmat[body].reshape(3, 3)[2, 2], -1.0, 1.0))))
 
@@ -65,14 +65,14 @@ def test_the_models_are_packaged() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(bundled_models()))
-def test_a_model_compiles_without_a_word_of_warning(scene_of: Callable[..., Scene], name: str) -> None:
+def test_a_model_compiles_without_a_word_of_warning(scene_of: Callable[..., CompiledScene], name: str) -> None:
     scene = scene_of((name, (0.0, 0.0, 0.0)))
 
     assert scene.warnings == ()
     run(scene, 0.2)
 
 
-def test_the_quadruped_has_what_a_robot_needs(scene_of: Callable[..., Scene]) -> None:
+def test_the_quadruped_has_what_a_robot_needs(scene_of: Callable[..., CompiledScene]) -> None:
     scene = scene_of(("quadruped", (0.0, 0.0, 0.0)))
     (index,) = scene.articulations
 
@@ -88,7 +88,7 @@ def test_the_quadruped_has_what_a_robot_needs(scene_of: Callable[..., Scene]) ->
 
 
 @pytest.mark.parametrize("start", ["reset", "home"])
-def test_the_quadruped_stands_for_five_seconds(scene_of: Callable[..., Scene], start: str) -> None:
+def test_the_quadruped_stands_for_five_seconds(scene_of: Callable[..., CompiledScene], start: str) -> None:
     scene = scene_of(("quadruped", (0.0, 0.0, 0.0)))
     (index,) = scene.articulations
     if start == "home":
@@ -105,7 +105,7 @@ def test_the_quadruped_stands_for_five_seconds(scene_of: Callable[..., Scene], s
     np.testing.assert_allclose(accelerometer, [0, 0, 9.81], atol=0.5)
 
 
-def test_without_torque_the_quadruped_lies_down_on_its_floor(scene_of: Callable[..., Scene]) -> None:
+def test_without_torque_the_quadruped_lies_down_on_its_floor(scene_of: Callable[..., CompiledScene]) -> None:
     scene = scene_of(("quadruped", (0.0, 0.0, 0.0)))
 
     run(scene, 3.0)
@@ -113,7 +113,7 @@ def test_without_torque_the_quadruped_lies_down_on_its_floor(scene_of: Callable[
     assert 0.03 < scene.data.qpos[2] < 0.25
 
 
-def test_two_quadrupeds_and_a_ball_share_the_ground(scene_of: Callable[..., Scene]) -> None:
+def test_two_quadrupeds_and_a_ball_share_the_ground(scene_of: Callable[..., CompiledScene]) -> None:
     scene = scene_of(
         ("quadruped", (0.0, 0.0, 0.0)),
         ("quadruped", (0.3, 1.0, 0.0)),
@@ -143,7 +143,7 @@ def test_two_quadrupeds_and_a_ball_share_the_ground(scene_of: Callable[..., Scen
         (-1.5, -0.6, 0.7, -1.0, 0.7, -2.0),
     ],
 )
-def test_the_arm_reaches_its_targets(scene_of: Callable[..., Scene], target: tuple[float, ...]) -> None:
+def test_the_arm_reaches_its_targets(scene_of: Callable[..., CompiledScene], target: tuple[float, ...]) -> None:
     scene = scene_of(("arm", (0.0, 0.0, 0.0)))
     (index,) = scene.articulations
     assert index.actuator_names[-1] == "gripper"
@@ -156,7 +156,7 @@ def test_the_arm_reaches_its_targets(scene_of: Callable[..., Scene], target: tup
     np.testing.assert_allclose(scene.data.qpos[index.qpos_adr[6:]], 0.03, atol=0.002)
 
 
-def test_the_arm_points_its_gripper_and_camera_down_when_at_rest(scene_of: Callable[..., Scene]) -> None:
+def test_the_arm_points_its_gripper_and_camera_down_when_at_rest(scene_of: Callable[..., CompiledScene]) -> None:
     scene = scene_of(("arm", (0.0, 0.0, 0.0)))
     mujoco.mj_resetDataKeyframe(scene.model, scene.data, scene.model.key("arm_home").id)
     run(scene, 1.0)

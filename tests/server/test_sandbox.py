@@ -6,16 +6,22 @@ import asyncio
 import os
 import signal
 import struct
+import subprocess
+import sys
+import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from wire import Wire
 
 from urlab_client import ImportFailed, URLabTimeoutError
+from urlab_client._landlock import is_available
 from urlab_client.aio import URLabClient
-from urlab_client.server import Limits, SimulatedServer, sandbox
+from urlab_client.server import Limits, SimulatedServer, simulated
+from urlab_client.server.assets import sandbox
 
 Serve = Callable[..., Wire]
 
@@ -131,6 +137,154 @@ def test_what_a_model_names_elsewhere_is_refused(text: str, wire: Wire, folder: 
     assert "secret" in message or "link" in message
 
 
+THEFT = FIGURE.format(file="{folder}/secret.obj")
+INCLUDING = '<mujoco><include file="{file}"/></mujoco>'
+ATTACHING = (
+    '<mujoco><asset><model name="a" file="{file}"/></asset>'
+    '<worldbody><attach model="a" prefix="x_"/></worldbody></mujoco>'
+)
+DISGUISES = {
+    "blanks": " " * 256,
+    "newlines": "\n" * 256,
+    "vertical tab": "\v",
+    "form feed": "\f",
+    "byte order marks": "\ufeff \ufeff",
+    "junk": "This is a poem. ",
+    "comment": '<!-- file=" -->',
+    "declaration": '<?xml version="1.0" encoding="utf-16"?>',
+}
+
+
+@pytest.mark.parametrize("names", [INCLUDING, ATTACHING, None], ids=["included", "attached", "itself"])
+@pytest.mark.parametrize("disguise", DISGUISES)
+def test_no_disguise_hides_what_a_model_names(disguise: str, names: str | None, wire: Wire, folder: Path) -> None:
+    root = folder / "root"
+    model = root / "model_in_disguise.xml"
+    model.write_text(DISGUISES[disguise] + THEFT.replace("{folder}", str(folder)), "utf-8")
+    if names is not None:
+        (root / "part.xml").write_bytes(model.read_bytes())
+        model.write_text(names.format(file="part.xml"))
+    message = refusal(wire, model)
+    assert "outside the folders" in message
+    assert "secret.obj" in message
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        ATTACHING.format(file="part.mjz"),
+        ATTACHING.format(file="part.ZIP"),
+        ATTACHING.format(file="part.mjz/model.xml"),
+        INCLUDING.format(file="part.mjz/model.xml"),
+        FIGURE.format(file="part.mjz"),
+    ],
+)
+def test_archives_are_not_opened(text: str, wire: Wire, folder: Path) -> None:
+    for name in ("part.mjz", "part.ZIP"):
+        with zipfile.ZipFile(folder / "root" / name, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("model.xml", THEFT.replace("{folder}", str(folder)))
+    model = folder / "root" / "packed.xml"
+    model.write_text(text)
+    assert "an archive, whose content is not looked into: unpack it" in refusal(wire, model)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ('<mujoco><include file="part&sol;x.xml"/></mujoco>', "not understood"),
+        ('<mujoco><include file="part\n.xml"/></mujoco>', "not understood"),
+        ('<mujoco><include file="pipe"/></mujoco>', "not a regular file"),
+        (ATTACHING.format(file="meshes/figure.obj"), "empty, or not XML"),
+        ("<mujoco><worldbody></mujoco", "see line 1"),
+        ("", "empty, or not XML"),
+        ("a poem", "empty, or not XML"),
+    ],
+)
+def test_what_is_not_understood_is_refused(text: str, reason: str, wire: Wire, folder: Path) -> None:
+    pipe = folder / "root" / "pipe"
+    if not pipe.exists():
+        os.mkfifo(pipe)
+    model = folder / "root" / "riddle.xml"
+    model.write_text(text)
+    assert reason in refusal(wire, model)
+
+
+def test_mujoco_s_own_leniency_is_understood(wire: Wire, folder: Path) -> None:
+    model = folder / "root" / "lenient.xml"
+    model.write_text(
+        "\n\v A robot:\n<!------ It's \"in\" here -->\n<mujoco\fmodel = 'bot'>"
+        "<asset><mesh name='m' file='meshes&#47;figure.obj' /></asset >"
+        "<worldbody><body><geom\ttype='mesh'\nmesh='m'/></body></worldbody></mujoco>\n"
+    )
+    assert wire.ask("import_xml", path=str(model))["imported_now"] is True
+
+
+@pytest.mark.skipif(not is_available(), reason="the kernel has no Landlock")
+def test_the_kernel_keeps_mujoco_from_files_that_a_check_missed(folder: Path, tmp_path: Path) -> None:
+    program = (
+        "from urlab_client.server.assets import sandbox\n"
+        "sandbox.check_references = lambda *arguments: None\n"
+        "sandbox._serve()\n"
+    )
+    orders = b""
+    for name, file in (("inside", "meshes/figure.obj"), ("outside", str(folder / "secret.obj"))):
+        model = folder / "root" / f"{name}.xml"
+        model.write_text(FIGURE.format(file=file))
+        (tmp_path / name).mkdir()
+        order = sandbox._SandboxJob(str(model), str(tmp_path / name / "snapshot"), [str(folder / "root")], LIMITS)
+        orders += msgspec.json.encode(order) + b"\n"
+    child = subprocess.run([sys.executable, "-c", program], input=orders, stdout=subprocess.PIPE, check=True)
+    inside, outside = map(msgspec.json.decode, child.stdout.splitlines())
+    assert inside["done"] is not None
+    assert "MuJoCo rejects" in outside["subject"]
+    assert not [*(tmp_path / "outside").rglob("*.obj")]
+
+
+@pytest.mark.skipif(not is_available(), reason="the kernel has no Landlock")
+def test_a_confined_process_opens_nothing_else(tmp_path: Path) -> None:
+    for name in ("read", "write", "other"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "file").write_text(name)
+    (tmp_path / "read" / "link").symlink_to(tmp_path / "other" / "file")
+    program = (
+        "import os, pathlib, socket, sys\n"
+        "from urlab_client._landlock import confine_files\n"
+        "here = pathlib.Path(sys.argv[1])\n"
+        "kept = open(here / 'other' / 'file')\n"
+        "server = socket.create_server(('127.0.0.1', 0))\n"
+        "assert confine_files([here / 'read', here / 'missing'], [here / 'write'])\n"
+        "def denied(what, *arguments):\n"
+        "    try:\n"
+        "        what(*arguments)\n"
+        "    except PermissionError:\n"
+        "        return True\n"
+        "assert kept.read() == 'other'\n"
+        "assert open(here / 'read' / 'file').read() == 'read'\n"
+        "assert os.listdir(here / 'read')\n"
+        "open(here / 'write' / 'new', 'w').write('x')\n"
+        "os.remove(here / 'write' / 'new')\n"
+        "assert denied(open, here / 'other' / 'file')\n"
+        "assert denied(open, here / 'read' / 'link')\n"
+        "assert denied(open, here / 'read' / 'new', 'w')\n"
+        "assert denied(os.listdir, here)\n"
+        "assert denied(os.execv, '/bin/true', ['true'])\n"
+    )
+    subprocess.run([sys.executable, "-c", program, str(tmp_path)], check=True)
+
+
+def test_a_server_says_when_the_kernel_does_not_help(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(simulated, "is_available", lambda: False)
+    with caplog.at_level("INFO"), SimulatedServer():
+        pass
+    assert [(record.levelname, "no Landlock" in record.message) for record in caplog.records][:1] == [("INFO", True)]
+    caplog.clear()
+    with SimulatedServer(host="0.0.0.0", insecure_no_auth=True):
+        pass
+    assert [record.message for record in caplog.records if "no Landlock" in record.message]
+
+
 PATHS = [
     "../secret.xml", "{root}/../secret.xml", "{folder}/secret.xml", "linked.xml", "{root}/linked.xml", "", ".", "..",
     "secret.xml\0", "\0", "C:\\Windows\\win.ini", "C:secret.xml", "\\\\host\\share\\x.xml", "//host/share/x.xml",
@@ -160,10 +314,10 @@ def test_recordings_stay_where_they_belong(folder: Path) -> None:
         wire.ask("recording_start")
         wire.ask("step", n_steps=3)
         wire.ask("recording_stop")
-        door = folder / "root" / "door"
-        door.symlink_to(folder)
+        fence = folder / "root" / "fence"
+        fence.symlink_to(folder)
         outside = sorted(folder.iterdir())
-        for path in (*PATHS, str(door / "out.json"), str(folder / "out.json")):
+        for path in (*PATHS, str(fence / "out.json"), str(folder / "out.json")):
             text = path.replace("{root}", str(folder / "root")).replace("{folder}", str(folder))
             if text:
                 reply = wire.raw({"op": "recording_save", "session_id": wire.session_id, "path": text})
@@ -172,7 +326,7 @@ def test_recordings_stay_where_they_belong(folder: Path) -> None:
                 reply = wire.raw({"op": "replay_load", "session_id": wire.session_id, "path": text})
                 assert reply["op"] == "replay_load_ok" or reply["code"] == "path_not_readable", text
         assert sorted(folder.iterdir()) == outside
-        assert os.path.lexists(door)
+        assert os.path.lexists(fence)
 
 
 def test_a_level_that_a_client_opens_names_no_files_elsewhere(folder: Path, tmp_path: Path) -> None:
@@ -192,6 +346,33 @@ def test_a_level_that_a_client_opens_names_no_files_elsewhere(folder: Path, tmp_
             code, message = wire.refusal("load_level", level_path=name)
             assert code == "load_level_failed"
             assert "outside the folders" in message
+
+
+def test_a_record_that_a_client_may_have_written_is_not_adopted(folder: Path, tmp_path: Path) -> None:
+    """What it says was compiled, in a snapshot that never was, would be read with nothing in the way."""
+    home = folder / "root" / "forged"
+    (home / "0123456789abcdef").mkdir(parents=True)
+    (home / "0123456789abcdef" / "model.xml").write_text(FIGURE.format(file=folder / "secret.obj"))
+    record = {"stem": "b", "source": "b.xml", "source_digest": "", "digest": "0123456789abcdef", "model_name": "b"}
+    record |= {"imported_at": "2026-01-01T00:00:00Z", "joints": [], "actuators": [], "actuator_types": {}}
+    (home / "blueprint.json").write_bytes(msgspec.json.encode(record | {"sensors": [], "cameras": []}))
+    (home / "b.xml").write_text(FIGURE.format(file=folder / "secret.obj"))
+    level = {
+        "format": "urlab-level",
+        "version": 1,
+        "blueprints": {
+            "b": {"source": f"{home}/b.xml", "digest": "0123456789abcdef", "record": f"{home}/blueprint.json"}
+        },
+        "actors": [{"name": "b", "kind": "articulation", "blueprint": "b"}],
+    }
+    (tmp_path / "Levels").mkdir()
+    (tmp_path / "Levels" / "forged.json").write_bytes(msgspec.json.encode(level))
+    with SimulatedServer(saved_dir=tmp_path, model_roots=[folder / "root"]) as server, Wire(server) as wire:
+        wire.hello()
+        code, message = wire.refusal("load_level", level_path="forged")
+    assert code == "load_level_failed"
+    assert "secret.obj, which lies outside the folders" in message
+    assert not [*tmp_path.rglob("*.obj")]
 
 
 def test_whoever_runs_the_server_may_name_any_file(folder: Path) -> None:

@@ -9,38 +9,38 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from worlds import BALL_BODY, BOT, GYMNASIUM, Desk, mjcf, write_obj, write_stl
+from worlds import BALL_BODY, BOT, GYMNASIUM, Workspace, mjcf, write_obj, write_stl
 
-from urlab_client.server.content import ContentRoot
-from urlab_client.server.scene import ArticulationIndex, CompileFailed, Scene, compile_scene
-from urlab_client.server.world import World
+from urlab_client.server.assets.content import ContentRoot
+from urlab_client.server.compile.scene import ArticulationIndex, CompiledScene, CompileFailed, compile_scene
+from urlab_client.server.editor.world import EditorWorld
 
 BALL = mjcf(BALL_BODY, model="ball")
 FLOOR = '<geom name="floor" type="plane" size="5 5 0.1"/>'
 
-SceneOf = Callable[..., Scene]
+SceneOf = Callable[..., CompiledScene]
 
 
 @pytest.fixture
-def desk(tmp_path: Path) -> Desk:
-    return Desk(tmp_path)
+def workspace(tmp_path: Path) -> Workspace:
+    return Workspace(tmp_path)
 
 
 @pytest.fixture
-def scene_of(desk: Desk) -> SceneOf:
+def scene_of(workspace: Workspace) -> SceneOf:
     """Compile actors given as name=MJCF in this order, 2 m apart along x; the name is the model's, too."""
 
-    def build(*models: tuple[str, str], **options: Any) -> Scene:
+    def build(*models: tuple[str, str], **options: Any) -> CompiledScene:
         for at, (name, text) in enumerate(models):
-            path = desk.blueprint(name, text)
-            desk.world.spawn_actor(path, f"id{at}", location=(2.0 * at, 0.0, 0.0))
-        return compile_scene(desk.world.freeze(), **options)
+            path = workspace.blueprint(name, text)
+            workspace.world.spawn_actor(path, f"id{at}", location=(2.0 * at, 0.0, 0.0))
+        return compile_scene(workspace.world.freeze(), **options)
 
     return build
 
 
 @pytest.fixture
-def two_bots(scene_of: SceneOf) -> Scene:
+def two_bots(scene_of: SceneOf) -> CompiledScene:
     return scene_of(("bot", BOT), ("bot", BOT))
 
 
@@ -55,12 +55,12 @@ def short(index: ArticulationIndex, ids: np.ndarray, element: Callable[[int], An
 # What the conformance checklist states about scenes
 
 
-def test_everything_an_articulation_owns_has_its_prefix(two_bots: Scene) -> None:
+def test_everything_an_articulation_owns_has_its_prefix(two_bots: CompiledScene) -> None:
     model = two_bots.model
     kinds = [
         (model.njnt, model.joint),
         (model.ngeom, model.geom),
-        (model.nactuator, model.actuator),
+        (model.nu, model.actuator),
         (model.nsensor, model.sensor),
         (model.nkey, model.key),
         (model.ncam, model.camera),
@@ -73,7 +73,7 @@ def test_everything_an_articulation_owns_has_its_prefix(two_bots: Scene) -> None
     assert names(model, model.nbody, model.body) == ["world", "bot_base", "bot_arm", "bot_1_base", "bot_1_arm"]
 
 
-def test_articulations_are_told_apart_by_key_and_id(two_bots: Scene) -> None:
+def test_articulations_are_told_apart_by_key_and_id(two_bots: CompiledScene) -> None:
     assert [(index.key, index.prefix, index.actor_id) for index in two_bots.articulations] == [
         ("bot", "bot_", "id0"),
         ("bot_1", "bot_1_", "id1"),
@@ -82,7 +82,7 @@ def test_articulations_are_told_apart_by_key_and_id(two_bots: Scene) -> None:
     assert all(not any(index.original_names.values()) for index in two_bots.articulations)
 
 
-def test_actors_stand_where_they_were_placed(two_bots: Scene) -> None:
+def test_actors_stand_where_they_were_placed(two_bots: CompiledScene) -> None:
     model = two_bots.model
 
     np.testing.assert_allclose(model.body("bot_1_base").pos, [2, 0, 1])
@@ -91,20 +91,20 @@ def test_actors_stand_where_they_were_placed(two_bots: Scene) -> None:
     np.testing.assert_allclose(model.geom("bot_1_floor").pos, [2, 0, 0])
 
 
-def test_a_rotated_actor_is_compiled_rotated(desk: Desk) -> None:
-    bot = desk.blueprint("bot", BOT)
-    desk.world.spawn_actor(bot, location=(0, 0, 5), rotation_euler=(0, 0, 90))
+def test_a_rotated_actor_is_compiled_rotated(workspace: Workspace) -> None:
+    bot = workspace.blueprint("bot", BOT)
+    workspace.world.spawn_actor(bot, location=(0, 0, 5), rotation_euler=(0, 0, 90))
 
-    scene = compile_scene(desk.world.freeze())
+    scene = compile_scene(workspace.world.freeze())
 
     np.testing.assert_allclose(scene.model.body("bot_base").pos, [0, 0, 6], atol=1e-12)
     np.testing.assert_allclose(scene.model.qpos0[3:7], [np.sqrt(0.5), 0, 0, np.sqrt(0.5)], atol=1e-12)
 
 
-def test_an_empty_level_is_an_empty_model(desk: Desk) -> None:
-    desk.world.ensure_manager()
+def test_an_empty_level_is_an_empty_model(workspace: Workspace) -> None:
+    workspace.world.ensure_manager()
 
-    scene = compile_scene(desk.world.freeze())
+    scene = compile_scene(workspace.world.freeze())
 
     assert (scene.model.nbody, scene.model.ngeom, scene.model.nlight) == (1, 0, 0)
     assert scene.articulations == ()
@@ -112,7 +112,7 @@ def test_an_empty_level_is_an_empty_model(desk: Desk) -> None:
     assert scene.warnings == ()
 
 
-def test_the_plugins_options_apply_whatever_the_model_says(two_bots: Scene) -> None:
+def test_the_plugins_options_apply_whatever_the_model_says(two_bots: CompiledScene) -> None:
     option = two_bots.model.opt
 
     assert option.timestep == 0.002
@@ -122,7 +122,7 @@ def test_the_plugins_options_apply_whatever_the_model_says(two_bots: Scene) -> N
     assert option.disableflags == 0
 
 
-def test_a_fresh_scene_is_at_its_reference_with_everything_computed(two_bots: Scene) -> None:
+def test_a_fresh_scene_is_at_its_reference_with_everything_computed(two_bots: CompiledScene) -> None:
     data = two_bots.data
 
     assert data.time == 0
@@ -130,7 +130,7 @@ def test_a_fresh_scene_is_at_its_reference_with_everything_computed(two_bots: Sc
     np.testing.assert_allclose(data.xpos[two_bots.articulations[1].root_body], [2, 0, 1])
 
 
-def test_the_binary_model_loads(two_bots: Scene, tmp_path: Path) -> None:
+def test_the_binary_model_loads(two_bots: CompiledScene, tmp_path: Path) -> None:
     two_bots.model.opt.timestep = 0.004
     file = tmp_path / "scene.mjb"
     file.write_bytes(two_bots.mjb())
@@ -199,11 +199,11 @@ def test_a_model_that_asks_for_memory_gets_it(scene_of: SceneOf) -> None:
 # Keyframes
 
 
-def key(scene: Scene, name: str) -> Any:
+def key(scene: CompiledScene, name: str) -> Any:
     return scene.model.key(name)
 
 
-def test_keyframes_hold_their_owners_part_only(two_bots: Scene) -> None:
+def test_keyframes_hold_their_owners_part_only(two_bots: CompiledScene) -> None:
     model = two_bots.model
     first, second = two_bots.articulations
 
@@ -235,6 +235,7 @@ KEYED = mjcf(
 )
 
 
+@pytest.mark.mujoco("3.16")
 def test_keyframes_beside_free_objects(scene_of: SceneOf) -> None:
     scene = scene_of(("ball", BALL), ("keyed", KEYED), ("ball", BALL), ("keyed", KEYED))
     model = scene.model
@@ -266,9 +267,10 @@ def test_keyframes_beside_free_objects(scene_of: SceneOf) -> None:
 ROBOTS = ["humanoid.xml", "ant.xml", "walker2d_v5.xml", "pusher_v5.xml"]
 
 
+@pytest.mark.mujoco("3.16")
 @pytest.mark.parametrize("file", ROBOTS)
 def test_real_robots_twice(tmp_path: Path, file: str) -> None:
-    world = World(ContentRoot(tmp_path, model_roots=[GYMNASIUM]))
+    world = EditorWorld(ContentRoot(tmp_path, model_roots=[GYMNASIUM]))
     blueprint, _ = world.import_xml(file)
     for at in range(2):
         world.spawn_actor(blueprint.class_path, location=(0.0, 10.0 * at, 0.0))
@@ -298,9 +300,10 @@ def test_real_robots_twice(tmp_path: Path, file: str) -> None:
     np.testing.assert_array_equal(np.sort(positions), np.arange(model.nq))
 
 
+@pytest.mark.mujoco("3.16")
 @pytest.mark.parametrize("file", ROBOTS)
 def test_a_robot_in_a_scene_moves_as_it_does_alone(tmp_path: Path, file: str) -> None:
-    world = World(ContentRoot(tmp_path, model_roots=[GYMNASIUM]))
+    world = EditorWorld(ContentRoot(tmp_path, model_roots=[GYMNASIUM]))
     world.spawn_actor(world.import_xml(file)[0].class_path)
     scene = compile_scene(world.freeze())
     alone = mujoco.MjModel.from_xml_path(str(GYMNASIUM / file))
@@ -342,6 +345,7 @@ def test_one_prefix_may_begin_with_another(scene_of: SceneOf) -> None:
     assert [index.sensor_names for index in scene.articulations] == [("1_s",), (), ("1_s",)]
 
 
+@pytest.mark.mujoco("3.16")
 def test_actuators_with_several_inputs_and_outputs(scene_of: SceneOf) -> None:
     text = mjcf(
         '<body name="b"><joint name="turn" type="ball"/><geom size="0.1"/>'
@@ -380,10 +384,10 @@ def test_a_model_of_world_geoms_only_belongs_to_the_world(scene_of: SceneOf) -> 
 # Meshes
 
 
-def meshy(desk: Desk, name: str, size: float) -> str:
-    write_obj(desk.models / name / "part.obj", size)
-    write_stl(desk.models / name / "shell.stl", size)
-    desk.write(
+def meshy(workspace: Workspace, name: str, size: float) -> str:
+    write_obj(workspace.models / name / "part.obj", size)
+    write_stl(workspace.models / name / "shell.stl", size)
+    workspace.write(
         f"{name}/{name}.xml",
         mjcf(
             '<body name="b"><freejoint/><geom type="mesh" mesh="part"/><geom type="mesh" mesh="shell"/></body>',
@@ -391,32 +395,33 @@ def meshy(desk: Desk, name: str, size: float) -> str:
             head='<asset><mesh file="part.obj"/><mesh file="shell.stl"/></asset>',
         ),
     )
-    return desk.world.import_xml(f"{name}/{name}.xml")[0].class_path
+    return workspace.world.import_xml(f"{name}/{name}.xml")[0].class_path
 
 
-def test_instances_share_their_meshes(desk: Desk) -> None:
-    path = meshy(desk, "part", 0.3)
-    desk.world.spawn_grid(path, "g", 3, 2)
+@pytest.mark.mujoco("3.17")
+def test_instances_share_their_meshes(workspace: Workspace) -> None:
+    path = meshy(workspace, "part", 0.3)
+    workspace.world.spawn_grid(path, "g", 3, 2)
 
-    model = compile_scene(desk.world.freeze()).model
+    model = compile_scene(workspace.world.freeze()).model
 
     assert model.nmesh == 2
     assert model.ngeom == 12
     assert len(set(model.geom_dataid.tolist())) == 2
 
 
-def test_the_exported_scene_loads_with_its_assets(desk: Desk) -> None:
+def test_the_exported_scene_loads_with_its_assets(workspace: Workspace) -> None:
     for at, (name, size) in enumerate([("small", 0.1), ("large", 0.4)]):  # with files of the same names
-        desk.world.spawn_actor(meshy(desk, name, size), location=(at, 0, 0))
-    desk.world.spawn_actor(desk.blueprint("bot", BOT))
-    scene = compile_scene(desk.world.freeze())
+        workspace.world.spawn_actor(meshy(workspace, name, size), location=(at, 0, 0))
+    workspace.world.spawn_actor(workspace.blueprint("bot", BOT))
+    scene = compile_scene(workspace.world.freeze())
 
     text, assets = scene.mjcf(), scene.assets()
     again = mujoco.MjModel.from_xml_string(text, assets=assets)
 
     assert len(assets) == 4
     assert all("/" not in name and "\\" not in name for name in assets)
-    assert str(desk.saved) not in text
+    assert str(workspace.saved) not in text
     assert again.nq == scene.model.nq
     assert names(again, again.nkey, again.key) == ["bot_home"]
     np.testing.assert_allclose(again.body_mass, scene.model.body_mass, rtol=1e-4)
@@ -462,12 +467,12 @@ def test_the_default_camera_size_can_be_chosen(scene_of: SceneOf) -> None:
 # Lights, meshes of the level
 
 
-def test_lights_shine_as_unreal_would_aim_them(desk: Desk) -> None:
-    desk.world.spawn_light("directional", rotation_euler=(0, -90, 0), intensity=2500.0, color=(1, 0.5, 0))
-    desk.world.spawn_light("point", location=(1, 2, 3), intensity=1e9)
-    desk.world.spawn_light("spot", rotation_euler=(0, 0, 90))
+def test_lights_shine_as_unreal_would_aim_them(workspace: Workspace) -> None:
+    workspace.world.spawn_light("directional", rotation_euler=(0, -90, 0), intensity=2500.0, color=(1, 0.5, 0))
+    workspace.world.spawn_light("point", location=(1, 2, 3), intensity=1e9)
+    workspace.world.spawn_light("spot", rotation_euler=(0, 0, 90))
 
-    model = compile_scene(desk.world.freeze()).model
+    model = compile_scene(workspace.world.freeze()).model
 
     sun, bulb, spot = (model.light(f"{kind}Light_0_Light") for kind in ("Directional", "Point", "Spot"))
     np.testing.assert_allclose(sun.dir, [0, 0, -1], atol=1e-9)
@@ -483,22 +488,22 @@ def test_lights_shine_as_unreal_would_aim_them(desk: Desk) -> None:
     assert model.light_type.tolist() == [int(kind) for kind in types]
 
 
-def level(desk: Desk, *actors: dict[str, Any]) -> Scene:
-    file = desk.saved / "Levels" / "props.json"
+def level(workspace: Workspace, *actors: dict[str, Any]) -> CompiledScene:
+    file = workspace.saved / "Levels" / "props.json"
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(json.dumps({"format": "urlab-level", "version": 1, "blueprints": {}, "actors": actors}))
-    desk.world.load_level("props")
-    desk.world.spawn_actor(desk.blueprint("ball", BALL), location=(5, 0, 0))
-    return compile_scene(desk.world.freeze())
+    workspace.world.load_level("props")
+    workspace.world.spawn_actor(workspace.blueprint("ball", BALL), location=(5, 0, 0))
+    return compile_scene(workspace.world.freeze())
 
 
 def prop(name: str, **settings: Any) -> dict[str, Any]:
     return {"name": name, "kind": "static_mesh", "mesh": {"shape": "box", "size": [0.1, 0.2, 0.3]}} | settings
 
 
-def test_converted_meshes_are_entities(desk: Desk) -> None:
+def test_converted_meshes_are_entities(workspace: Workspace) -> None:
     scene = level(
-        desk,
+        workspace,
         prop("crate", location=[0, 0, 1], quick_convert={"friction": [0.5, 0.1, 0.2]}),
         prop("wall", quick_convert={"static": True}),
         prop("door", quick_convert={"driven_by_unreal": True}),
@@ -524,12 +529,12 @@ def test_converted_meshes_are_entities(desk: Desk) -> None:
     assert [index.key for index in scene.articulations] == ["ball"]
 
 
-def test_a_converted_mesh_file_is_scaled(desk: Desk) -> None:
-    write_obj(desk.saved / "Levels" / "rock.obj", 1.0)
+def test_a_converted_mesh_file_is_scaled(workspace: Workspace) -> None:
+    write_obj(workspace.saved / "Levels" / "rock.obj", 1.0)
     rock = {"shape": "file", "file": "rock.obj"}
 
     scene = level(
-        desk,
+        workspace,
         prop("one", mesh=rock, quick_convert={}),
         prop("two", mesh=rock, scale=[2, 2, 2], quick_convert={}, location=[9, 0, 0]),
         prop("round", mesh={"shape": "sphere", "size": [0.5]}, scale=[2, 2, 2], quick_convert={}, location=[20, 0, 0]),
@@ -543,7 +548,7 @@ def test_a_converted_mesh_file_is_scaled(desk: Desk) -> None:
 # Floors and suns
 
 
-def test_floors_that_coincide_are_named_and_drawn_once(two_bots: Scene) -> None:
+def test_floors_that_coincide_are_named_and_drawn_once(two_bots: CompiledScene) -> None:
     model = two_bots.model
 
     assert any("2 floors coincide (bot_floor, bot_1_floor)" in warning for warning in two_bots.warnings)
@@ -584,13 +589,13 @@ def test_a_light_may_aim_at_the_world(scene_of: SceneOf) -> None:
     assert model.cam_targetbodyid.tolist() == [0, 0]
 
 
-def test_mujocos_message_is_on_one_line(desk: Desk) -> None:
-    path = desk.blueprint("bot", BOT)
-    desk.world.spawn_actor(path)
-    blueprint = desk.content.blueprints["bot"]
+def test_mujocos_message_is_on_one_line(workspace: Workspace) -> None:
+    path = workspace.blueprint("bot", BOT)
+    workspace.world.spawn_actor(path)
+    blueprint = workspace.content.blueprints["bot"]
     (blueprint.folder / "model.xml").write_text("<mujoco>\n<nonsense/></mujoco>")
 
-    fresh = World(ContentRoot(desk.saved))
+    fresh = EditorWorld(ContentRoot(workspace.saved))
     fresh.spawn_actor(path)
     with pytest.raises(CompileFailed) as failed:
         compile_scene(fresh.freeze())
@@ -600,12 +605,13 @@ def test_mujocos_message_is_on_one_line(desk: Desk) -> None:
     assert str(failed.value) == failed.value.message
 
 
-def test_a_mesh_file_that_vanished_fails_the_compilation(desk: Desk) -> None:
+def test_a_mesh_file_that_vanished_fails_the_compilation(workspace: Workspace) -> None:
     with pytest.raises(CompileFailed, match=r"gone\.obj"):
-        level(desk, prop("rock", mesh={"shape": "file", "file": "gone.obj"}, quick_convert={}))
+        level(workspace, prop("rock", mesh={"shape": "file", "file": "gone.obj"}, quick_convert={}))
 
 
-def test_a_model_that_needs_its_own_integrator_says_how_to_get_it(scene_of: SceneOf, desk: Desk) -> None:
+@pytest.mark.mujoco("3.16")
+def test_a_model_that_needs_its_own_integrator_says_how_to_get_it(scene_of: SceneOf, workspace: Workspace) -> None:
     cloth = mjcf(
         '<flexcomp name="cloth" type="grid" count="3 3 1" spacing="0.1 0.1 0.1" mass="1" dim="2">'
         '<elasticity young="1e4" poisson="0.2" thickness="0.01" elastic2d="both"/>'
@@ -617,10 +623,10 @@ def test_a_model_that_needs_its_own_integrator_says_how_to_get_it(scene_of: Scen
     with pytest.raises(CompileFailed, match="--mjcf-options"):
         scene_of(("cloth", cloth))
 
-    assert compile_scene(desk.world.freeze(), honour_mjcf_options=True).model.nflex == 1
+    assert compile_scene(workspace.world.freeze(), honour_mjcf_options=True).model.nflex == 1
 
 
-def test_what_a_scene_warns_of_is_logged(two_bots: Scene, caplog: pytest.LogCaptureFixture) -> None:
+def test_what_a_scene_warns_of_is_logged(two_bots: CompiledScene, caplog: pytest.LogCaptureFixture) -> None:
     logged = [record for record in caplog.records if record.name == "urlab_client.server"]
 
     assert tuple(record.getMessage() for record in caplog.get_records("setup")) == two_bots.warnings

@@ -25,8 +25,9 @@ from raw_shm import HEADER, RawRegion, RawShm
 from waiting import eventually
 
 from urlab_client.server import SimulatedServer
-from urlab_client.server.region_files import InstanceDirectory, RegionFile
-from urlab_client.server.shared_memory import MAX_LISTENERS, SharedMemory
+from urlab_client.server.system.health import Health
+from urlab_client.server.transport.region_files import InstanceDirectory, RegionFile
+from urlab_client.server.transport.shared_memory import MAX_LISTENERS, SharedMemoryServer
 
 Rpc = Callable[..., dict[str, Any]]
 
@@ -268,9 +269,9 @@ def test_files_that_are_cut_off_do_not_kill_the_server(
 def test_nonsense_at_the_doorbell_disturbs_nobody(server: SimulatedServer, session: str) -> None:
     directory = directory_of(server)
     noise = random.Random(5)
-    with ExitStack() as strangers, RawShm(directory, bell=False) as shm:
+    with ExitStack() as unmatched_names, RawShm(directory, bell=False) as shm:
         for number in range(50):
-            stranger = strangers.enter_context(socket.socket(socket.AF_UNIX))
+            stranger = unmatched_names.enter_context(socket.socket(socket.AF_UNIX))
             stranger.connect(os.fspath(directory / "doorbell.sock"))
             with suppress(OSError):  # beyond the limit they are shut out
                 stranger.send(noise.randbytes(3000))
@@ -361,7 +362,7 @@ def test_a_server_for_which_there_is_no_room_keeps_nothing(base: Path, monkeypat
     monkeypatch.setattr(os, "posix_fallocate", allocate, raising=False)
     before = os.listdir("/dev/fd")
     with pytest.raises(OSError, match="No space left"):
-        SharedMemory(base)
+        SharedMemoryServer(base, Health())
     assert set(os.listdir("/dev/fd")) <= set(before)  # what was garbage before may have been collected meanwhile
     assert list(base.iterdir()) == []
 

@@ -26,9 +26,9 @@ from urlab_client import URLabClient
 from urlab_client.protocol.enums import CameraMode, StepMode
 from urlab_client.server import ControllerConfig, ModelError, PortInUse, SimulatedServer, bundled_models
 from urlab_client.server import core as core_module
+from urlab_client.server.compile.scene import compile_scene
+from urlab_client.server.editor.world import EditorWorld
 from urlab_client.server.limits import Limits
-from urlab_client.server.scene import compile_scene
-from urlab_client.server.world import World
 
 Connect = Callable[[SimulatedServer], Wire]
 Serve = Callable[..., Wire]
@@ -254,7 +254,7 @@ def test_close_during_what_cannot_be_broken_off(
     models: Path, connect: Connect, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     gate = Gate(lambda: "/Game/Levels/x")
-    monkeypatch.setattr(World, "current_level", gate)
+    monkeypatch.setattr(EditorWorld, "current_level", gate)
     with caplog.at_level(logging.WARNING, "urlab_client.server"), SimulatedServer() as server:
         wire = connect(server)
         wire.hello()

@@ -10,7 +10,7 @@ import pytest
 from wire import Wire, float32
 
 from urlab_client.protocol.rotation import rotate
-from urlab_client.server.viewport import Track, Viewport
+from urlab_client.server.editor.viewport import Track, Viewport
 
 POSE = {"location", "rotation_quat", "rotation_euler", "fov"}
 

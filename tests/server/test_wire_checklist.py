@@ -19,7 +19,7 @@ from scenes import hasty as hasty_engine
 from wire import Wire, float32, write_level
 
 from urlab_client.protocol.base import Needs
-from urlab_client.protocol.registry import OPS
+from urlab_client.protocol.dialects import ALPHA
 from urlab_client.server import ControllerConfig, SimulatedServer
 
 Serve = Callable[..., Wire]
@@ -404,7 +404,7 @@ def test_editor_33_untracking(editor: Wire, models: Path) -> None:
     assert editor.ask("untrack") == {"op": "untrack_ok", "was_tracking": False}
 
 
-@pytest.mark.parametrize("op", [op.name for op in OPS.values() if op.needs is not Needs.NOTHING])
+@pytest.mark.parametrize("op", [op.name for op in ALPHA.ops.values() if op.needs is not Needs.NOTHING])
 def test_editor_35_session_before_fields(shared: Wire, op: str) -> None:
     for session in ({}, {"session_id": ""}, {"session_id": "0"}, {"session_id": shared.session_id.upper()}):
         reply = shared.raw({"op": op, **session})

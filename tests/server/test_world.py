@@ -12,38 +12,39 @@ import mujoco
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from worlds import BALL_BODY, BOT, Desk, mjcf, write_obj
+from worlds import BALL_BODY, BOT, Workspace, mjcf, write_obj
 
-from urlab_client.server.content import ContentRoot
+from urlab_client.server.assets.content import ContentRoot
+from urlab_client.server.compile.scene import compile_scene
+from urlab_client.server.editor.world import Actor, ActorKind, EditorWorld
+from urlab_client.server.handlers.scene import _row as snapshot_row
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.scene import compile_scene
-from urlab_client.server.world import ActorKind, ActorRow, World
 
 BALL = mjcf(BALL_BODY, model="ball")
 HALF = math.sqrt(0.5)
 
 
 @pytest.fixture
-def desk(tmp_path: Path) -> Desk:
-    return Desk(tmp_path)
+def workspace(tmp_path: Path) -> Workspace:
+    return Workspace(tmp_path)
 
 
 @pytest.fixture
-def world(desk: Desk) -> World:
-    desk.world.create_level("lab")
-    return desk.world
+def world(workspace: Workspace) -> EditorWorld:
+    workspace.world.create_level("lab")
+    return workspace.world
 
 
 @pytest.fixture
-def bot(desk: Desk, world: World) -> str:
+def bot(workspace: Workspace, world: EditorWorld) -> str:
     """Class path of the bot."""
-    return desk.blueprint("bot", BOT)
+    return workspace.blueprint("bot", BOT)
 
 
 @pytest.fixture
-def ball(desk: Desk, world: World) -> str:
+def ball(workspace: Workspace, world: EditorWorld) -> str:
     """Class path of the ball."""
-    return desk.blueprint("ball", BALL)
+    return workspace.blueprint("ball", BALL)
 
 
 def refusal(call: Callable[..., object], *args: Any, **kwargs: Any) -> Refusal:
@@ -53,11 +54,11 @@ def refusal(call: Callable[..., object], *args: Any, **kwargs: Any) -> Refusal:
     return refused.value
 
 
-def names(rows: list[ActorRow]) -> list[str]:
+def names(rows: list[Actor]) -> list[str]:
     return [row.name for row in rows]
 
 
-def row(world: World, key: str) -> ActorRow:
+def row(world: EditorWorld, key: str) -> Actor:
     return next(row for row in world.list_actors() if key in (row.name, row.actor_id))
 
 
@@ -68,7 +69,7 @@ def same_rotation(a: Any, b: Any) -> bool:
 # Blueprints
 
 
-def test_blueprints_are_listed_by_name(bot: str, ball: str, world: World) -> None:
+def test_blueprints_are_listed_by_name(bot: str, ball: str, world: EditorWorld) -> None:
     rows = world.list_blueprints()
 
     assert [item.short_name for item in rows] == ["ball", "bot"]
@@ -80,22 +81,24 @@ def test_blueprints_are_listed_by_name(bot: str, ball: str, world: World) -> Non
 @pytest.mark.parametrize(
     "path", ["/Game/MuJoCoImports/bot", "/Game/MuJoCoImports/bot.bot_C", "/game/mujocoimports/BOT.bot_c"]
 )
-def test_a_blueprint_is_named_by_package_or_class_path(bot: str, world: World, path: str) -> None:
-    assert world.spawn_actor(path, "a").blueprint_class_path == bot
+def test_a_blueprint_is_named_by_package_or_class_path(bot: str, world: EditorWorld, path: str) -> None:
+    assert world.spawn_actor(path, "a").actor.class_path == bot
 
 
 @pytest.mark.parametrize("path", ["bot", "/Game/MuJoCoImports/bot.bot", "/Game/MuJoCoImports/robot", "/Script/Pawn_C"])
-def test_other_paths_name_no_blueprint(bot: str, world: World, path: str) -> None:
+def test_other_paths_name_no_blueprint(bot: str, world: EditorWorld, path: str) -> None:
     refused = refusal(world.spawn_actor, path, "a")
 
     assert refused.code == "spawn_failed"
     assert "/Game/MuJoCoImports/bot" in refused.message
 
 
-def test_actors_take_the_new_model_of_a_reimport_at_the_next_play(desk: Desk, bot: str, world: World) -> None:
+def test_actors_take_the_new_model_of_a_reimport_at_the_next_play(
+    workspace: Workspace, bot: str, world: EditorWorld
+) -> None:
     world.spawn_actor(bot, "a")
     before = world.freeze()
-    desk.write("bot.xml", BOT.replace('mass="1"', 'mass="3"'))
+    workspace.write("bot.xml", BOT.replace('mass="1"', 'mass="3"'))
 
     world.import_xml("bot.xml", force_reimport=True)
 
@@ -106,7 +109,7 @@ def test_actors_take_the_new_model_of_a_reimport_at_the_next_play(desk: Desk, bo
     assert mass(before) == pytest.approx(1.5)
 
 
-def test_a_blueprint_in_use_is_not_destroyed(bot: str, world: World) -> None:
+def test_a_blueprint_in_use_is_not_destroyed(bot: str, world: EditorWorld) -> None:
     world.spawn_actor(bot, "a")
 
     refused = refusal(world.destroy_asset, "/Game/MuJoCoImports/bot.bot")
@@ -123,24 +126,24 @@ def test_a_blueprint_in_use_is_not_destroyed(bot: str, world: World) -> None:
     "path",
     ["/Game/MuJoCoImports/bot.bot_C", "/Game/MuJoCoImports/bot.ball", "/Game/Levels/none.none", "/Game/../x.x", "bot"],
 )
-def test_what_is_no_asset_is_not_found(bot: str, world: World, path: str) -> None:
+def test_what_is_no_asset_is_not_found(bot: str, world: EditorWorld, path: str) -> None:
     assert world.destroy_asset(path) is False
 
 
 # Levels
 
 
-def test_a_level_without_a_name_cannot_be_saved(desk: Desk) -> None:
-    assert desk.world.current_level() == "/Temp/Untitled_1"
+def test_a_level_without_a_name_cannot_be_saved(workspace: Workspace) -> None:
+    assert workspace.world.current_level() == "/Temp/Untitled_1"
 
-    refused = refusal(desk.world.save_level)
+    refused = refusal(workspace.world.save_level)
 
     assert refused.code == "save_level_failed"
     assert "create_level" in refused.message
 
 
-def test_a_level_is_created_once_unless_forced(desk: Desk, bot: str) -> None:
-    world = desk.world
+def test_a_level_is_created_once_unless_forced(workspace: Workspace, bot: str) -> None:
+    world = workspace.world
     world.spawn_actor(bot, "a")
 
     assert refusal(world.create_level, "lab").code == "create_level_failed"
@@ -151,7 +154,7 @@ def test_a_level_is_created_once_unless_forced(desk: Desk, bot: str) -> None:
     assert refusal(world.create_level, "../lab").code == "create_level_failed"
 
 
-def test_levels_keep_what_was_saved(desk: Desk, bot: str, ball: str, world: World) -> None:
+def test_levels_keep_what_was_saved(workspace: Workspace, bot: str, ball: str, world: EditorWorld) -> None:
     world.ensure_manager()
     world.spawn_actor(bot, "a", location=(1, 2, 3), rotation_euler=(0, 0, 90))
     world.spawn_actor(ball)
@@ -165,18 +168,18 @@ def test_levels_keep_what_was_saved(desk: Desk, bot: str, ball: str, world: Worl
     assert world.load_level("lab") == world.current_level() == "/Game/Levels/lab"
 
     assert world.list_actors() == before
-    assert World(ContentRoot(desk.saved)).load_level("/Game/Levels/lab")
+    assert EditorWorld(ContentRoot(workspace.saved)).load_level("/Game/Levels/lab")
 
 
 @pytest.mark.parametrize("name", ["nowhere", "/Engine/lab", "../lab"])
-def test_a_level_that_is_not_there_is_not_loaded(bot: str, world: World, name: str) -> None:
+def test_a_level_that_is_not_there_is_not_loaded(bot: str, world: EditorWorld, name: str) -> None:
     world.spawn_actor(bot, "a")
 
     assert refusal(world.load_level, name).code == "load_level_failed"
     assert names(world.list_actors()) == ["bot"]
 
 
-def test_destroying_the_open_level_opens_an_untitled_one(bot: str, world: World) -> None:
+def test_destroying_the_open_level_opens_an_untitled_one(bot: str, world: EditorWorld) -> None:
     world.spawn_actor(bot, "a")
     world.save_level()
 
@@ -195,14 +198,14 @@ def test_destroying_the_open_level_opens_an_untitled_one(bot: str, world: World)
         (lambda world: world.save_level(), "save_level_failed"),
     ],
 )
-def test_levels_are_not_touched_during_play(world: World, op: Callable[[World], str], code: str) -> None:
+def test_levels_are_not_touched_during_play(world: EditorWorld, op: Callable[[EditorWorld], str], code: str) -> None:
     world.pie_running = True
 
     assert refusal(op, world).code == code
 
 
 def test_a_save_that_fails_leaves_the_level_as_it_was(
-    desk: Desk, bot: str, world: World, monkeypatch: pytest.MonkeyPatch
+    workspace: Workspace, bot: str, world: EditorWorld, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     world.save_level()
     world.spawn_actor(bot, "a")
@@ -220,55 +223,61 @@ def test_a_save_that_fails_leaves_the_level_as_it_was(
     assert world.list_actors() == []
 
 
-def test_a_content_root_can_be_moved(desk: Desk, bot: str, world: World, tmp_path: Path) -> None:
+def test_a_content_root_can_be_moved(workspace: Workspace, bot: str, world: EditorWorld, tmp_path: Path) -> None:
     world.spawn_actor(bot, "a")
     world.save_level()
-    shutil.rmtree(desk.models)
-    moved = desk.saved.rename(tmp_path / "elsewhere")
+    shutil.rmtree(workspace.models)
+    moved = workspace.saved.rename(tmp_path / "elsewhere")
 
-    fresh = World(ContentRoot(moved))
+    fresh = EditorWorld(ContentRoot(moved))
     fresh.load_level("lab")
 
     assert compile_scene(fresh.freeze()).model.nu == 1
 
 
 def test_a_level_file_with_its_models_can_be_moved(tmp_path: Path) -> None:
-    desk = Desk(tmp_path / "here")
-    bot = desk.blueprint("bot", BOT)
-    desk.world.create_level("lab")
-    desk.world.spawn_actor(bot, "a")
-    desk.world.save_level()
-    shutil.rmtree(desk.saved / "MuJoCoImports")
+    workspace = Workspace(tmp_path / "here")
+    bot = workspace.blueprint("bot", BOT)
+    workspace.world.create_level("lab")
+    workspace.world.spawn_actor(bot, "a")
+    workspace.world.save_level()
+    shutil.rmtree(workspace.saved / "MuJoCoImports")
     (tmp_path / "here").rename(tmp_path / "there")
 
-    fresh = World(ContentRoot(tmp_path / "fresh"))
+    fresh = EditorWorld(ContentRoot(tmp_path / "fresh"))
     fresh.load_level_file(tmp_path / "there" / "saved" / "Levels" / "lab.json")
 
     assert names(fresh.list_actors()) == ["bot"]
     assert compile_scene(fresh.freeze()).model.nu == 1
 
 
-def test_a_level_file_brings_its_snapshot_along(desk: Desk, bot: str, world: World, tmp_path: Path) -> None:
+def test_a_level_file_brings_its_snapshot_along(
+    workspace: Workspace, bot: str, world: EditorWorld, tmp_path: Path
+) -> None:
     world.spawn_actor(bot, "a")
     world.save_level()
-    shutil.rmtree(desk.models)
+    shutil.rmtree(workspace.models)
 
-    fresh = World(ContentRoot(tmp_path / "fresh"))
-    fresh.load_level_file(desk.saved / "Levels" / "lab.json")
-    shutil.rmtree(desk.saved)
+    fresh = EditorWorld(ContentRoot(tmp_path / "fresh"))
+    fresh.load_level_file(workspace.saved / "Levels" / "lab.json")
+    shutil.rmtree(workspace.saved)
 
     assert compile_scene(fresh.freeze()).model.nu == 1
     assert [item.short_name for item in fresh.list_blueprints()] == ["bot"]
 
 
-def test_a_level_file_is_saved_where_it_was_opened(desk: Desk, bot: str, world: World, tmp_path: Path) -> None:
+def test_a_level_file_is_saved_where_it_was_opened(
+    workspace: Workspace, bot: str, world: EditorWorld, tmp_path: Path
+) -> None:
     world.spawn_actor(bot, "a")
     world.save_level()
     file = tmp_path / "elsewhere" / "my level.json"
     file.parent.mkdir()
-    text = (desk.saved / "Levels" / "lab.json").read_text().replace("../", "../saved/").replace("../saved/../", "../")
+    text = (
+        (workspace.saved / "Levels" / "lab.json").read_text().replace("../", "../saved/").replace("../saved/../", "../")
+    )
     file.write_text(text.replace("../models", "../models").replace("../saved/models", "../models"))
-    fresh = World(ContentRoot(tmp_path / "fresh"))
+    fresh = EditorWorld(ContentRoot(tmp_path / "fresh"))
 
     assert fresh.load_level_file(file) == "/Game/Levels/my_level"
     fresh.set_actor_transform("a", location=(7, 0, 0))
@@ -285,28 +294,30 @@ def test_a_level_file_is_saved_where_it_was_opened(desk: Desk, bot: str, world: 
 
 
 def test_the_levels_own_model_wins_when_the_level_was_named_by_the_user(
-    bot: str, world: World, desk: Desk, tmp_path: Path
+    bot: str, world: EditorWorld, workspace: Workspace, tmp_path: Path
 ) -> None:
     world.spawn_actor(bot, "a")
     world.save_level()
-    other = Desk(tmp_path / "other")
+    other = Workspace(tmp_path / "other")
     other.blueprint("bot", BALL.replace('model="ball"', 'model="impostor"'))
 
-    other.world.load_level_file(desk.saved / "Levels" / "lab.json")
+    other.world.load_level_file(workspace.saved / "Levels" / "lab.json")
 
     assert compile_scene(other.world.freeze()).model.nu == 1
 
 
-def test_bundled_models_in_a_level_are_found_on_any_machine(desk: Desk, world: World, tmp_path: Path) -> None:
+def test_bundled_models_in_a_level_are_found_on_any_machine(
+    workspace: Workspace, world: EditorWorld, tmp_path: Path
+) -> None:
     world.import_xml("ball")
     world.spawn_actor("/Game/MuJoCoImports/ball", "b")
     world.save_level()
     level = tmp_path / "level.json"
-    text = (desk.saved / "Levels" / "lab.json").read_text()
+    text = (workspace.saved / "Levels" / "lab.json").read_text()
     level.write_text(text)
-    shutil.rmtree(desk.saved)
+    shutil.rmtree(workspace.saved)
 
-    fresh = World(ContentRoot(tmp_path / "fresh"))
+    fresh = EditorWorld(ContentRoot(tmp_path / "fresh"))
     fresh.load_level_file(level)
 
     assert '"bundled:ball"' in text
@@ -317,12 +328,12 @@ HEAD = {"format": "urlab-level", "version": 1, "blueprints": {}}
 BOX = {"name": "crate", "kind": "static_mesh", "mesh": {"shape": "box", "size": [0.1, 0.1, 0.1]}}
 
 
-def load(desk: Desk, level: object) -> World:
-    file = desk.saved / "Levels" / "hand.json"
+def load(workspace: Workspace, level: object) -> EditorWorld:
+    file = workspace.saved / "Levels" / "hand.json"
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(level if isinstance(level, str) else json.dumps(level))
-    desk.world.load_level("hand")
-    return desk.world
+    workspace.world.load_level("hand")
+    return workspace.world
 
 
 @pytest.mark.parametrize(
@@ -351,18 +362,18 @@ def load(desk: Desk, level: object) -> World:
         (HEAD | {"actors": [{"name": "m", "kind": "manager", "quick_convert": {}}]}, "only a static mesh"),
     ],
 )
-def test_a_level_that_makes_no_sense_is_refused_with_the_place(desk: Desk, level: object, text: str) -> None:
-    desk.world.create_level("lab")
+def test_a_level_that_makes_no_sense_is_refused_with_the_place(workspace: Workspace, level: object, text: str) -> None:
+    workspace.world.create_level("lab")
 
-    refused = refusal(load, desk, level)
+    refused = refusal(load, workspace, level)
 
     assert refused.code == "load_level_failed"
     assert text in refused.message
-    assert desk.world.current_level() == "/Game/Levels/lab"
+    assert workspace.world.current_level() == "/Game/Levels/lab"
 
 
-def test_a_level_brings_meshes_which_no_op_can(desk: Desk) -> None:
-    write_obj(desk.saved / "Levels" / "meshes" / "rock.obj", 0.5)
+def test_a_level_brings_meshes_which_no_op_can(workspace: Workspace) -> None:
+    write_obj(workspace.saved / "Levels" / "meshes" / "rock.obj", 0.5)
     rock = {
         "name": "rock",
         "kind": "static_mesh",
@@ -370,11 +381,11 @@ def test_a_level_brings_meshes_which_no_op_can(desk: Desk) -> None:
         "mesh": {"shape": "file", "file": "meshes/rock.obj"},
         "parent": "crate",
     }
-    world = load(desk, HEAD | {"actors": [BOX | {"location": [1, 2, 3], "scale": [1, 2, 3]}, rock]})
+    world = load(workspace, HEAD | {"actors": [BOX | {"location": [1, 2, 3], "scale": [1, 2, 3]}, rock]})
 
     rows = world.list_actors()
     assert [item.class_name for item in rows] == ["StaticMeshActor", "StaticMeshActor"]
-    assert all(item.is_static_mesh_actor and not item.is_articulation and not item.is_light for item in rows)
+    assert {item.kind for item in rows} == {ActorKind.STATIC_MESH}
     assert rows[1].tags == ("URLab.ActorId=rock-1",)
     box = world.get_actor_bounds("crate", components_only=True)
     assert box.center == pytest.approx((1, 2, 3))
@@ -387,7 +398,7 @@ def test_a_level_brings_meshes_which_no_op_can(desk: Desk) -> None:
     assert [child.name for child in tree.children] == ["rock"]
 
     world.save_level()
-    saved = json.loads((desk.saved / "Levels" / "hand.json").read_text())
+    saved = json.loads((workspace.saved / "Levels" / "hand.json").read_text())
     assert saved["actors"][1]["mesh"]["file"] == "meshes/rock.obj"
 
 
@@ -402,70 +413,70 @@ positions = st.tuples(numbers, numbers, numbers)
 )
 @settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 def test_any_level_comes_back_as_it_was(
-    desk: Desk, robots: list[tuple[str, Any, Any]], lights: list[tuple[str, str, Any]]
+    workspace: Workspace, robots: list[tuple[str, Any, Any]], lights: list[tuple[str, str, Any]]
 ) -> None:
-    world = desk.world
+    world = workspace.world
     world.create_level("any", force_overwrite=True)
-    bot = desk.blueprint("bot", BOT)
+    bot = workspace.blueprint("bot", BOT)
     for actor_id, location, euler in robots:
         world.spawn_actor(bot, f"bot_{actor_id}", location=location, rotation_euler=euler)
     for kind, actor_id, location in lights:
         world.spawn_light(kind, actor_id, location=location)
-    before = world.snapshot()
+    before = [snapshot_row(actor, compiled=False) for actor in world.snapshot()]
     world.save_level()
 
-    fresh = World(ContentRoot(desk.saved))
+    fresh = EditorWorld(ContentRoot(workspace.saved))
     fresh.load_level("any")
 
-    assert fresh.snapshot() == before
+    assert [snapshot_row(actor, compiled=False) for actor in fresh.snapshot()] == before
 
 
 # Spawning
 
 
-def test_the_model_name_names_actors(desk: Desk, bot: str, world: World) -> None:
-    nameless = desk.blueprint("my-file", mjcf(BALL_BODY))
-    spaced = desk.blueprint("spaced", mjcf(BALL_BODY, model="my robot!"))
+def test_the_model_name_names_actors(workspace: Workspace, bot: str, world: EditorWorld) -> None:
+    nameless = workspace.blueprint("my-file", mjcf(BALL_BODY))
+    spaced = workspace.blueprint("spaced", mjcf(BALL_BODY, model="my robot!"))
 
-    placed = [world.spawn_actor(path).actor_name for path in (bot, bot, nameless, spaced, bot)]
+    placed = [world.spawn_actor(path).actor.name for path in (bot, bot, nameless, spaced, bot)]
 
     assert placed == ["bot", "bot_1", "my_file", "my_robot_", "bot_2"]
     world.destroy_actor("bot_1")
-    assert world.spawn_actor(bot).actor_name == "bot_1"
+    assert world.spawn_actor(bot).actor.name == "bot_1"
 
 
 def test_actors_can_be_named_as_the_plugin_does(tmp_path: Path) -> None:
-    desk = Desk(tmp_path, actor_names="plugin")
-    bot = desk.blueprint("robot", BOT)
+    workspace = Workspace(tmp_path, actor_names="plugin")
+    bot = workspace.blueprint("robot", BOT)
 
-    assert [desk.world.spawn_actor(bot).actor_name for _ in range(3)] == ["robot_C_0", "robot_C_1", "robot_C_2"]
-    assert desk.world.duplicate_actor("robot_C_0", "d").actor_name == "robot_C_3"
+    assert [workspace.world.spawn_actor(bot).actor.name for _ in range(3)] == ["robot_C_0", "robot_C_1", "robot_C_2"]
+    assert workspace.world.duplicate_actor("robot_C_0", "d").actor.name == "robot_C_3"
 
 
-def test_names_whose_compiled_names_would_repeat_are_passed_over(desk: Desk, world: World) -> None:
-    tricky = desk.blueprint(
+def test_names_whose_compiled_names_would_repeat_are_passed_over(workspace: Workspace, world: EditorWorld) -> None:
+    tricky = workspace.blueprint(
         "tricky", mjcf('<body name="base"><geom size="0.1"/><body name="1_base"><geom size="0.1"/></body></body>')
     )
 
-    placed = [world.spawn_actor(tricky).actor_name for _ in range(3)]
+    placed = [world.spawn_actor(tricky).actor.name for _ in range(3)]
 
     assert placed == ["tricky", "tricky_2", "tricky_3"]  # tricky_1 + base would be tricky + 1_base
     assert compile_scene(world.freeze()).model.nbody == 7
 
 
-def test_an_id_is_placed_once_and_moved_from_then_on(bot: str, world: World) -> None:
+def test_an_id_is_placed_once_and_moved_from_then_on(bot: str, world: EditorWorld) -> None:
     first = world.spawn_actor(bot, "a", location=(1, 2, 3), rotation_euler=(0, 0, 90))
     second = world.spawn_actor(bot, "a", location=(4, 5, 6))
 
     assert (first.was_existing, second.was_existing) == (False, True)
-    assert second.actor_name == first.actor_name
-    assert second.location == (4, 5, 6)
+    assert second.actor.name == first.actor.name
+    assert second.actor.location == (4, 5, 6)
     assert [(item.actor_id, item.location) for item in world.list_actors()] == [("a", (4, 5, 6))]
-    assert row(world, "a").rotation_quat == (0, 0, 0, 1)
-    assert first.actor_path == "/Game/Levels/lab.lab:PersistentLevel.bot"
+    assert row(world, "a").rotation == (0, 0, 0, 1)
+    assert world.actor_path(first.actor) == "/Game/Levels/lab.lab:PersistentLevel.bot"
 
 
-def test_an_id_of_another_class_is_refused(bot: str, ball: str, world: World) -> None:
+def test_an_id_of_another_class_is_refused(bot: str, ball: str, world: EditorWorld) -> None:
     world.spawn_actor(bot, "a")
     world.spawn_light("point", "lamp")
 
@@ -475,16 +486,16 @@ def test_an_id_of_another_class_is_refused(bot: str, ball: str, world: World) ->
     assert not world.spawn_actor(ball, "bot").was_existing  # an object name is no id
 
 
-def test_rotations_are_understood_in_mujocos_frame(bot: str, world: World) -> None:
+def test_rotations_are_understood_in_mujocos_frame(bot: str, world: EditorWorld) -> None:
     world.spawn_actor(bot, "quat", rotation_quat=(0, 0, 2, 2))
     world.spawn_actor(bot, "euler", rotation_euler=(0, 0, 90))
     rolled = world.spawn_actor(bot, "rolled", rotation_euler=(90, 0, 0))
     both = world.spawn_actor(bot, "both", rotation_quat=(0, 0, 0, 1), rotation_euler=(90, 0, 0))
 
-    assert same_rotation(row(world, "quat").rotation_quat, row(world, "euler").rotation_quat)
-    assert same_rotation(row(world, "rolled").rotation_quat, (-HALF, 0, 0, HALF))
+    assert same_rotation(row(world, "quat").rotation, row(world, "euler").rotation)
+    assert same_rotation(row(world, "rolled").rotation, (-HALF, 0, 0, HALF))
     assert same_rotation(rolled.rotation_quat, (-HALF, 0, 0, HALF))
-    assert both.rotation_quat == row(world, "both").rotation_quat == (0, 0, 0, 1)
+    assert both.rotation_quat == row(world, "both").rotation == (0, 0, 0, 1)
 
 
 @pytest.mark.parametrize(
@@ -497,7 +508,7 @@ def test_rotations_are_understood_in_mujocos_frame(bot: str, world: World) -> No
         ({"location": (math.nan, 0.0, 0.0)}, "location"),
     ],
 )
-def test_a_pose_that_is_none_is_refused(bot: str, world: World, pose: dict[str, Any], text: str) -> None:
+def test_a_pose_that_is_none_is_refused(bot: str, world: EditorWorld, pose: dict[str, Any], text: str) -> None:
     refused = refusal(world.spawn_actor, bot, "a", **pose)
 
     assert refused.code == "spawn_failed"
@@ -505,7 +516,7 @@ def test_a_pose_that_is_none_is_refused(bot: str, world: World, pose: dict[str, 
     assert world.list_actors() == []
 
 
-def test_what_is_missing_is_named(bot: str, world: World) -> None:
+def test_what_is_missing_is_named(bot: str, world: EditorWorld) -> None:
     assert refusal(world.spawn_actor, "").code == "missing_field"
     assert refusal(world.spawn_grid, bot, "", 1, 1).code == "missing_field"
     for op in (world.destroy_actor, world.set_actor_transform, world.get_actor_bounds, world.select_actor):
@@ -516,18 +527,18 @@ def test_what_is_missing_is_named(bot: str, world: World) -> None:
     assert refusal(world.load_level, "").code == "missing_field"
 
 
-def test_a_grid_is_placed_x_first(ball: str, world: World) -> None:
+def test_a_grid_is_placed_x_first(ball: str, world: EditorWorld) -> None:
     placed = world.spawn_grid(ball, "g", 2, 3, spacing=(1, 2, 9), origin=(10, 20, 30))
 
-    assert [cell.actor_id for cell in placed] == ["g_0_0", "g_1_0", "g_0_1", "g_1_1", "g_0_2", "g_1_2"]
-    assert placed[3].location == (11, 22, 30)
+    assert [cell.actor.actor_id for cell in placed] == ["g_0_0", "g_1_0", "g_0_1", "g_1_1", "g_0_2", "g_1_2"]
+    assert placed[3].actor.location == (11, 22, 30)
     assert names(world.list_actors()) == ["ball", "ball_1", "ball_2", "ball_3", "ball_4", "ball_5"]
     again = world.spawn_grid(ball, "g", 3, 1)
     assert [cell.was_existing for cell in again] == [True, True, False]
     assert len(world.list_actors()) == 7
 
 
-def test_a_grid_that_cannot_be_placed_whole_is_not_placed(bot: str, ball: str, world: World) -> None:
+def test_a_grid_that_cannot_be_placed_whole_is_not_placed(bot: str, ball: str, world: EditorWorld) -> None:
     world.spawn_actor(bot, "g_1_1")
 
     assert refusal(world.spawn_grid, ball, "g", 2, 2).code == "spawn_failed"
@@ -544,30 +555,31 @@ def test_a_grid_that_cannot_be_placed_whole_is_not_placed(bot: str, ball: str, w
         ((2**40, 2**40), "too_many_cells"),
     ],
 )
-def test_a_grid_has_limits(ball: str, world: World, counts: tuple[int, int], code: str) -> None:
+def test_a_grid_has_limits(ball: str, world: EditorWorld, counts: tuple[int, int], code: str) -> None:
     assert refusal(world.spawn_grid, ball, "g", *counts).code == code
 
 
-def test_the_largest_grid_fits(ball: str, world: World) -> None:
+def test_the_largest_grid_fits(ball: str, world: EditorWorld) -> None:
     assert len(world.spawn_grid(ball, "g", 32, 32)) == 1024
 
 
-def test_lights_are_added_each_time(world: World) -> None:
+def test_lights_are_added_each_time(world: EditorWorld) -> None:
     first = world.spawn_light("SPOT", "lamp", location=(1, 2, 3), rotation_euler=(1, -30, 45), color=(0.1, 0.2, 0.3))
     second = world.spawn_light("spot", "lamp")
 
-    assert (first.kind, first.actor_name, second.actor_name) == ("spot", "SpotLight_0", "SpotLight_1")
-    assert first.color == pytest.approx((0.1, 0.2, 0.3))
-    assert first.color[0] == 0.10000000149011612  # single precision, as the plugin echoes it
-    assert first.rotation_euler == (1, -30, 45)
+    assert (first.name, second.name) == ("SpotLight_0", "SpotLight_1")
+    assert first.light is not None
+    assert first.light.kind == "spot"
+    assert first.light.color == pytest.approx((0.1, 0.2, 0.3))
+    assert first.light.color[0] == 0.10000000149011612  # single precision, as the plugin echoes it
     listed = world.list_actors()
     assert [item.label for item in listed] == ["SpotLight", "SpotLight2"]
-    assert all(item.is_light and item.tags == ("URLab.ActorId=lamp",) for item in listed)
+    assert all(item.kind is ActorKind.LIGHT and item.tags == ("URLab.ActorId=lamp",) for item in listed)
     assert refusal(world.spawn_light, "sun").code == "spawn_failed"
     assert refusal(world.spawn_light, "point", intensity=math.nan).code == "spawn_failed"
 
 
-def test_there_is_one_manager(world: World) -> None:
+def test_there_is_one_manager(world: EditorWorld) -> None:
     assert not world.has_manager
     first, existed = world.ensure_manager()
     second, existed_again = world.ensure_manager()
@@ -581,15 +593,15 @@ def test_there_is_one_manager(world: World) -> None:
 # Editing
 
 
-def test_a_transform_changes_the_parts_it_names(bot: str, world: World) -> None:
+def test_a_transform_changes_the_parts_it_names(bot: str, world: EditorWorld) -> None:
     world.spawn_actor(bot, "a", location=(1, 2, 3), rotation_quat=(0, 0, HALF, HALF))
 
     world.set_actor_transform("a", location=(4, 5, 6))
     assert row(world, "a").location == (4, 5, 6)
-    assert same_rotation(row(world, "a").rotation_quat, (0, 0, HALF, HALF))
+    assert same_rotation(row(world, "a").rotation, (0, 0, HALF, HALF))
     world.set_actor_transform("bot", rotation_quat=(0, 3, 0, 0))
     assert row(world, "a").location == (4, 5, 6)
-    assert row(world, "a").rotation_quat == (0, 1, 0, 0)
+    assert row(world, "a").rotation == (0, 1, 0, 0)
     assert world.set_actor_transform("a").name == "bot"
 
     code = "set_actor_transform_failed"
@@ -598,7 +610,7 @@ def test_a_transform_changes_the_parts_it_names(bot: str, world: World) -> None:
     assert refusal(world.set_actor_transform, "a", location=(0, math.nan, 0)).code == code
 
 
-def test_the_first_actor_with_the_id_or_name_is_meant(bot: str, world: World) -> None:
+def test_the_first_actor_with_the_id_or_name_is_meant(bot: str, world: EditorWorld) -> None:
     world.spawn_actor(bot, "bot_1")
     world.spawn_actor(bot, "other")  # its object name is bot_1
 
@@ -609,35 +621,35 @@ def test_the_first_actor_with_the_id_or_name_is_meant(bot: str, world: World) ->
     assert world.actor("bot") is None
 
 
-def test_a_copy_has_the_rotation_of_its_source_and_stands_beside_it(bot: str, world: World) -> None:
+def test_a_copy_has_the_rotation_of_its_source_and_stands_beside_it(bot: str, world: EditorWorld) -> None:
     world.spawn_actor(bot, "a", location=(1, 2, 3), rotation_quat=(0, 0, HALF, HALF))
 
     copy = world.duplicate_actor("a", "b")
 
-    assert copy.location == (2, 2, 3)
-    assert same_rotation(row(world, "b").rotation_quat, (0, 0, HALF, HALF))
-    assert copy.blueprint_class_path == bot
+    assert copy.actor.location == (2, 2, 3)
+    assert same_rotation(row(world, "b").rotation, (0, 0, HALF, HALF))
+    assert copy.actor.class_path == bot
     assert world.duplicate_actor("a", "b", location=(9, 9, 9)).was_existing
     assert row(world, "b").location == (9, 9, 9)
     assert len(world.list_actors()) == 2
 
 
-def test_lights_can_be_copied_and_managers_cannot(bot: str, world: World) -> None:
+def test_lights_can_be_copied_and_managers_cannot(bot: str, world: EditorWorld) -> None:
     world.spawn_light("point", "lamp", color=(1, 0, 0))
     world.spawn_actor(bot, "a")
     manager, _ = world.ensure_manager()
 
     copy = world.duplicate_actor("lamp", "lamp2")
 
-    assert row(world, "lamp2").is_light
-    assert copy.actor_name == "PointLight_1"
+    assert row(world, "lamp2").kind is ActorKind.LIGHT
+    assert copy.actor.name == "PointLight_1"
     assert refusal(world.duplicate_actor, "lamp", "a").code == "duplicate_failed"
     assert refusal(world.duplicate_actor, manager.name, "m").code == "duplicate_failed"
     assert refusal(world.duplicate_actor, "nobody", "n").code == "duplicate_failed"
 
 
-def test_a_destroyed_actor_is_gone(desk: Desk, bot: str) -> None:
-    world = load(desk, HEAD | {"actors": [BOX, BOX | {"name": "lid", "parent": "crate"}]})
+def test_a_destroyed_actor_is_gone(workspace: Workspace, bot: str) -> None:
+    world = load(workspace, HEAD | {"actors": [BOX, BOX | {"name": "lid", "parent": "crate"}]})
     world.select_actor("crate")
 
     world.destroy_actor("crate")
@@ -648,7 +660,7 @@ def test_a_destroyed_actor_is_gone(desk: Desk, bot: str) -> None:
     assert refusal(world.destroy_actor, "crate").code == "destroy_failed"
 
 
-def test_one_actor_is_selected(bot: str, world: World) -> None:
+def test_one_actor_is_selected(bot: str, world: EditorWorld) -> None:
     world.spawn_actor(bot, "a")
     world.spawn_actor(bot, "b")
 
@@ -660,7 +672,7 @@ def test_one_actor_is_selected(bot: str, world: World) -> None:
 # Looking
 
 
-def test_filters_narrow_down_together_and_know_no_letter_case(bot: str, ball: str, world: World) -> None:
+def test_filters_narrow_down_together_and_know_no_letter_case(bot: str, ball: str, world: EditorWorld) -> None:
     world.spawn_actor(bot, "a")
     world.spawn_actor(ball, "b")
     world.spawn_light("point", "lamp")
@@ -682,11 +694,12 @@ def test_filters_narrow_down_together_and_know_no_letter_case(bot: str, ball: st
     assert found(class_filter="AMjManager") == ["AMjManager_0"]
 
 
-def test_play_shows_the_level_as_it_was_at_its_start(bot: str, ball: str, world: World) -> None:
+def test_play_shows_the_level_as_it_was_at_its_start(bot: str, ball: str, world: EditorWorld) -> None:
     world.spawn_actor(bot, "a")
     editor = world.snapshot()
-    assert editor[0].names is not None
-    assert editor[0].names.joints == ("root", "j")
+    described = snapshot_row(editor[0], compiled=False).urlab
+    assert described is not None
+    assert described.joints == ["root", "j"]
     world.freeze()
     world.pie_running = True
     world.spawn_actor(ball, "b")
@@ -696,11 +709,12 @@ def test_play_shows_the_level_as_it_was_at_its_start(bot: str, ball: str, world:
 
     assert [item.class_name for item in play] == ["bot_C", "MjReplayManager"]
     assert play[0].location == (0, 0, 0)
-    assert play[0].names is not None
-    assert play[0].names.joints == ("bot_root", "bot_j")
-    assert play[0].names.actuators == ("bot_m",)
-    assert play[0].names.sensors == ("bot_s",)
-    assert play[0].names.cameras == ("cam",)
+    described = snapshot_row(play[0], compiled=True).urlab
+    assert described is not None
+    assert described.joints == ["bot_root", "bot_j"]
+    assert described.actuators == ["bot_m"]
+    assert described.sensors == ["bot_s"]
+    assert described.cameras == ["cam"]
     assert names(world.list_actors()) == ["bot", "ball"]
     rows, in_play = world.find_actors(class_filter="Pawn", in_pie=True)
     assert (names(rows), in_play) == (["bot"], True)
@@ -716,13 +730,13 @@ def test_play_shows_the_level_as_it_was_at_its_start(bot: str, ball: str, world:
     assert world.shown_level() == "/Game/Levels/lab"
 
 
-def test_bounds_hold_the_geoms_at_the_authored_pose(desk: Desk, world: World) -> None:
+def test_bounds_hold_the_geoms_at_the_authored_pose(workspace: Workspace, world: EditorWorld) -> None:
     text = mjcf(
         '<geom name="floor" type="plane" size="1 1 1"/>'
         '<body name="b" pos="0 0 1"><freejoint/><geom type="box" size="0.1 0.2 0.3"/>'
         '<geom type="sphere" size="0.1" pos="1 0 0" contype="0" conaffinity="0"/></body>'
     )
-    world.spawn_actor(desk.blueprint("boxed", text), "a", location=(10, 0, 0), rotation_euler=(0, 0, 90))
+    world.spawn_actor(workspace.blueprint("boxed", text), "a", location=(10, 0, 0), rotation_euler=(0, 0, 90))
 
     solid = world.get_actor_bounds("a")
     every = world.get_actor_bounds("a", components_only=True)
@@ -735,10 +749,10 @@ def test_bounds_hold_the_geoms_at_the_authored_pose(desk: Desk, world: World) ->
     assert refusal(world.get_actor_bounds, "b").code == "get_actor_bounds_failed"
 
 
-def test_bounds_of_meshes_follow_the_mesh(desk: Desk, world: World) -> None:
-    write_obj(desk.models / "part.obj", 0.4)
+def test_bounds_of_meshes_follow_the_mesh(workspace: Workspace, world: EditorWorld) -> None:
+    write_obj(workspace.models / "part.obj", 0.4)
     text = mjcf('<body name="b"><geom type="mesh" mesh="part"/></body>', head='<asset><mesh file="part.obj"/></asset>')
-    world.spawn_actor(desk.blueprint("meshy", text), "a", location=(0, 0, 2))
+    world.spawn_actor(workspace.blueprint("meshy", text), "a", location=(0, 0, 2))
 
     bounds = world.get_actor_bounds("a")
 
@@ -748,10 +762,10 @@ def test_bounds_of_meshes_follow_the_mesh(desk: Desk, world: World) -> None:
     assert bounds.max[2] < 2.7
 
 
-def test_lights_managers_and_bare_models_have_no_bounds(desk: Desk, world: World) -> None:
+def test_lights_managers_and_bare_models_have_no_bounds(workspace: Workspace, world: EditorWorld) -> None:
     world.spawn_light(actor_id="lamp")
     manager, _ = world.ensure_manager()
-    world.spawn_actor(desk.blueprint("floor", mjcf('<geom type="plane" size="1 1 1"/>')), "floor")
+    world.spawn_actor(workspace.blueprint("floor", mjcf('<geom type="plane" size="1 1 1"/>')), "floor")
 
     for key in ("lamp", manager.name, "floor"):
         assert world.get_actor_bounds(key).extents == (0, 0, 0)
@@ -760,8 +774,8 @@ def test_lights_managers_and_bare_models_have_no_bounds(desk: Desk, world: World
 # Quick Convert
 
 
-def test_a_mesh_is_converted_with_the_settings_of_the_last_call(desk: Desk) -> None:
-    world = load(desk, HEAD | {"actors": [BOX]})
+def test_a_mesh_is_converted_with_the_settings_of_the_last_call(workspace: Workspace) -> None:
+    world = load(workspace, HEAD | {"actors": [BOX]})
 
     world.add_quick_convert("crate", static=True, coacd_threshold=0.1, friction=(0.5, 0.1, 0.1))
     settings_ = row(world, "crate").quick_convert
@@ -777,9 +791,9 @@ def test_a_mesh_is_converted_with_the_settings_of_the_last_call(desk: Desk) -> N
     assert refusal(world.remove_quick_convert, "crate").code == "remove_quick_convert_failed"
 
 
-def test_only_meshes_are_converted(desk: Desk, bot: str) -> None:
+def test_only_meshes_are_converted(workspace: Workspace, bot: str) -> None:
     plane = BOX | {"name": "ground", "mesh": {"shape": "plane", "size": [1, 1]}}
-    world = load(desk, HEAD | {"actors": [BOX, plane]})
+    world = load(workspace, HEAD | {"actors": [BOX, plane]})
     world.spawn_actor(bot, "a")
     code = "add_quick_convert_failed"
 
@@ -790,7 +804,7 @@ def test_only_meshes_are_converted(desk: Desk, bot: str) -> None:
     assert world.add_quick_convert("ground", static=True).quick_convert is not None
 
 
-def test_play_gets_the_actors_in_spawn_order(bot: str, ball: str, world: World) -> None:
+def test_play_gets_the_actors_in_spawn_order(bot: str, ball: str, world: EditorWorld) -> None:
     for path in (ball, bot, ball):
         world.spawn_actor(path)
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 
-from urlab_client.server.content import ContentRoot
-from urlab_client.server.world import ActorNames, World
+from urlab_client.server.assets.content import ContentRoot
+from urlab_client.server.editor.world import ActorNames, EditorWorld
 
 GYMNASIUM = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 DATA = Path(__file__).parent / "data"
@@ -45,7 +45,7 @@ def mjcf(body: str, *, model: str = "", head: str = "", tail: str = "") -> str:
 BALL_BODY = '<body name="ball" pos="0 0 1"><freejoint name="root"/><geom size="0.1" mass="1"/></body>'
 
 
-class Desk:
+class Workspace:
     """A world on temporary folders: `models` is the only model root, `saved` the content root."""
 
     def __init__(self, folder: Path, *, actor_names: ActorNames = "model") -> None:
@@ -53,7 +53,7 @@ class Desk:
         self.saved = folder / "saved"
         self.models.mkdir(parents=True, exist_ok=True)
         self.content = ContentRoot(self.saved, model_roots=[self.models])
-        self.world = World(self.content, actor_names=actor_names)
+        self.world = EditorWorld(self.content, actor_names=actor_names)
 
     def write(self, name: str, text: str) -> Path:
         path = self.models / name

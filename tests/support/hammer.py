@@ -18,7 +18,7 @@ from pathlib import Path
 
 from urlab_client.protocol.fence import processor_fence
 from urlab_client.protocol.shm import Region, attach
-from urlab_client.server.region_files import RegionFile, RequestFile
+from urlab_client.server.transport.region_files import RegionFile, RequestFile
 
 WORDS = (8, 40, 100)
 STRIDE = 1024

@@ -20,6 +20,8 @@ def sample(kind: Any) -> Any:
             return "text"
         case msgspec.inspect.LiteralType(values=values):
             return values[0]
+        case msgspec.inspect.EnumType(cls=cls):
+            return next(iter(cls))
         case msgspec.inspect.BoolType():
             return True
         case msgspec.inspect.IntType():

@@ -395,7 +395,7 @@ class TestResult:
             client.fail(LookupError("x"))
         frames = traceback.extract_tb(caught.value.__traceback__)
         assert [frame.name for frame in frames[1:]] == ["fail", "call", "fail"]
-        assert frames[1].line == "self._portal.call(self._aio.fail(error))"
+        assert frames[1].line == "self._portal.call(self._aio.fail, error)"
 
     def test_closing(self, lab: Callable[[str], ModuleType]) -> None:
         client = lab("sync.client").Client()

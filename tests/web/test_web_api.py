@@ -21,7 +21,7 @@ from urlab_client.aio import URLabClient
 from urlab_client.protocol.registry import OPS
 from urlab_client.server import SimulatedServer
 from urlab_client.web import Access, app
-from urlab_client.web.lease import Lease, NotDriving, Viewer
+from urlab_client.web.driving_lease import DrivingLease, NotDriving, Viewer
 
 
 @pytest.fixture(scope="module")
@@ -336,7 +336,7 @@ def test_it_can_be_mounted_in_a_backend_that_has_its_own_door(server: SimulatedS
 
 def test_the_controls_are_lost_by_not_using_them() -> None:
     now = 0.0
-    lease = Lease(10.0, clock=lambda: now)
+    lease = DrivingLease(10.0, clock=lambda: now)
     ann, bob = Viewer("a", "Ann"), Viewer("b", "Bob")
     lease.use(ann)
     now = 9.0

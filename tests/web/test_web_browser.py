@@ -23,6 +23,8 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.remote.webelement import WebElement
 from selenium.webdriver.support.ui import WebDriverWait
 
+pytestmark = pytest.mark.browser
+
 FLAGS = (
     "--headless", "--no-sandbox", "--disable-quic", "--no-first-run", "--window-size=1300,900",
     "--disable-background-networking", "--disable-component-update", "--disable-sync",

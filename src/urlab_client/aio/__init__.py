@@ -5,7 +5,7 @@ from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.controllers import URLabController, URLabPDController
 from urlab_client.aio.deadline import DEFAULT
-from urlab_client.aio.handles import Actuator, Body, Joint, Sensor
+from urlab_client.aio.model.elements import Actuator, Body, Joint, Sensor
 from urlab_client.aio.streams import Stream
 
 __all__ = [

@@ -8,10 +8,10 @@ import numpy as np
 
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.controllers import URLabController, make_controller
-from urlab_client.aio.handles import Actuator, Body, Handles, Joint, Sensor, make_handles
-from urlab_client.aio.layout import ArticulationLayout
-from urlab_client.aio.publishers import Publishers
-from urlab_client.aio.records import ArticulationRecord, EntityRecord
+from urlab_client.aio.live.publishers import Publishers
+from urlab_client.aio.model.articulation_state import MirroredArticulation, MirroredEntity
+from urlab_client.aio.model.elements import Actuator, ArticulationElements, Body, Joint, Sensor, make_elements
+from urlab_client.aio.model.layout import ArticulationLayout
 from urlab_client.aio.session import Session
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.enums import ControlMode
@@ -33,7 +33,7 @@ class URLabEntity:
     that steps, several values belong together only under `client._data_lock`.
     """
 
-    def __init__(self, record: EntityRecord) -> None:
+    def __init__(self, record: MirroredEntity) -> None:
         self._record = record
 
     @property
@@ -153,14 +153,14 @@ class URLabArticulation(URLabEntity):
     are found, too. Without a local model only actuators and cameras are known.
     """
 
-    _record: ArticulationRecord
+    _record: MirroredArticulation
 
-    def __init__(self, record: ArticulationRecord, session: Session, publishers: Publishers) -> None:
+    def __init__(self, record: MirroredArticulation, session: Session, publishers: Publishers) -> None:
         super().__init__(record)
         self._session = session
         self._publishers = publishers
         self._controller: tuple[ControllerInfo, URLabController] | None = None
-        self._handles: tuple[ArticulationLayout, Handles] | None = None
+        self._handles: tuple[ArticulationLayout, ArticulationElements] | None = None
         self._cameras: NameMap[URLabCameraView] = NameMap()
 
     @property
@@ -357,10 +357,10 @@ class URLabArticulation(URLabEntity):
             raise ValueError(f"{self.prefix}: name the body: without a local model its root is not known")
         self._record.apply_wrench(body, _wrench(force, torque))
 
-    def _made(self) -> Handles:
+    def _made(self) -> ArticulationElements:
         layout = self._record.layout
         if self._handles is None or self._handles[0] is not layout:
-            self._handles = layout, make_handles(self._record)
+            self._handles = layout, make_elements(self._record)
         return self._handles[1]
 
 

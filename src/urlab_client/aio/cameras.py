@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.publishers import Publishers, SharedFrame
-from urlab_client.aio.reception import Pictures
+from urlab_client.aio.live.live_state import LatestPicture
+from urlab_client.aio.live.publishers import Publishers, SharedFrame
 from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS, Stream
 from urlab_client.protocol.enums import CameraMode, known
 from urlab_client.protocol.messages.session import CameraInfo
@@ -34,7 +34,7 @@ class URLabCameraView:
         self.delivered = True
         self._publishers = publishers
         # Fed by the client. Not declared above, so that the façade has none.
-        self.pictures = Pictures(publishers.camera(self))
+        self.pictures = LatestPicture(publishers.camera(self))
 
     @property
     def latest_frame(self) -> Pixels | None:
@@ -80,8 +80,9 @@ class URLabCameraView:
             policy: `latest`, or `all` within the buffer.
             buffer: Pictures that may wait, with `all`.
             buffer_bytes: Bytes that may wait, with `all`.
-            timeout: Seconds that iterating waits for each picture; by default the client's for the first one and then
-                without limit; None waits.
+            timeout: Seconds that iterating waits for each picture; by default the client's for the first one, or 30
+                where that is less and the server is there and in live mode (it may still be looking for OpenGL), and
+                then without limit; None waits.
 
         Raises:
             ValueError: Unknown policy, or an empty buffer.

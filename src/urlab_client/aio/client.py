@@ -18,26 +18,26 @@ from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.explain import diagnose
 from urlab_client.aio.launch import SCHEME, LaunchedTransport
-from urlab_client.aio.mirror import model_names
+from urlab_client.aio.live.publishers import Publishers
+from urlab_client.aio.model.mirror import model_names
 from urlab_client.aio.namespaces.debug import DebugNamespace
+from urlab_client.aio.namespaces.farm import FarmNamespace
 from urlab_client.aio.namespaces.outliner import OutlinerNamespace
 from urlab_client.aio.namespaces.recording import RecordingNamespace, ReplayNamespace
 from urlab_client.aio.namespaces.runtime import RuntimeNamespace
 from urlab_client.aio.namespaces.scene import SceneNamespace
 from urlab_client.aio.namespaces.sim import SimNamespace
 from urlab_client.aio.namespaces.viewport import ViewportNamespace
-from urlab_client.aio.publishers import Publishers
-from urlab_client.aio.recovery import leaves_open, resync
 from urlab_client.aio.session import Session
-from urlab_client.aio.state import SimState
-from urlab_client.aio.stepping import take_steps
+from urlab_client.aio.state.connection_monitor import ConnectionMonitor
+from urlab_client.aio.state.recovery import leaves_open, resync
+from urlab_client.aio.state.sim_state import SimState
+from urlab_client.aio.state.stepping import take_steps
 from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS, Stream
-from urlab_client.aio.transport.base import Transport as TransportProtocol
-from urlab_client.aio.transport.base import TransportStats
+from urlab_client.aio.transport.base import RequestTransport, TransportStats
 from urlab_client.aio.transport.curve import ClientKeys, client_keys, is_local
-from urlab_client.aio.transport.shm import SharedMemory, ShmTransport
+from urlab_client.aio.transport.shm import SharedMemoryRegions, ShmTransport
 from urlab_client.aio.transport.zmq import ZmqTransport
-from urlab_client.aio.watch import Watch
 from urlab_client.protocol.base import Reply, Request
 from urlab_client.protocol.enums import CameraTiming, ObservationLevel, StepMode, Transport
 from urlab_client.protocol.errors import UnknownKeyframe, URLabError
@@ -156,7 +156,7 @@ class URLabClient:
         if rcv_timeout_ms <= 0:
             raise ValueError(f"rcv_timeout_ms must be above 0, got {rcv_timeout_ms}")
         keys = client_keys(address, self._config.server_key, self._config.client_key)
-        memory = SharedMemory(shm_dir) if Transport(transport) is Transport.SHM else None
+        memory = SharedMemoryRegions(shm_dir) if Transport(transport) is Transport.SHM else None
         plain = _transport(address, step_port, keys, shm=memory is not None)
         self._transport = plain if memory is None else ShmTransport(plain, memory)
         self._session = Session(self._transport, default_timeout=rcv_timeout_ms / 1000, json=encoding == "json")
@@ -164,6 +164,7 @@ class URLabClient:
             lambda: self._transport.endpoint,
             lambda: self._transport.state_port or state_port,
             default_timeout=rcv_timeout_ms / 1000,
+            live=lambda: self._state.mode is StepMode.LIVE,
             keys=keys,
             memory=memory,
         )
@@ -177,8 +178,8 @@ class URLabClient:
             trusted=trust_server or keys is not None or is_local(address),
             live_pictures=live_pictures,
         )
-        self._watch = Watch(self._session, self._state)
-        self._transport.on_event = self._watch.on_line
+        self._watch = ConnectionMonitor(self._session, self._state)
+        self._transport.on_event = self._watch.on_connection
         self._closed = False
         self._scene = SceneNamespace(self._session)
         self._sim = SimNamespace(self._session, self._state)
@@ -186,6 +187,7 @@ class URLabClient:
         self._outliner = OutlinerNamespace(self._session)
         self._debug = DebugNamespace(self._session)
         self._viewport = ViewportNamespace(self._session)
+        self._farm = FarmNamespace(self._session)
         self._recording = RecordingNamespace(self._session)
         self._replay = ReplayNamespace(self._session)
 
@@ -220,6 +222,11 @@ class URLabClient:
     def viewport(self) -> ViewportNamespace:
         """The editor's perspective viewport."""
         return self._viewport
+
+    @property
+    def farm(self) -> FarmNamespace:
+        """Sharing servers among clients."""
+        return self._farm
 
     @property
     def recording(self) -> RecordingNamespace:
@@ -451,9 +458,9 @@ class URLabClient:
                 state.absorb_reset(reply, request.keyframe_name)
             except BaseException as error:
                 if turn.sent and leaves_open(error):
-                    state.doubts.add_reset(state, request.keyframe_name)
+                    state.pending.add_reset(state, request.keyframe_name)
                 raise
-            state.doubts.clear()
+            state.pending.clear()
             return reply
 
     async def resync(self, *, timeout: Timeout = DEFAULT) -> Resync:
@@ -637,7 +644,7 @@ class URLabClient:
         raise UnknownKeyframe("unknown_keyframe", f"{problem}. Nothing was sent.", op="reset")
 
 
-def _transport(address: str, step_port: int, keys: ClientKeys | None, *, shm: bool) -> TransportProtocol:
+def _transport(address: str, step_port: int, keys: ClientKeys | None, *, shm: bool) -> RequestTransport:
     if address.startswith(SCHEME):
         return LaunchedTransport(address, shm=shm)
     scheme, separator, rest = address.partition("://")

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any, cast
 
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.protocol.enums import ControllerKind, known
-from urlab_client.protocol.errors import ControllerSchemaViolation
+from urlab_client.protocol.errors import ControllerSchemaViolation, ProtocolError
 from urlab_client.protocol.messages.runtime import ConfigureController
 from urlab_client.protocol.messages.session import ControllerInfo
 
 if TYPE_CHECKING:
     from urlab_client.aio.session import Session
 
-__all__ = ["URLabController", "URLabPDController", "make_controller"]
+__all__ = ["URLabController", "URLabPDController", "check_controller", "make_controller"]
 
 _GAINS = ("kp", "kv", "torque_limit")
 
@@ -68,6 +68,7 @@ class URLabController:
     async def _push(self, params: dict[str, Any], timeout: Timeout) -> dict[str, Any]:
         async with self._session.turn(ConfigureController, timeout=timeout) as turn:
             reply = await turn.call(ConfigureController(articulation=self._prefix, params=params))
+            _check_gains(self._prefix, self._info.kind, reply.params, "configure_controller")
             # In place, so that views handed out before stay current.
             self._info.params.clear()
             self._info.params.update(reply.params)
@@ -164,6 +165,30 @@ def make_controller(session: Session, prefix: str, info: ControllerInfo) -> URLa
     return (URLabPDController if info.kind == ControllerKind.PD else URLabController)(session, prefix, info)
 
 
+def check_controller(prefix: str, info: ControllerInfo) -> None:
+    """Check what a handshake says of a controller.
+
+    Raises:
+        ProtocolError: Gains of a PD controller are not numbers by actuator, or a least value is not a number.
+    """
+    _check_gains(prefix, info.kind, info.params, "hello")
+    for name, rule in info.schema.items():
+        low = rule.get("min")
+        if low is not None and not _is_number(low):
+            raise ProtocolError(f"hello: {low!r} as the least {name} of the controller of {prefix!r}.", op="hello")
+
+
+def _check_gains(prefix: str, kind: str, params: Mapping[str, Any], op: str) -> None:
+    for name in _GAINS if kind == ControllerKind.PD else ():
+        gains = params.get(name, {})
+        if not (isinstance(gains, dict) and all(map(_is_number, cast("dict[str, Any]", gains).values()))):
+            raise ProtocolError(f"{op}: {name} of the controller of {prefix!r} is {gains!r:.60}.", op=op)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
 def _check_params(
     prefix: str, schema: Mapping[str, Any], current: Mapping[str, Any], params: Mapping[str, Any]
 ) -> None:
@@ -190,7 +215,7 @@ def _check_params(
 
 
 def _check_number(prefix: str, what: str, value: Any, rule: Mapping[str, Any]) -> None:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
+    if not _is_number(value):
         raise _violation(prefix, f"{what} takes a number, got {value!r}")
     low = rule.get("min")
     if low is not None and not value >= low:

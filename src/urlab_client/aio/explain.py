@@ -14,7 +14,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from urlab_client.aio.session import Session
-from urlab_client.aio.state import SimState
+from urlab_client.aio.state.sim_state import SimState
 from urlab_client.protocol.enums import ControlMode, PIEState, StepMode
 from urlab_client.protocol.errors import RPC_ERRORS, SessionTakenOver, URLabError
 from urlab_client.protocol.messages.session import Meta
@@ -139,7 +139,7 @@ async def _play(session: Session, state: SimState) -> tuple[Finding, bool]:
             PIEState.OFF: "Call sim.start().",
             PIEState.COMPILING: "Wait, or check that the level has a manager: scene.ensure_manager().",
             PIEState.COMPILE_FAILED: f"MuJoCo says: {second.compile_error}",
-        }.get(PIEState(second.state), "")
+        }.get(second.state, "")
         return Finding(Verdict.PROBLEM, "play", f"Play is {second.state}. {advice}".strip()), False
     runs = second.sim_time != first.sim_time
     if state.mode is StepMode.LIVE and not runs:

@@ -106,7 +106,7 @@ class LaunchedTransport:
     async def request(
         self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
     ) -> bytes:
-        """See `Transport.request`. The first request also starts the server, which its deadline does not cover.
+        """See `RequestTransport.request`. The first request also starts the server, which its deadline does not cover.
 
         When the server has died, a handshake starts another one; anything else would be refused by it anyway.
         """
@@ -159,16 +159,17 @@ class LaunchedTransport:
                 await process.wait()
         except TimeoutError:
             log.warning("%s: the server did not end within %g s and was killed", self._address, _STOP_S)
+        finally:  # cancelled, too: whoever does not wait any longer leaves no process and no pipes behind
             _kill(process)
             await process.wait()
-        # A pipe that asyncio has not seen the end of when its loop is closed makes it complain at some later time.
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(_STOP_S):
-                if drain is not None:
-                    await drain
-                for pipe in (process.stdout, process.stderr):
-                    if pipe is not None:
-                        await pipe.read()
+            # A pipe that asyncio has not seen the end of when its loop is closed makes it complain at some later time.
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(_STOP_S):
+                    if drain is not None:
+                        await drain
+                    for pipe in (process.stdout, process.stderr):
+                        if pipe is not None:
+                            await pipe.read()
 
     async def _started(self, op: Op) -> ZmqTransport:
         """Start a server in a task of its own, which `aclose` can break off as well as who waits for it."""

@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import Any, NamedTuple, Self, TypeVar
 
 from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.transport.base import Transport
+from urlab_client.aio.transport.base import RequestTransport
 from urlab_client.protocol.base import Needs, Op, Reply, Request
 from urlab_client.protocol.codec import check_request, decode_reply, encode_request, op_of
 from urlab_client.protocol.errors import (
@@ -22,6 +22,7 @@ from urlab_client.protocol.errors import (
     URLabRPCError,
     URLabTimeoutError,
 )
+from urlab_client.protocol.features import Features
 from urlab_client.protocol.messages.session import Hello, HelloOk, Meta
 
 __all__ = ["Session", "Turn"]
@@ -39,6 +40,9 @@ class Limits(NamedTuple):
     connect_by: float | None
 
 
+_UNLISTED = frozenset({"hello", "meta"})  # every server has them, none lists them
+
+
 class Session:
     """A session with one server.
 
@@ -49,7 +53,7 @@ class Session:
     Attributes:
         session_id: Id of the open session; empty without one.
         greeted: Whether a handshake was sent, with whatever outcome.
-        offered: Ops the server lists, or None before it was asked.
+        features: What the server can do, as far as its answers have shown.
         on_opened: Told of each session that was opened, also by a handshake that its caller had given up.
         on_refusal: Told of each refusal before it is raised.
         confirmed: Whether the server has answered within this session since the connection was made. It may be another
@@ -58,10 +62,10 @@ class Session:
         turns: Held by the `Turn` under way.
     """
 
-    def __init__(self, transport: Transport, *, default_timeout: float | None, json: bool = False) -> None:
+    def __init__(self, transport: RequestTransport, *, default_timeout: float | None, json: bool = False) -> None:
         self.session_id = ""
         self.greeted = False
-        self.offered: frozenset[str] | None = None
+        self.features = Features()
         self.on_opened: Callable[[HelloOk], None] | None = None
         self.on_refusal: Callable[[URLabRPCError], None] | None = None
         self.confirmed = False
@@ -77,7 +81,7 @@ class Session:
         self._unanswered = False
 
     @property
-    def transport(self) -> Transport:
+    def transport(self) -> RequestTransport:
         """What carries the requests."""
         return self._transport
 
@@ -139,7 +143,11 @@ class Session:
             request.encoding = "json"
         reply = await turn.call(request)
         # A packaged build lacks the editor's ops, an older server lacks newer ones.
-        self.offered = frozenset(op.name for op in (await turn.call(Meta())).ops)
+        try:
+            listed = [op.name for op in (await turn.call(Meta())).ops]
+        except UnknownOp:
+            listed = None
+        self.features = self.features.with_ops(listed).with_hello(reply)
         return reply
 
     async def aclose(self) -> None:
@@ -152,7 +160,7 @@ class Session:
         Raises:
             UnknownOp: It does not; nothing was sent.
         """
-        if self.offered is not None and op.needs is not Needs.NOTHING and op.name not in self.offered:
+        if op.name not in _UNLISTED and not self.features.offers(op.name):
             raise UnknownOp("unknown_op", "this server does not offer it. Nothing was sent.", op=op.name)
 
     def limits(self, op: Op, timeout: Timeout, since: float, takes: float | None = None) -> Limits:
@@ -236,7 +244,6 @@ class Session:
     def _open(self, hello: HelloOk) -> None:
         self.session_id = hello.session_id
         self.confirmed = True
-        self.offered = None
         self._given_up = None
         self._unanswered = False
         if self.on_opened is not None:

@@ -11,9 +11,9 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Generic, Protocol, Self, TypeVar
 
-from urlab_client.aio.buffers import Buffer, Entry
 from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.transport.subscriber import MessageGone, Sink
+from urlab_client.aio.stream_buffer import BufferedMessage, StreamBuffer
+from urlab_client.aio.transport.subscriber import MessageGone, MessageHandler
 from urlab_client.protocol.errors import (
     ConcurrentReadError,
     ProtocolError,
@@ -43,12 +43,12 @@ class _Source(Protocol[T_co]):
 
     name: str
 
-    def attach(self, sink: Sink) -> None:
-        """Begin to feed `sink`, from the event loop."""
+    def attach(self, handler: MessageHandler) -> None:
+        """Begin to feed `handler`, from the event loop."""
         ...
 
-    def detach(self, sink: Sink) -> None:
-        """Stop feeding `sink`. Idempotent."""
+    def detach(self, handler: MessageHandler) -> None:
+        """Stop feeding `handler`. Idempotent."""
         ...
 
     def wants(self, topic: bytes, payload: BytesLike) -> bool:
@@ -59,12 +59,16 @@ class _Source(Protocol[T_co]):
         """Make an item of a message. Raises `ProtocolError`."""
         ...
 
-    def silence(self, sink: Sink, seconds: float) -> tuple[str, str]:
+    def first_after(self, handler: MessageHandler) -> float:
+        """Return how many seconds the first item may be in coming; 0 where nothing says that it takes long."""
+        ...
+
+    def silence(self, handler: MessageHandler, seconds: float) -> tuple[str, str]:
         """Return why nothing came for so long, and what to do about it."""
         ...
 
 
-class _Channel(Sink, Generic[T]):
+class _StreamChannel(MessageHandler, Generic[T]):
     """Buffer, reader and end of one stream. What receives holds it, and it does not hold the stream: a stream that is
     dropped without being closed can so be collected, and stops receiving then.
 
@@ -73,7 +77,13 @@ class _Channel(Sink, Generic[T]):
     """
 
     def __init__(
-        self, source: _Source[T], buffer: Buffer, *, tolerant: bool, timeout: Timeout, default_timeout: float | None
+        self,
+        source: _Source[T],
+        buffer: StreamBuffer,
+        *,
+        tolerant: bool,
+        timeout: Timeout,
+        default_timeout: float | None,
     ) -> None:
         self.closed = False
         self._source = source
@@ -142,10 +152,7 @@ class _Channel(Sink, Generic[T]):
 
     async def next(self) -> T:
         """Return the next item, within the stream's own limit."""
-        limit = self._timeout
-        if limit is DEFAULT:
-            limit = None if self._delivered else self._default_timeout
-        return await self.receive(limit)
+        return await self.receive(None if self._timeout is DEFAULT and self._delivered else self._timeout)
 
     async def receive(self, timeout: Timeout) -> T:
         """Return the next item within `timeout` seconds."""
@@ -244,7 +251,7 @@ class _Channel(Sink, Generic[T]):
             item.dropped, item.gap = entry.dropped, entry.gap
             return item
 
-    def _decoded(self, entry: Entry) -> T | None:
+    def _decoded(self, entry: BufferedMessage) -> T | None:
         """Return the item of a message, None if it is malformed."""
         with self._lock:
             if entry.item is not None or entry.malformed:
@@ -278,6 +285,12 @@ class _Channel(Sink, Generic[T]):
                 if item is not None:
                     return item
                 if self._expired and seconds is not None:
+                    more = self._source.first_after(self) - seconds
+                    if timeout is DEFAULT and self._arrived is None and more > 0.0:
+                        self._expired = False
+                        seconds += more
+                        timer = loop.call_later(more, self._expire)
+                        continue
                     problem, advice = self._source.silence(self, seconds)
                     raise URLabTimeoutError(f"{self._source.name}: {problem}", hint=advice)
         finally:
@@ -344,8 +357,10 @@ class Stream(Generic[T]):
         Raises:
             ValueError: Unknown policy, or a limit below 1.
         """
-        kept = Buffer(StreamPolicy(policy), buffer, buffer_bytes)
-        self._channel = _Channel(source, kept, tolerant=tolerant, timeout=timeout, default_timeout=default_timeout)
+        kept = StreamBuffer(StreamPolicy(policy), buffer, buffer_bytes)
+        self._channel = _StreamChannel(
+            source, kept, tolerant=tolerant, timeout=timeout, default_timeout=default_timeout
+        )
         if eager:
             self._channel.attach()
 
@@ -383,7 +398,8 @@ class Stream(Generic[T]):
         """Return the next item.
 
         Args:
-            timeout: Seconds to wait; None waits without limit.
+            timeout: Seconds to wait; None waits without limit. By default the client's `rcv_timeout_ms`, or 30 s where
+                that is less and a server in live mode may still be preparing its first picture.
 
         Raises:
             URLabTimeoutError: Nothing came in time; says at which stage, and what to look at.
@@ -421,7 +437,7 @@ class Stream(Generic[T]):
         return await self._channel.next()
 
     def __del__(self) -> None:
-        channel: _Channel[T] | None = getattr(self, "_channel", None)  # None if the constructor failed
+        channel: _StreamChannel[T] | None = getattr(self, "_channel", None)  # None if the constructor failed
         if channel is not None:
             channel.abandon()
 

@@ -6,34 +6,37 @@ runs. A failure that can be foreseen is one line on standard error and exit code
 
 from __future__ import annotations
 
+import argparse
 import logging
 import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
-from importlib.metadata import version
+from importlib import import_module
 
-from urlab_client.cli import (
-    console,
-    convert,
-    demo,
-    doctor,
-    info,
-    keys,
-    ping,
-    plot,
-    record,
-    run_policy,
-    serve,
-    snapshot,
-    view,
-)
+import urlab_client
 from urlab_client.cli._arguments import Parser
 from urlab_client.cli._failure import CommandError, one_line
 from urlab_client.integrations._extras import MissingExtra
 from urlab_client.protocol.errors import URLabError
 
 __all__ = ["main"]
+
+_COMMANDS = (
+    "serve",
+    "console",
+    "ping",
+    "doctor",
+    "demo",
+    "keys",
+    "snapshot",
+    "record",
+    "info",
+    "convert",
+    "plot",
+    "run-policy",
+    "view",
+)
 
 _FAILED = 2
 _INTERRUPTED = 128 + signal.SIGINT
@@ -45,7 +48,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     Args:
         argv: Arguments without the program's name; default those of this process.
     """
-    parser = _parser()
+    argv = sys.argv[1:] if argv is None else argv
+    # Each `sim://` server is an `urlab serve`: it starts a third faster without the modules of the other commands.
+    parser = _parser(*(name for name in argv[:1] if name in _COMMANDS))
     arguments = parser.parse_args(argv)
     run: Callable[[object], int] = arguments.run
     name = f"{parser.prog} {arguments.command}"
@@ -66,18 +71,25 @@ def main(argv: Sequence[str] | None = None) -> int:
         logging.getLogger("urlab_client").removeHandler(handler)
 
 
-def _parser() -> Parser:
+def _parser(*commands: str) -> Parser:
+    """Return the parser of some commands, by default of all."""
     parser = Parser(
         prog="urlab",
         description="Clients and a simulated server for URLab, the Unreal plugin that embeds MuJoCo.",
         epilog="Exit codes: 0 success, 1 a diagnosis with problems, 2 wrong usage or a failure explained on standard "
         "error, 130 Ctrl-C.",
     )
-    parser.add_argument("--version", action="version", version=f"urlab_client {version('urlab-client')}")
-    commands = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND", required=True)
-    for module in (serve, console, ping, doctor, demo, keys, snapshot, record, info, convert, plot, run_policy, view):
-        module.add_parser(commands)
+    parser.add_argument("--version", action=_Version, nargs=0, help="show program's version number and exit")
+    subparsers = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND", required=True)
+    for name in commands or _COMMANDS:
+        import_module(f"{__name__}.{name.replace('-', '_')}").add_parser(subparsers)
     return parser
+
+
+class _Version(argparse.Action):  # argparse's own wants the version, which takes a while, before it is asked for
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        print(f"urlab_client {urlab_client.__version__}")
+        parser.exit()
 
 
 class _StderrHandler(logging.Handler):

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress
     from rich.table import Table
 
-    from urlab_client.cli.demo_runs import Outcome, Run
+    from urlab_client.cli.demo_runs import DemoRun, Outcome
     from urlab_client.cli.robot_file import RobotFile
 
 __all__ = ["add_parser", "run"]
@@ -87,7 +87,7 @@ def run(arguments: DemoArguments) -> int:
         MissingExtra: A library is missing.
         URLabError: The server refused something.
     """
-    need("matplotlib", "rich", extra="demo")
+    need("matplotlib", "PIL", "rich", extra="demo")
     import_mujoco()
 
     from urlab_client.cli.demo_runs import drive_one, drive_two  # noqa: PLC0415
@@ -185,7 +185,7 @@ def _numbers(values: list[float]) -> str:
     return " ".join(f"{value:6.3f}" for value in values)
 
 
-def _write(folder: Path, robot: RobotFile, one: Run, two: Run, *, render: bool) -> dict[Path, str]:
+def _write(folder: Path, robot: RobotFile, one: DemoRun, two: DemoRun, *, render: bool) -> dict[Path, str]:
     """Write the files and return what is in each, or why it is missing."""
     from urlab_client.cli.figures import plot_trace  # noqa: PLC0415
     from urlab_client.cli.picture import NoPicture, draw_state  # noqa: PLC0415
@@ -211,7 +211,7 @@ def _write(folder: Path, robot: RobotFile, one: Run, two: Run, *, render: bool) 
     return notes
 
 
-def _configuration(robot: RobotFile, one: Run, two: Run) -> dict[str, Any]:
+def _configuration(robot: RobotFile, one: DemoRun, two: DemoRun) -> dict[str, Any]:
     import mujoco  # noqa: PLC0415
 
     from urlab_client.cli.demo_runs import SEED  # noqa: PLC0415
@@ -238,6 +238,8 @@ def _configuration(robot: RobotFile, one: Run, two: Run) -> dict[str, Any]:
             "gravity": option.gravity.tolist(),
         },
         "seed": SEED,
-        "pilots": {run.outcome.level: [pilot.settings for pilot in run.pilots] for run in (one, two)},
+        "controllers": {
+            run.outcome.level: [controller.settings for controller in run.controllers] for run in (one, two)
+        },
         "runs": [one.outcome, two.outcome],
     }

@@ -11,17 +11,17 @@ import numpy as np
 from msgspec import Struct
 
 from urlab_client import URLabAsset, URLabClient, URLabError, aio
+from urlab_client.cli.demo_controllers import DemoController, DemoRobot, make_demo_controller
 from urlab_client.cli.figures import Quantity, Trace
-from urlab_client.cli.pilots import Pilot, Robot, make_pilot
 from urlab_client.cli.robot_file import RobotFile
-from urlab_client.server.bundled import bundled_models
+from urlab_client.server.assets.bundled_robots import bundled_models
 
 if TYPE_CHECKING:
     import mujoco
 
     from urlab_client.server.simulated import SimulatedServer
 
-__all__ = ["SEED", "Outcome", "Pose", "Run", "drive_one", "drive_two"]
+__all__ = ["SEED", "DemoRun", "Outcome", "Pose", "drive_one", "drive_two"]
 
 SEED = 0
 
@@ -57,28 +57,33 @@ class Outcome(Struct):
     final_base_poses: list[Pose]
 
 
-class Run:
+class DemoRun:
     """What a run leaves.
 
     Attributes:
         outcome: How it went.
-        pilots: What drove the robots.
+        controllers: What drove the robots.
         trace: Joint positions of the first robot.
         model: The model.
         data: The last state.
     """
 
     def __init__(
-        self, outcome: Outcome, pilots: list[Pilot], trace: Trace, model: mujoco.MjModel, data: mujoco.MjData
+        self,
+        outcome: Outcome,
+        controllers: list[DemoController],
+        trace: Trace,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
     ) -> None:
         self.outcome = outcome
-        self.pilots = pilots
+        self.controllers = controllers
         self.trace = trace
         self.model = model
         self.data = data
 
 
-def drive_one(server: SimulatedServer, robot: RobotFile, steps: int, advance: Advance) -> Run:
+def drive_one(server: SimulatedServer, robot: RobotFile, steps: int, advance: Advance) -> DemoRun:
     """Author a level with one robot and drive it through the blocking client."""
     with URLabClient(**server.client_options(), step_mode="direct") as client:
         client.discover()
@@ -93,22 +98,24 @@ def drive_one(server: SimulatedServer, robot: RobotFile, steps: int, advance: Ad
         client.reset(seed=SEED, per_articulation_qpos=_home(client, robot, 1))
 
         art = client.articulations_by_id[robot.name]
-        pilot = make_pilot(robot, art)
+        controller = make_demo_controller(robot, art)
         recorder = _Recorder(art, steps)
         started = time.perf_counter()
         for _ in range(steps):
-            pilot.act(client.sim_time)
+            controller.act(client.sim_time)
             client.step()
             recorder.note(client.sim_time)
             advance()
         wall = time.perf_counter() - started
 
-        run = _run("blocking", client, robot, number=1, level=level, recorder=recorder, pilots=[pilot], wall=wall)
+        run = _run(
+            "blocking", client, robot, number=1, level=level, recorder=recorder, controllers=[controller], wall=wall
+        )
         client.sim.stop()
         return run
 
 
-async def drive_two(server: SimulatedServer, robot: RobotFile, steps: int, advance: Advance) -> Run:
+async def drive_two(server: SimulatedServer, robot: RobotFile, steps: int, advance: Advance) -> DemoRun:
     """Author a level with two robots and drive each from a task of its own, through one async client."""
     async with aio.URLabClient(**server.client_options(), step_mode="direct") as client:
         await client.discover()
@@ -119,12 +126,12 @@ async def drive_two(server: SimulatedServer, robot: RobotFile, steps: int, advan
 
         arts = [client.articulations_by_id[name] for name in _ids(robot, 2)]
         recorder = _Recorder(arts[0], steps)
-        pilots = [make_pilot(robot, art, turn) for art, turn in zip(arts, _PART_WAYS, strict=True)]
-        both = asyncio.Barrier(len(pilots))
+        controllers = [make_demo_controller(robot, art, turn) for art, turn in zip(arts, _PART_WAYS, strict=True)]
+        both = asyncio.Barrier(len(controllers))
 
-        async def drive(pilot: Pilot) -> None:
+        async def drive(controller: DemoController) -> None:
             for _ in range(steps):
-                pilot.act(client.sim_time)
+                controller.act(client.sim_time)
                 if await both.wait() == 0:  # every robot has its set-points; one task takes the step for all
                     await client.step()
                     recorder.note(client.sim_time)
@@ -134,13 +141,13 @@ async def drive_two(server: SimulatedServer, robot: RobotFile, steps: int, advan
         started = time.perf_counter()
         try:
             async with asyncio.TaskGroup() as tasks:
-                for pilot in pilots:
-                    tasks.create_task(drive(pilot))
+                for controller in controllers:
+                    tasks.create_task(drive(controller))
         except ExceptionGroup as group:  # one task steps at a time, so there is one error
             raise group.exceptions[0] from None
         wall = time.perf_counter() - started
 
-        run = _run("async", client, robot, number=2, level=level, recorder=recorder, pilots=pilots, wall=wall)
+        run = _run("async", client, robot, number=2, level=level, recorder=recorder, controllers=controllers, wall=wall)
         await client.sim.stop()
         return run
 
@@ -148,7 +155,7 @@ async def drive_two(server: SimulatedServer, robot: RobotFile, steps: int, advan
 class _Recorder:
     """Notes the positions of a robot: hinges, slides, and where its base is."""
 
-    def __init__(self, robot: Robot, steps: int) -> None:
+    def __init__(self, robot: DemoRobot, steps: int) -> None:
         self._robot = robot
         self._quantities: list[Quantity] = []
         self._columns: list[int] = []
@@ -207,9 +214,9 @@ def _run(
     number: int,
     level: str,
     recorder: _Recorder,
-    pilots: list[Pilot],
+    controllers: list[DemoController],
     wall: float,
-) -> Run:
+) -> DemoRun:
     model, data = client.model, client.data
     if model is None or data is None:
         raise URLabError("The server sent no model.")
@@ -220,4 +227,6 @@ def _run(
     ]
     steps, sim_time = client.step_count, client.sim_time
     outcome = Outcome(kind, level, number, steps, sim_time, wall, steps / wall, sim_time / wall, poses)
-    return Run(outcome, pilots, recorder.trace(f"{robot.name}, {steps} steps through the {kind} client"), model, data)
+    return DemoRun(
+        outcome, controllers, recorder.trace(f"{robot.name}, {steps} steps through the {kind} client"), model, data
+    )

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client.cli._files import replaced
-from urlab_client.server.geometry import Box, box_around
+from urlab_client.server.editor.geometry import Box, box_around
 
 if TYPE_CHECKING:
     import mujoco
@@ -60,8 +60,8 @@ def draw_state(model: mujoco.MjModel, data: mujoco.MjData, path: Path) -> str:
     """
     import mujoco  # noqa: PLC0415
 
-    with tempfile.TemporaryDirectory(prefix="urlab-picture-") as scratch:
-        folder = Path(scratch)
+    with tempfile.TemporaryDirectory(prefix="urlab-picture-") as name:
+        folder = Path(name)
         mujoco.mj_saveModel(model, str(folder / "model.mjb"))
         np.savez(folder / "state.npz", qpos=data.qpos, mocap_pos=data.mocap_pos, mocap_quat=data.mocap_quat)
         reasons: list[str] = []
@@ -117,16 +117,14 @@ def _draw_in_child(folder: Path, platform: str) -> str | None:
 
 def _main(folder: Path) -> None:
     import mujoco  # noqa: PLC0415
-
-    # matplotlib leaves the type of a path open.
-    from matplotlib.image import imsave  # noqa: PLC0415  # pyright: ignore[reportUnknownVariableType]
+    from PIL import Image  # noqa: PLC0415
 
     model = mujoco.MjModel.from_binary_path(str(folder / "model.mjb"))
     data = mujoco.MjData(model)
     with np.load(folder / "state.npz") as state:
         data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = state["qpos"], state["mocap_pos"], state["mocap_quat"]
     mujoco.mj_forward(model, data)
-    imsave(folder / "picture.png", _render(model, data))
+    Image.fromarray(_render(model, data)).save(folder / "picture.png")
 
 
 def _render(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.uint8]:

@@ -53,7 +53,7 @@ class RoundTrips(Struct):
     max: float
 
 
-class Articulation(Struct):
+class ArticulationReport(Struct):
     """One articulation; `joints` and `sensors` are None where the model could not be loaded here."""
 
     key: str
@@ -65,7 +65,7 @@ class Articulation(Struct):
     controller: str | None
 
 
-class Play(Struct):
+class PlayReport(Struct):
     """The play session.
 
     `physics` is `advancing`, `standing still` or None without a model; `step_mode` None where only the client that
@@ -86,8 +86,8 @@ class Identity(Struct):
     mujoco_version: str
     local_mujoco_version: str
     same_mujoco_build: bool
-    play: Play
-    articulations: list[Articulation]
+    play: PlayReport
+    articulations: list[ArticulationReport]
     entities: list[str]
 
 
@@ -183,9 +183,9 @@ async def _identity(client: URLabClient) -> Identity:
     )
 
 
-def _articulation(articulation: URLabArticulation, with_model: bool) -> Articulation:
+def _articulation(articulation: URLabArticulation, with_model: bool) -> ArticulationReport:
     controller = articulation.controller
-    return Articulation(
+    return ArticulationReport(
         key=articulation.prefix,
         actor_id=articulation.actor_id,
         joints=len(articulation.joints) if with_model else None,
@@ -196,13 +196,15 @@ def _articulation(articulation: URLabArticulation, with_model: bool) -> Articula
     )
 
 
-async def _play(client: URLabClient) -> Play:
+async def _play(client: URLabClient) -> PlayReport:
     try:
         before = await client.sim.status()
     except URLabRPCError:  # a packaged build has no such op
         state = "ready" if client.manager_present else "off"
-        return Play(state=state, sim_time=None, physics=None, step_mode=None, step_mode_pinned=False)
-    play = Play(state=before.state, sim_time=before.sim_time, physics=None, step_mode=None, step_mode_pinned=False)
+        return PlayReport(state=state, sim_time=None, physics=None, step_mode=None, step_mode_pinned=False)
+    play = PlayReport(
+        state=before.state, sim_time=before.sim_time, physics=None, step_mode=None, step_mode_pinned=False
+    )
     if before.sim_time is None or not client.manager_present:
         return play
     after = await watched(client.sim.status, before)
@@ -249,7 +251,7 @@ def _text(report: Report) -> str:
     return "\n".join(lines)
 
 
-def _play_rows(play: Play) -> list[tuple[str, str]]:
+def _play_rows(play: PlayReport) -> list[tuple[str, str]]:
     if play.physics is None:
         return [("play", play.state)]
     mode = f"{play.step_mode}, pinned by the server" if play.step_mode_pinned else play.step_mode
@@ -263,7 +265,7 @@ def _titled(title: str, texts: list[str]) -> list[tuple[str, str]]:
     return [(title if index == 0 else "", text) for index, text in enumerate(texts)]
 
 
-def _articulation_text(articulation: Articulation) -> str:
+def _articulation_text(articulation: ArticulationReport) -> str:
     counts = [
         counted(number, noun)
         for number, noun in (

@@ -8,10 +8,11 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from urlab_client._mujoco import actuator_count, control_starts
 from urlab_client.cli._failure import CommandError, one_line
-from urlab_client.server.bundled import bundled_models
-from urlab_client.server.content import mujoco_messages
-from urlab_client.server.geometry import box_around
+from urlab_client.server.assets.bundled_robots import bundled_models
+from urlab_client.server.assets.content import mujoco_messages
+from urlab_client.server.editor.geometry import box_around
 
 __all__ = ["RobotFile", "read_robot"]
 
@@ -98,8 +99,9 @@ def _take_home(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[dict[str, fl
         data.qpos[base : base + 7] = model.qpos0[base : base + 7]
     scalar = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
     joints = [joint for joint in map(model.joint, range(model.njnt)) if joint.name and int(joint.type[0]) in scalar]
-    actuators = [actuator for actuator in map(model.actuator, range(model.nactuator)) if actuator.name]
+    actuators = [actuator for actuator in map(model.actuator, range(actuator_count(model))) if actuator.name]
+    starts = control_starts(model)
     return (
         {joint.name: float(data.qpos[joint.qposadr[0]]) for joint in joints},
-        {actuator.name: float(data.ctrl[model.actuator_ctrladr[actuator.id]]) for actuator in actuators},
+        {actuator.name: float(data.ctrl[starts[actuator.id]]) for actuator in actuators},
     )

@@ -22,8 +22,8 @@ from urlab_client.protocol.controller_text import ControllerText
 from urlab_client.protocol.enums import CameraMode, StepMode
 
 if TYPE_CHECKING:
-    from urlab_client.server.guard import CurveServer
     from urlab_client.server.simulated import SimulatedServer
+    from urlab_client.server.transport.curve_authentication import CurveServer
 
 __all__ = ["add_parser", "run"]
 
@@ -85,7 +85,7 @@ def add_parser(commands: Commands) -> None:
         "serve",
         help="run a simulated server",
         description="Run a simulated server that any URLab client can talk to. It ends with exit code 0 on SIGINT "
-        "(Ctrl-C) and SIGTERM.",
+        "(Ctrl-C) and SIGTERM, and with 2 when it fails.",
     )
     parser.add_argument(
         "models",
@@ -212,7 +212,7 @@ def run(arguments: ServeArguments) -> int:
     """Serve until told to stop.
 
     Raises:
-        CommandError: An option cannot be honoured, or a model cannot be used.
+        CommandError: An option cannot be honoured, a model cannot be used, or a thread of the server died.
         OSError: A port is in use, or a folder cannot be used.
     """
     _check_ports(arguments)
@@ -222,22 +222,25 @@ def run(arguments: ServeArguments) -> int:
         threading.Thread(target=_watch_input, args=[events], name="urlab-stdin", daemon=True).start()
     import_mujoco()
     _check_paths(arguments)
-    from urlab_client.server.heap import share_heaps  # noqa: PLC0415
-    from urlab_client.server.scratch import Scratch  # noqa: PLC0415
+    from urlab_client.server.system.allocator import limit_arenas  # noqa: PLC0415
+    from urlab_client.server.system.temporary_folder import TemporaryFolder  # noqa: PLC0415
 
-    share_heaps()
+    limit_arenas()
 
-    with Scratch() as scratch:
-        server = _server(arguments, arguments.saved_dir or scratch.path)
+    with TemporaryFolder() as temporary:
+        server = _server(arguments, arguments.saved_dir or temporary.path)
         starter = _Starter(server, events)
         starter.start()
         if _next(events) is _Event.STARTED:
             if starter.error is not None:
                 raise starter.error
             with server:
+                server.add_failure_callback(lambda _: events.put(_Event.FAILED))
                 _announce(server, arguments)
-                while _next(events) is not _Event.STOP:
+                while (event := _next(events)) is _Event.STARTED:
                     pass
+                if event is _Event.FAILED:
+                    raise CommandError(str(server.failure))
             return 0
         starter.join(_PATIENCE_S)
         stuck = starter.is_alive()
@@ -254,6 +257,7 @@ class _Event(Enum):
 
     STARTED = "started"
     STOP = "stop"
+    FAILED = "failed"
 
 
 _Events: TypeAlias = "queue.SimpleQueue[_Event]"  # unlike a threading.Event, it may be used in signal handlers
@@ -307,7 +311,7 @@ def _watch_input(events: _Events) -> None:
 
 
 def _server(arguments: ServeArguments, saved_dir: Path) -> SimulatedServer:
-    from urlab_client.server.controllers import ControllerConfig  # noqa: PLC0415
+    from urlab_client.server.physics.controllers import ControllerConfig  # noqa: PLC0415
     from urlab_client.server.simulated import SimulatedServer  # noqa: PLC0415
 
     try:
@@ -339,7 +343,7 @@ def _server(arguments: ServeArguments, saved_dir: Path) -> SimulatedServer:
 
 
 def _curve(arguments: ServeArguments) -> CurveServer | None:
-    from urlab_client.server.guard import CurveServer  # noqa: PLC0415
+    from urlab_client.server.transport.curve_authentication import CurveServer  # noqa: PLC0415
 
     if arguments.server_key is None:
         if arguments.allow_client or arguments.allow_any_client:
@@ -381,7 +385,7 @@ def _check_ports(arguments: ServeArguments) -> None:
 
 
 def _check_paths(arguments: ServeArguments) -> None:
-    from urlab_client.server.bundled import bundled_models  # noqa: PLC0415
+    from urlab_client.server.assets.bundled_robots import bundled_models  # noqa: PLC0415
 
     bundled = bundled_models()
     for model in arguments.models:

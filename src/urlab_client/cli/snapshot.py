@@ -101,7 +101,7 @@ def run(arguments: SnapshotArguments) -> int:
         URLabError: A model is broken, nothing can be drawn here, or the server does not answer.
         OSError: The file cannot be written.
     """
-    need("matplotlib", extra="demo")
+    need("PIL", extra="demo")
     if not arguments.output.parent.is_dir():
         raise CommandError(f"{arguments.output}: no such folder")
     _check_mode(arguments)
@@ -128,7 +128,7 @@ def _check_mode(arguments: SnapshotArguments) -> None:
 def _of_models(arguments: SnapshotArguments) -> NDArray[np.uint8]:
     from urlab_client import URLabClient  # noqa: PLC0415
     from urlab_client.server import SimulatedServer  # noqa: PLC0415
-    from urlab_client.server.rendering import need_backend  # noqa: PLC0415
+    from urlab_client.server.render.camera_renderer import need_backend  # noqa: PLC0415
 
     need_backend()
     camera = arguments.camera
@@ -222,8 +222,7 @@ def _pixels(view: URLabCameraView) -> NDArray[np.uint8]:
 
 
 def _write(path: Path, image: NDArray[np.uint8]) -> None:
-    # matplotlib leaves the type of a path open.
-    from matplotlib.image import imsave  # noqa: PLC0415  # pyright: ignore[reportUnknownVariableType]
+    from PIL import Image  # noqa: PLC0415
 
     with replaced(path) as temporary:
-        imsave(temporary, np.ascontiguousarray(image), format="png")
+        Image.fromarray(image).save(temporary, format="png")

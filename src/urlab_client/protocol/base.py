@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
-from typing import Annotated, Any, Generic, Literal, TypeAlias, TypeVar
+from typing import Annotated, Any, Final, Generic, Literal, TypeAlias, TypeVar
 
 import msgspec
 import numpy as np
@@ -17,9 +17,13 @@ from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
 __all__ = [
+    "EDITOR_TIMEOUT_S",
     "ActorId",
     "ActorTarget",
     "Color",
+    "ControlRequest",
+    "DialectName",
+    "Effect",
     "EulerDeg",
     "Floats",
     "Needs",
@@ -31,7 +35,6 @@ __all__ = [
     "Request",
     "RequiresPieRestart",
     "TargetBy",
-    "Timing",
     "Vec3",
     "doc",
 ]
@@ -41,6 +44,10 @@ Floats: TypeAlias = NDArray[np.float64]
 
 Vec3: TypeAlias = tuple[float, float, float]
 Quat: TypeAlias = tuple[float, float, float, float]
+
+
+DialectName: TypeAlias = Literal["alpha", "beta"]
+"""The generations of the plugin whose whole wire is known; see `protocol.dialects`."""
 
 
 def doc(text: str) -> Meta:
@@ -76,6 +83,18 @@ class Request(Struct, Generic[R_co], tag_field="op", kw_only=True, omit_defaults
     session_id: Annotated[str, doc("Session id from the latest `hello_ok`.")] = ""
 
 
+class ControlRequest(Request[R_co], Generic[R_co], kw_only=True, omit_defaults=True):
+    """A request that writes to a robot, which some servers accept only from the robot's owner."""
+
+    control_owner: Annotated[
+        str | None, doc("Name of the client that writes; absent stands for the session. Not known to the alpha.")
+    ] = None
+
+
+EDITOR_TIMEOUT_S: Final = 30.0
+"""Seconds to wait for an editor op: it waits for the game thread, which level or mesh work can hold for long."""
+
+
 class Needs(StrEnum):
     """What a server must have running for an op: the op's category on the wire."""
 
@@ -84,7 +103,7 @@ class Needs(StrEnum):
     MANAGER = "manager_required"
 
 
-class Timing(StrEnum):
+class Effect(StrEnum):
     """What the caller may assume when the reply to an op is lost."""
 
     READ = "read"
@@ -113,13 +132,15 @@ class Op:
         positional: For a generated method: how many leading parameters are positional.
         undeclared: Required fields that only the op's handler checks, so that `meta` does not list them.
         declares: Reply fields as `meta` lists them, where the plugin's list differs from what it sends.
+        dialects: Generations of the plugin that offer it.
+        job: Whether the beta answers `op_started` and delivers the reply through `op_status`.
     """
 
     request: type[Request[Any]]
     ns: str = ""
     method: str = ""
     needs: Needs = Needs.EDITOR
-    effect: Timing = Timing.WRITE
+    effect: Effect = Effect.WRITE
     timeout: float | None = None
     hot: bool = False
     errors: tuple[str, ...] = ()
@@ -128,6 +149,8 @@ class Op:
     positional: int = 0
     undeclared: tuple[str, ...] = ()
     declares: tuple[str, ...] | None = None
+    dialects: tuple[DialectName, ...] = ("alpha", "beta")
+    job: bool = False
     name: str = field(init=False)
     reply: type[Reply] = field(init=False)
 

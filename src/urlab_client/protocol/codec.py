@@ -11,7 +11,7 @@ import base64
 import math
 import re
 from _thread import allocate_lock
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from typing import Any, TypeVar, cast
@@ -21,8 +21,9 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import force_setattr
 
-from urlab_client.protocol.base import Op, Reply, Request
+from urlab_client.protocol.base import Needs, Op, Reply, Request
 from urlab_client.protocol.errors import ProtocolError, rpc_error
+from urlab_client.protocol.messages.jobs import OpStarted, OpStatusOk
 from urlab_client.protocol.messages.session import ErrorReply
 from urlab_client.protocol.registry import OPS
 
@@ -31,6 +32,8 @@ __all__ = [
     "MAX_REQUEST_BYTES",
     "building",
     "check_request",
+    "decode_answer",
+    "decode_job",
     "decode_reply",
     "encode_reply",
     "encode_request",
@@ -77,7 +80,10 @@ def op_of(request: Request[Any] | type[Request[Any]]) -> Op:
 
 def from_wire_array(kind: type, value: Any) -> Any:
     """Decoding hook: a list of numbers becomes a float64 array of shape (n,)."""
-    array: np.ndarray[Any, np.dtype[np.float64]] = np.array(value, dtype=np.float64)
+    try:
+        array: np.ndarray[Any, np.dtype[np.float64]] = np.array(value, dtype=np.float64)
+    except OverflowError as error:  # integers have no limit in JSON; msgspec expects ValueError
+        raise ValueError(str(error)) from None
     if array.ndim != 1:
         raise ValueError(f"expected a flat array of numbers, got {array.ndim} dimensions")
     return array
@@ -146,16 +152,28 @@ def check_request(request: Request[Any], frame: bytes) -> None:
         raise kind(f"{op_of(request).name}: {where}: {problem[:1].lower()}{problem[1:]}") from None
 
 
+# Which of the editor's ops are jobs shows in the answer alone. That of `op_status` is never another job.
+_MAY_START = frozenset(op.reply for op in OPS.values() if op.needs is Needs.EDITOR) - {OpStatusOk}
+
+
 @cache
-def _reply_decoder(reply: type[R]) -> msgspec.msgpack.Decoder[R | ErrorReply]:
+def _answers(reply: type[Reply]) -> Any:
+    """Return the union of what may come instead of a reply."""
+    return reply | ErrorReply | OpStarted if reply in _MAY_START else reply | ErrorReply
+
+
+@cache
+def _reply_decoder(reply: type[Reply]) -> msgspec.msgpack.Decoder[Reply]:
     # Not strict: the plugin sends integers as floats.
     with building():
-        decoder = msgspec.msgpack.Decoder(reply | ErrorReply, strict=False, dec_hook=from_wire_array)
-    return cast("msgspec.msgpack.Decoder[R | ErrorReply]", decoder)
+        return msgspec.msgpack.Decoder(_answers(reply), strict=False, dec_hook=from_wire_array)
 
 
-def decode_reply(op: Op, reply: type[R], frame: Buffer) -> R:
+def decode_answer(op: Op, reply: type[R], frame: Buffer) -> R | OpStarted:
     """Decode the server's answer to `op`; whether it is msgpack or JSON shows in its first byte.
+
+    Returns:
+        The reply, or the start of the job that will deliver it: `decode_job` then reads it.
 
     Raises:
         URLabRPCError: The server refused.
@@ -164,29 +182,69 @@ def decode_reply(op: Op, reply: type[R], frame: Buffer) -> R:
     if len(frame) > MAX_REPLY_BYTES:
         raise ProtocolError(f"{op.name}: a reply of {len(frame)} bytes exceeds the limit {MAX_REPLY_BYTES}", op=op.name)
     try:
-        answer = _decode_json(reply, frame) if frame[:1] == b"{" else _reply_decoder(reply).decode(frame)
+        if frame[:1] == b"{":
+            answer = _converted(reply, _restore_binary(msgspec.json.decode(frame)))
+        else:
+            answer = _reply_decoder(reply).decode(frame)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise ProtocolError(
-            f"{op.name}: the server's answer is not a valid {op.reply_name}: {error}.",
-            op=op.name,
-            raw=bytes(frame[:256]),
-        ) from error
+        raise _not_an_answer(op, error, bytes(frame[:256])) from error
     if isinstance(answer, ErrorReply):
-        raise _refusal(op, answer)
+        raise _refusal(op, answer, _plain(frame))
+    return cast("R | OpStarted", answer)
+
+
+def decode_reply(op: Op, reply: type[R], frame: Buffer) -> R:
+    """Decode the server's reply to `op`, as `decode_answer` does, where a job is not expected.
+
+    Raises:
+        URLabRPCError: The server refused.
+        ProtocolError: The frame is not the reply to `op`.
+    """
+    answer = decode_answer(op, reply, frame)
+    if isinstance(answer, OpStarted):
+        raise ProtocolError(f"{op.name}: the server has started {answer.job_id} instead of answering.", op=op.name)
+    return answer
+
+
+def decode_job(op: Op, reply: type[R], result: dict[str, Any]) -> R:
+    """Read what `op_status` hands over at the end of a job as if it had been the answer to `op`.
+
+    Raises:
+        URLabRPCError: The server refused.
+        ProtocolError: It is not an answer to `op`.
+    """
+    try:
+        answer = _converted(reply, result)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise _not_an_answer(op, error, b"") from error
+    if isinstance(answer, ErrorReply):
+        raise _refusal(op, answer, result)
+    if isinstance(answer, OpStarted):
+        raise ProtocolError(f"{op.name}: the job's result is another job, {answer.job_id}.", op=op.name)
     return cast("R", answer)
 
 
-def _refusal(op: Op, answer: ErrorReply) -> Exception:
+def _converted(reply: type[Reply], plain: Any) -> Reply:
+    _reply_decoder(reply)  # so that `convert` finds the structs described
+    return msgspec.convert(plain, _answers(reply), strict=False, dec_hook=from_wire_array)
+
+
+def _not_an_answer(op: Op, error: Exception, raw: bytes) -> ProtocolError:
+    return ProtocolError(
+        f"{op.name}: the server's answer is not a valid {op.reply_name}: {error}.", op=op.name, raw=raw
+    )
+
+
+def _plain(frame: Buffer) -> dict[str, Any]:
+    return _restore_binary(msgspec.json.decode(frame)) if frame[:1] == b"{" else msgspec.msgpack.decode(frame)
+
+
+def _refusal(op: Op, answer: ErrorReply, fields: Mapping[str, Any]) -> Exception:
     message = answer.message
     if not message and answer.absolute_path is not None:
         message = f"nothing to save, or {answer.absolute_path} cannot be written"
-    return rpc_error(answer.code, message, op=op.name)
-
-
-def _decode_json(reply: type[R], frame: Buffer) -> R | ErrorReply:
-    plain = _restore_binary(msgspec.json.decode(frame))
-    _reply_decoder(reply)  # so that `convert` finds the structs described
-    return cast("R | ErrorReply", msgspec.convert(plain, reply | ErrorReply, strict=False, dec_hook=from_wire_array))
+    details = {name: value for name, value in fields.items() if name not in {"op", "code", "message"}}
+    return rpc_error(answer.code, message, op=op.name, details=details)
 
 
 def _restore_binary(value: Any) -> Any:

@@ -7,6 +7,7 @@ Mistakes in arguments are plain `ValueError` or `TypeError`, raised before anyth
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 from urlab_client.protocol.enums import PIEState, StepMode
@@ -22,6 +23,7 @@ __all__ = [
     "ClientClosed",
     "ConcurrentReadError",
     "ConnectionLost",
+    "ControlClaimed",
     "ControllerSchemaViolation",
     "CreateLevelFailed",
     "DestroyAssetFailed",
@@ -32,10 +34,12 @@ __all__ = [
     "ForkedError",
     "GameThreadTimeout",
     "GetActorBoundsFailed",
+    "HashMismatch",
     "ImportFailed",
     "InternalError",
     "InvalidCount",
     "InvalidMode",
+    "LeaseBusy",
     "ListActorsFailed",
     "ListBlueprintsFailed",
     "LoadLevelFailed",
@@ -51,12 +55,14 @@ __all__ = [
     "NoTwistController",
     "NoViewport",
     "NoWorld",
+    "NotControlOwner",
     "NotInEditor",
     "NotMocapBody",
     "NotReady",
     "OutcomeUnknown",
     "PathNotReadable",
     "PathNotWritable",
+    "PayloadTooLarge",
     "ProtocolError",
     "RecordingAlreadyActive",
     "RecordingNotActive",
@@ -84,8 +90,10 @@ __all__ = [
     "UnknownActor",
     "UnknownArticulation",
     "UnknownBody",
+    "UnknownJob",
     "UnknownKeyframe",
     "UnknownOp",
+    "UnknownUpload",
     "Unsupported",
     "WrongTransport",
     "rpc_error",
@@ -148,7 +156,13 @@ class ConnectionLost(URLabConnectionError):
 
 
 class OutcomeUnknown(URLabConnectionError):
-    """The connection broke after a request was sent that changes state: it may or may not have been executed."""
+    """The connection broke after a request was sent that changes state: it may or may not have been executed.
+
+    Attributes:
+        job_id: The editor's job that carries it out, if it is one.
+    """
+
+    job_id: str | None = None
 
 
 class ClientClosed(URLabConnectionError):
@@ -160,7 +174,13 @@ class ForkedError(URLabConnectionError):
 
 
 class URLabTimeoutError(URLabError, TimeoutError):
-    """No reply arrived within the deadline. A request that was sent may still be executed by the server."""
+    """No reply arrived within the deadline. A request that was sent may still be executed by the server.
+
+    Attributes:
+        job_id: The editor's job that carries it out, if it is one; it goes on.
+    """
+
+    job_id: str | None = None
 
 
 class ProtocolError(URLabError):
@@ -230,10 +250,12 @@ class URLabRPCError(URLabError):
     Attributes:
         code: Short stable code, for example `unknown_articulation`.
         message: The server's text; its wording is not stable.
+        details: What else the server said, by the name of the field.
     """
 
     advice: ClassVar[str | None] = None
     message: str
+    details: dict[str, Any]
 
     def __init_subclass__(cls, *, code: str | None = None, advice: str | None = None, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -244,17 +266,28 @@ class URLabRPCError(URLabError):
         if advice is not None:
             cls.advice = advice
 
-    def __init__(self, code: str, message: str, *, op: str | None = None, hint: str | None = None) -> None:
+    def __init__(
+        self,
+        code: str,
+        message: str,
+        *,
+        op: str | None = None,
+        hint: str | None = None,
+        details: Mapping[str, Any] | None = None,
+    ) -> None:
         what = f"{op}: {code}" if op else code
         super().__init__(
             f"{what}: {message}" if message else what, op=op, code=code, hint=hint if hint is not None else self.advice
         )
         self.message = message
+        self.details = dict(details or {})
 
 
-def rpc_error(code: str, message: str, *, op: str | None = None) -> URLabRPCError:
+def rpc_error(
+    code: str, message: str, *, op: str | None = None, details: Mapping[str, Any] | None = None
+) -> URLabRPCError:
     """Make the exception for an error reply: the class declared for `code`, else `URLabRPCError`."""
-    return RPC_ERRORS.get(code, URLabRPCError)(code, message, op=op)
+    return RPC_ERRORS.get(code, URLabRPCError)(code, message, op=op, details=details)
 
 
 class URLabPIEError(URLabRPCError):
@@ -381,6 +414,50 @@ class BadValue(URLabRPCError, code="bad_value"):
 
 class UnknownArticulation(URLabRPCError, code="unknown_articulation"):
     """No articulation has this key or actor id."""
+
+
+class NotControlOwner(
+    URLabRPCError,
+    code="not_control_owner",
+    advice="articulation.claim(force=True) takes the robot over; its present owner is then refused.",
+):
+    """Another client controls the robot, or nobody does; nothing was written."""
+
+    @property
+    def owner(self) -> str:
+        """Who controls the robot, or `(unclaimed)`; empty when the server does not say."""
+        return str(self.details.get("owner", ""))
+
+
+class ControlClaimed(NotControlOwner, code="control_claimed"):
+    """Another client controls the robot, so it could not be claimed."""
+
+
+class LeaseBusy(
+    URLabRPCError, code="busy", advice="Use another server, or wait until the lease is given back or runs out."
+):
+    """Somebody holds the server's driver lease."""
+
+    @property
+    def lease_id(self) -> str:
+        """The holder's lease; empty when the server does not say."""
+        return str(self.details.get("lease_id", ""))
+
+
+class UnknownJob(URLabRPCError, code="unknown_job"):
+    """The editor has no such job: there never was one, or its end was told already."""
+
+
+class UnknownUpload(URLabRPCError, code="unknown_upload"):
+    """The server has no such upload: it was committed, or nothing was sent for too long."""
+
+
+class HashMismatch(URLabRPCError, code="hash_mismatch"):
+    """A file arrived changed; it has to be sent anew."""
+
+
+class PayloadTooLarge(URLabRPCError, code="payload_too_large"):
+    """A file or a model is larger than the server takes."""
 
 
 class NoController(URLabRPCError, code="no_controller"):

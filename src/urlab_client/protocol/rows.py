@@ -31,7 +31,7 @@ __all__ = [
     "BaseStateRow",
     "BytesLike",
     "CameraEndpoint",
-    "CameraFrame",
+    "CameraImage",
     "ControlPayload",
     "JointGains",
     "JointRow",
@@ -39,11 +39,12 @@ __all__ = [
     "Row",
     "SceneRow",
     "SensorRow",
-    "Topic",
+    "StreamTopic",
     "TopicKind",
     "TwistRow",
     "articulation_filter",
     "camera_filter",
+    "check_picture_size",
     "decode_camera",
     "decode_gains",
     "decode_row",
@@ -121,7 +122,7 @@ _ARTICULATION_KINDS: Mapping[str, TopicKind] = {kind.value: kind for kind in _OF
 _SCENE_KINDS: Mapping[str, TopicKind] = {kind.value: kind for kind in _SCENE_SIZES}
 
 
-class Topic(Struct, frozen=True):
+class StreamTopic(Struct, frozen=True):
     """Address of a message on the publish/subscribe sockets.
 
     An articulation may itself be called `scene`; a topic that reads as `scene/<entity>/xpos` (or `xquat`, `qpos`,
@@ -164,7 +165,7 @@ class Topic(Struct, frozen=True):
         return str(self).encode()
 
     @staticmethod
-    def parse(frame: BytesLike) -> Topic:
+    def parse(frame: BytesLike) -> StreamTopic:
         """Read a topic frame.
 
         Raises:
@@ -180,9 +181,9 @@ def _check_key(key: str) -> None:
 
 # A stream repeats a few hundred topics for ever.
 @lru_cache(maxsize=4096)
-def _parse_topic(frame: bytes) -> Topic:
+def _parse_topic(frame: bytes) -> StreamTopic:
     if frame == STATE_FULL:
-        return Topic(TopicKind.STATE_FULL)
+        return StreamTopic(TopicKind.STATE_FULL)
     try:
         text = frame.decode()
     except UnicodeDecodeError as exc:
@@ -199,16 +200,16 @@ def _parse_topic(frame: bytes) -> Topic:
     return topic
 
 
-def _split_topic(text: str) -> Topic | None:
+def _split_topic(text: str) -> StreamTopic | None:
     head, _, quantity = text.rpartition("/")
     entity = head.removeprefix(f"{_SCENE}/")
     if quantity in _SCENE_KINDS and entity and entity != head:
-        return Topic(_SCENE_KINDS[quantity], entity)
+        return StreamTopic(_SCENE_KINDS[quantity], entity)
     match text.split("/", 2):
         case [owner, kind] if owner and kind in _ARTICULATION_KINDS:
-            return Topic(_ARTICULATION_KINDS[kind], owner)
+            return StreamTopic(_ARTICULATION_KINDS[kind], owner)
         case [owner, kind, name] if owner and name and kind in _COMPONENT_KINDS:
-            return Topic(_COMPONENT_KINDS[kind], owner, name)
+            return StreamTopic(_COMPONENT_KINDS[kind], owner, name)
         case _:
             return None
 
@@ -230,7 +231,7 @@ def articulation_filter(key: str, kind: TopicKind | None = None) -> bytes:
     if kind in _OF_COMPONENT:
         return f"{key}/{kind}/".encode()
     if kind in _OF_ARTICULATION:
-        return Topic(kind, key).encode()
+        return StreamTopic(kind, key).encode()
     raise ValueError(f"an articulation has no {kind} topic")
 
 
@@ -466,7 +467,7 @@ _ROWS: Mapping[TopicKind, Callable[[BytesLike, object], Row]] = {
 }
 
 
-def decode_row(topic: Topic, payload: BytesLike) -> Row:
+def decode_row(topic: StreamTopic, payload: BytesLike) -> Row:
     """Read the row that belongs to a topic of the state socket.
 
     Raises:
@@ -672,10 +673,11 @@ class ActuatorInfo(Struct, frozen=True, eq=False):
 _FRAME_MAGIC = 0x314D4355
 _FRAME_HEADERS = {1: Layout("<IIQdII"), 2: Layout("<IIQdIId")}
 _OPAQUE = np.uint32(0xFF000000)
+_MAX_SIDE = 16_384  # what graphics cards render at most
 _CENTIMETRES = np.float32(100)
 
 
-class CameraFrame(Struct, frozen=True, eq=False):
+class CameraImage(Struct, frozen=True, eq=False):
     """One picture.
 
     Attributes:
@@ -692,6 +694,16 @@ class CameraFrame(Struct, frozen=True, eq=False):
     capture_time: float | None = None
 
 
+def check_picture_size(width: int, height: int) -> None:
+    """Check the size of a picture as a peer gives it.
+
+    Raises:
+        ValueError: No camera has pictures of this size.
+    """
+    if not (0 < width <= _MAX_SIDE and 0 < height <= _MAX_SIDE):
+        raise ValueError(f"pictures of {width}x{height} pixels; each side has 1 to {_MAX_SIDE}")
+
+
 def decode_camera(
     payload: BytesLike,
     mode: CameraMode | str,
@@ -700,7 +712,7 @@ def decode_camera(
     *,
     out: Pixels | None = None,
     where: object = "",
-) -> CameraFrame:
+) -> CameraImage:
     """Read a picture: a camera message, a slot of a camera region or the `data` of a step reply's camera block.
 
     Newer servers put a header before the pixels. It is recognised by its magic number and by the length together, so
@@ -715,25 +727,28 @@ def decode_camera(
         where: Names the camera in errors.
 
     Raises:
-        ProtocolError: If the payload does not have the size of such a picture.
+        ProtocolError: If the payload does not have the size of such a picture, or there is no picture of this size.
         ValueError: If `out` does not fit.
     """
+    try:
+        check_picture_size(width, height)
+    except ValueError as problem:
+        raise _error("camera frame", where, str(problem), payload) from None
     size = width * height * 4
     header = _frame_header(payload, width, height, where)
     if header is None and len(payload) != size:
         problem = f"{len(payload)} bytes, expected {size} ({width}x{height} pixels of 4 bytes)"
         raise _error("camera frame", where, problem, payload)
     start = header.size if header else 0
-    if out is None and mode == CameraMode.REAL and size:
+    if out is None and mode == CameraMode.REAL:
         pixels: Pixels = _rgba(np.frombuffer(payload, np.uint8, size, start), width, height)
     else:
         pixels = _target(mode, width, height, out)
-        if size:
-            _convert(np.frombuffer(payload, np.uint8, size, start), mode, pixels)
+        _convert(np.frombuffer(payload, np.uint8, size, start), mode, pixels)
     if header is None:
-        return CameraFrame(pixels)
+        return CameraImage(pixels)
     _, _, frame_id, sim_time, _, _, *capture_time = header.unpack_from(payload)
-    return CameraFrame(pixels, frame_id, sim_time, *capture_time)
+    return CameraImage(pixels, frame_id, sim_time, *capture_time)
 
 
 def _target(mode: CameraMode | str, width: int, height: int, out: Pixels | None) -> Pixels:
@@ -789,7 +804,7 @@ def encode_camera(pixels: Pixels, mode: CameraMode | str) -> bytes:
     """Return the bare pixels of a picture, the inverse of `decode_camera`.
 
     Args:
-        pixels: As in `CameraFrame`, top row first; mode `real` also takes RGB, shape (H, W, 3). Alpha is sent as 255.
+        pixels: As in `CameraImage`, top row first; mode `real` also takes RGB, shape (H, W, 3). Alpha is sent as 255.
         mode: Mode of the camera.
 
     Raises:

@@ -4,14 +4,14 @@ For tests, demonstrations and offline work; `urlab serve` runs the same server f
 package imports MuJoCo.
 """
 
-from urlab_client.server.bundled import bundled_models
-from urlab_client.server.controllers import ControllerConfig
-from urlab_client.server.endpoint import PortInUse
+from urlab_client.server.assets.bundled_robots import bundled_models
 from urlab_client.server.faults import ActiveFault, Corrupt, Cut, Delay, Drop, Fault, Faults, Refuse
-from urlab_client.server.guard import CurveServer, UnprotectedServer
 from urlab_client.server.limits import Limits
-from urlab_client.server.rendering import RenderingUnavailable
+from urlab_client.server.physics.controllers import ControllerConfig
+from urlab_client.server.render.camera_renderer import RenderingUnavailable
 from urlab_client.server.simulated import ModelError, SimulatedServer
+from urlab_client.server.transport.curve_authentication import CurveServer, UnprotectedServer
+from urlab_client.server.transport.endpoint import PortInUse
 
 __all__ = [
     "ActiveFault",

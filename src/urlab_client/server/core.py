@@ -14,26 +14,29 @@ from typing import Any
 
 import mujoco
 
+from urlab_client._mujoco import copy_options
 from urlab_client.protocol.base import Request
 from urlab_client.protocol.codec import encode_reply
+from urlab_client.protocol.dialects import ALPHA, Dialect
 from urlab_client.protocol.enums import CameraMode, PIEState, StepMode
 from urlab_client.protocol.messages.session import ErrorReply, Hello, Step
-from urlab_client.server.actors import Actor
-from urlab_client.server.controllers import ControllerConfig
-from urlab_client.server.engine import Engine
-from urlab_client.server.heap import give_back
+from urlab_client.server.assets.actors import Actor
+from urlab_client.server.compile.scene import ArticulationIndex, CompiledScene, compile_scene
+from urlab_client.server.editor.markers import Drawings
+from urlab_client.server.editor.viewport import Viewport
+from urlab_client.server.editor.world import EditorWorld
 from urlab_client.server.limits import Limits
-from urlab_client.server.markers import Drawings
-from urlab_client.server.observe import Observer
-from urlab_client.server.play import Play, Running
-from urlab_client.server.rendering import CameraStudio, RenderQuality
-from urlab_client.server.replay import recordings, replay_folder
-from urlab_client.server.scene import ArticulationIndex, Scene, compile_scene
-from urlab_client.server.session import Session
-from urlab_client.server.viewport import Viewport
-from urlab_client.server.world import World
+from urlab_client.server.physics.controllers import ControllerConfig
+from urlab_client.server.physics.engine import Engine
+from urlab_client.server.physics.observe import Observer
+from urlab_client.server.physics.play import Play, Running
+from urlab_client.server.physics.replay import recordings, replay_folder
+from urlab_client.server.render.camera_renderer import CameraRenderer, RenderQuality
+from urlab_client.server.session import ServerSession
+from urlab_client.server.system.allocator import trim
+from urlab_client.server.system.health import Health
 
-__all__ = ["PhysicsConfig", "ServerCore", "strangers"]
+__all__ = ["PhysicsConfig", "ServerCore", "unmatched_names"]
 
 logger = logging.getLogger("urlab_client.server")
 
@@ -84,22 +87,26 @@ class ServerCore:
         world: The level being edited.
         physics: How play sessions are set up.
         camera_endpoint: Returns where a camera publishes, from articulation key and camera name.
+        dialect: What the generation of the plugin that it speaks for says differently.
         shm_directory: Directory of the shared-memory regions; None without.
         session: The client's session.
         play: The play session.
         viewport: The viewport's camera.
         drawings: Debug drawing.
+        health: Whether the server's threads run.
         compiled: What the last play session was started with.
     """
 
-    world: World
+    world: EditorWorld
     physics: PhysicsConfig
     camera_endpoint: Callable[[str, str], str]
+    dialect: Dialect = ALPHA
     shm_directory: str | None = None
-    session: Session = field(default_factory=Session)
+    session: ServerSession = field(default_factory=ServerSession)
     play: Play = field(default_factory=Play)
     viewport: Viewport = field(default_factory=Viewport)
     drawings: Drawings = field(init=False)
+    health: Health = field(default_factory=Health)
     compiled: _Compiled | None = None
 
     def refuse(self, code: str, message: str) -> bytes:
@@ -154,7 +161,7 @@ class ServerCore:
         if running is not None and not running.close(timeout):
             return False
         model = compiled.scene.model
-        model.opt = compiled.options
+        copy_options(compiled.options, model)
 
         def build() -> Running:
             data = mujoco.MjData(model)
@@ -165,13 +172,19 @@ class ServerCore:
         self.world.pie_running = True
         return self.play.wait(timeout) is PIEState.READY
 
-    def _run(self, scene: Scene, actors: Sequence[Actor]) -> Running:
+    def _run(self, scene: CompiledScene, actors: Sequence[Actor]) -> Running:
         physics = self.physics
         files = recordings(replay_folder(self.world.content.root))
         controllers = {index.key: config for index in scene.articulations if (config := physics.controller(index))}
-        for problem in strangers(scene, physics):
+        for problem in unmatched_names(scene, physics):
             logger.warning("%s", problem)
-        engine = Engine(scene, pinned_mode=physics.step_mode, paused=not physics.unpaused, controllers=controllers)
+        engine = Engine(
+            scene,
+            pinned_mode=physics.step_mode,
+            paused=not physics.unpaused,
+            controllers=controllers,
+            health=self.health,
+        )
         modes = {
             (index.key, camera.name): physics.camera_mode(index, camera.name)
             for index in scene.articulations
@@ -181,31 +194,32 @@ class ServerCore:
             scene,
             engine.start(),
             Observer(scene, engine.controls),
-            self._studio(scene, actors, modes),
+            self._camera_renderer(scene, actors, modes),
             files,
             self.limits,
         )
 
-    def authored_studio(self) -> CameraStudio:
+    def authored_renderer(self) -> CameraRenderer:
         """Compile the level as it is now and return what draws it; the caller closes it.
 
         Raises:
             CompileFailed: MuJoCo rejects the level.
         """
         actors = self.world.freeze()
-        return self._studio(compile_scene(actors, honour_mjcf_options=self.physics.mjcf_options), actors, {})
+        return self._camera_renderer(compile_scene(actors, honour_mjcf_options=self.physics.mjcf_options), actors, {})
 
-    def _studio(
-        self, scene: Scene, actors: Sequence[Actor], modes: Mapping[tuple[str, str], CameraMode]
-    ) -> CameraStudio:
-        return CameraStudio(scene, modes, {actor.name: _kind(actor) for actor in actors}, self.physics.render_quality)
+    def _camera_renderer(
+        self, scene: CompiledScene, actors: Sequence[Actor], modes: Mapping[tuple[str, str], CameraMode]
+    ) -> CameraRenderer:
+        classes = {actor.name: _kind(actor) for actor in actors}
+        return CameraRenderer(scene, modes, classes, self.physics.render_quality, self.health)
 
     def stop_play(self) -> None:
         """End play, if it runs."""
         self.play.stop()
         self.world.pie_running = False
         self.drawings.clear(in_play=True)
-        give_back()
+        trim()
 
 
 @dataclass(frozen=True)
@@ -213,7 +227,7 @@ class _Compiled:
     """A level that was compiled, and the options its model had before anybody changed them."""
 
     actors: tuple[Actor, ...]
-    scene: Scene
+    scene: CompiledScene
     options: mujoco.MjOption
 
 
@@ -223,7 +237,7 @@ def _kind(actor: Actor) -> str:
     return actor.class_name if mesh is None else Path(mesh.file).stem or mesh.shape
 
 
-def strangers(scene: Scene, physics: PhysicsConfig) -> list[str]:
+def unmatched_names(scene: CompiledScene, physics: PhysicsConfig) -> list[str]:
     """Return what is wrong with configured names that fit nothing in a scene: most likely they are misspelt."""
     actors = {name for index in scene.articulations for name in (index.actor_id, index.key) if name}
     cameras = {

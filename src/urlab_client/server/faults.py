@@ -15,13 +15,13 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final, Self, get_type_hints
 
 import msgspec
 import zmq
 
 from urlab_client.protocol.registry import OPS
-from urlab_client.server.endpoint import RpcEndpoint
+from urlab_client.server.transport.endpoint import RpcEndpoint
 
 __all__ = [
     "ActiveFault",
@@ -38,6 +38,8 @@ __all__ = [
 ]
 
 logger = logging.getLogger("urlab_client.server")
+
+_KINDS: Final = "a Delay, Drop, Cut, Corrupt or Refuse"
 
 NEVER_USED: Final = 0xC1
 """A byte that starts no msgpack value and occurs in no UTF-8 text."""
@@ -67,7 +69,12 @@ class Fault:
 
     def __post_init__(self) -> None:
         if type(self) is Fault:
-            raise TypeError("a fault is a Delay, Drop, Cut, Corrupt or Refuse")
+            raise TypeError(f"a fault is {_KINDS}")
+        for name, kind in get_type_hints(type(self)).items():
+            try:
+                msgspec.convert(getattr(self, name), kind)
+            except msgspec.ValidationError as error:
+                raise TypeError(f"{type(self).__name__}: {name}: {error}") from None
         if self.op is not None and self.op not in OPS:
             raise ValueError(f"there is no op {self.op!r}")
         if self.topic is not None and self.op is not None:
@@ -239,6 +246,9 @@ class Faults:
         Args:
             faults: Applied from the start.
             seed: Of the decisions that `probability` and `corrupt` leave open.
+
+        Raises:
+            TypeError: One of them is not a fault.
         """
         self._seed = seed
         self._made = 0
@@ -256,7 +266,12 @@ class Faults:
         """Apply a fault from now on.
 
         Of several that concern a message all delays are applied, and of the others the first that is due.
+
+        Raises:
+            TypeError: It is not a fault.
         """
+        if not isinstance(fault, Fault):  # pyright: ignore[reportUnnecessaryIsInstance]
+            raise TypeError(f"{fault!r} is not a fault: make {_KINDS}, for example Drop('step')")
         with self._changed:
             added = ActiveFault(self, fault, f"{self._seed}/{self._made}")
             self._made += 1
@@ -289,7 +304,7 @@ class Faults:
         other: ActiveFault | None = None
         with self._changed:
             for active in self._active:
-                if not concerned(active.fault):
+                if not self._concerned(active, concerned):
                     continue
                 if isinstance(active.fault, Delay):
                     if active.due():
@@ -298,6 +313,14 @@ class Faults:
                     other = active
             self._changed.notify_all()
         return delays, other
+
+    def _concerned(self, active: ActiveFault, concerned: Callable[[Fault], bool]) -> bool:
+        try:
+            return concerned(active.fault)
+        except Exception:  # one of a user's own classes
+            logger.exception("%r cannot tell what it concerns and is removed", active)
+            self.remove(active)
+            return False
 
     def wait_for(self, condition: Callable[[], bool], timeout: float) -> bool:
         """Wait until something that changes with the faults is true; return False if it is not in time."""
@@ -408,6 +431,7 @@ class FaultyEndpoint(RpcEndpoint):
         """
         super().__init__(answer, **options)
         self._injector = injector
+        self._envelope: list[bytes] = []
 
     def _exchange(self) -> bool:
         frames = self._socket.recv_multipart(copy=False)
@@ -418,12 +442,19 @@ class FaultyEndpoint(RpcEndpoint):
         if b"" not in parts[1:]:
             return True
         end = parts.index(b"", 1) + 1
+        self._envelope = envelope = parts[:end]
         reply = self._injector.answer(parts[end] if len(parts) == end + 1 else b"", self._answer)
         if reply is Loss.CUT:
             _shut(int(frames[end - 1].get(zmq.SRCFD)))
         elif reply is not Loss.DROP:
-            self._socket.send_multipart([*parts[:end], reply])
+            self._socket.send_multipart([*envelope, reply])
+        self._envelope = []
         return True
+
+    def _send_owed(self, reply: bytes) -> None:
+        envelope, self._envelope = self._envelope, []
+        if envelope:
+            self._socket.send_multipart([*envelope, reply])
 
 
 def _shut(descriptor: int) -> None:

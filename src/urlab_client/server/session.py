@@ -10,10 +10,10 @@ import uuid
 
 from urlab_client.protocol.enums import ObservationLevel
 
-__all__ = ["Session"]
+__all__ = ["ServerSession"]
 
 
-class Session:
+class ServerSession:
     """What the server remembers between requests, apart from the world.
 
     Attributes:

@@ -9,7 +9,7 @@ import threading
 import time
 import warnings
 import weakref
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,30 +21,32 @@ import anyio.to_thread
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client._landlock import is_available
 from urlab_client.protocol.enums import CameraMode, PIEState, StepMode, Transport
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.rows import CameraEndpoint
-from urlab_client.server.bundled import bundled_models
-from urlab_client.server.camera_streams import CameraStreams
-from urlab_client.server.content import ContentRoot
-from urlab_client.server.controllers import ControllerConfig
-from urlab_client.server.core import PhysicsConfig, ServerCore, strangers
-from urlab_client.server.dispatch import Dispatcher
-from urlab_client.server.endpoint import RpcEndpoint, connect_host, numeric_host, tcp
+from urlab_client.server.assets.bundled_robots import bundled_models
+from urlab_client.server.assets.content import ContentRoot
+from urlab_client.server.core import PhysicsConfig, ServerCore, unmatched_names
+from urlab_client.server.editor.markers import Drawings
+from urlab_client.server.editor.viewport import Viewport
+from urlab_client.server.editor.world import EditorWorld
 from urlab_client.server.faults import Faults, FaultyEndpoint, Injector
-from urlab_client.server.guard import CurveServer, Door, UnprotectedServer, is_loopback
 from urlab_client.server.handlers import HANDLERS
 from urlab_client.server.limits import Limits
-from urlab_client.server.markers import Drawings
-from urlab_client.server.publishing import StreamServer
+from urlab_client.server.physics.controllers import ControllerConfig
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.rendering import RenderQuality, find_backend
-from urlab_client.server.scratch import Scratch
-from urlab_client.server.session import Session
-from urlab_client.server.shared_memory import MAX_REPLY_BYTES, SharedMemory
+from urlab_client.server.render.camera_renderer import RenderQuality, find_backend
+from urlab_client.server.rpc.dispatch import Dispatcher
+from urlab_client.server.session import ServerSession
 from urlab_client.server.snapshot import LARGEST_PIXELS, take_snapshot
-from urlab_client.server.viewport import Viewport
-from urlab_client.server.world import World
+from urlab_client.server.streams.camera_streams import CameraStreams
+from urlab_client.server.streams.publishing import StreamServer
+from urlab_client.server.system.health import Health
+from urlab_client.server.system.temporary_folder import TemporaryFolder
+from urlab_client.server.transport.curve_authentication import CurveKeys, CurveServer, UnprotectedServer, is_loopback
+from urlab_client.server.transport.endpoint import RpcEndpoint, connect_host, numeric_host, tcp
+from urlab_client.server.transport.shared_memory import MAX_REPLY_BYTES, SharedMemoryServer
 
 __all__ = ["ModelError", "SimulatedServer"]
 
@@ -222,6 +224,8 @@ class SimulatedServer:
     def __repr__(self) -> str:
         opened = self._opened
         where = "closed" if opened is None else f"{self.address}:{opened.endpoint.port}"
+        if self.failure is not None:
+            where += f", failed: {self.failure}"
         return f"<{type(self).__name__} {' '.join(self._config.models) or 'empty'} at {where}>"
 
     # Life
@@ -261,8 +265,8 @@ class SimulatedServer:
 
         The session is ended, play starts afresh from the level's initial state or is stopped, and nothing is left of
         modes, options, controllers, recordings, drawings and faults. That takes milliseconds. Where a level was
-        edited or a file written, or where the server hangs, it is closed and started again instead, after which free
-        ports have other numbers. Files in a `saved_dir` of the caller's own stay.
+        edited or a file written, or where the server hangs or has failed, it is closed and started again instead,
+        after which free ports have other numbers. Files in a `saved_dir` of the caller's own stay.
 
         Raises:
             OSError, ModelError: It could not be started again; see `start`.
@@ -296,6 +300,26 @@ class SimulatedServer:
         if len(size) != 2 or not all(1 <= side <= LARGEST_PIXELS for side in size):
             raise ValueError(f"size is a width and a height from 1 to {LARGEST_PIXELS} pixels, not {size!r}")
         return self._running.snapshot((int(size[0]), int(size[1])), frame_all=frame_all)
+
+    @property
+    def failure(self) -> str | None:
+        """Which of its threads died, and of what; None while all run, and while the server is closed.
+
+        A server that has failed refuses every request with `internal_error` and this text, until it is closed and
+        started again.
+        """
+        opened = self._opened
+        return None if opened is None else opened.health.failure
+
+    def add_failure_callback(self, callback: Callable[[str], None]) -> None:
+        """Call `callback` with `failure` when a thread of the server dies, on that thread; at once if one has died.
+
+        It counts until the server is closed.
+
+        Raises:
+            RuntimeError: The server is closed.
+        """
+        self._running.health.add_callback(callback)
 
     @property
     def can_render(self) -> bool:
@@ -379,11 +403,11 @@ class SimulatedServer:
     @property
     def open_to(self) -> str:
         """Who can use the server, in words: this machine alone, holders of keys, or anyone on an interface."""
-        host, door = self._running.host, self._running.door
+        host, curve_keys = self._running.host, self._running.curve_keys
         where = "this machine" if is_loopback(host) else _INTERFACES.get(host, f"the network at {host}")
-        if door is None:
+        if curve_keys is None:
             return f"any program on {where}" if is_loopback(host) else f"anyone on {where}, without authentication"
-        who = "whoever has the server's key" if door.clients is None else f"{door.clients} client key(s)"
+        who = "whoever has the server's key" if curve_keys.clients is None else f"{curve_keys.clients} client key(s)"
         return f"{who} on {where}, encrypted"
 
     @property
@@ -396,8 +420,8 @@ class SimulatedServer:
 
         With `curve` that includes the server's public key. A client that must show who it is adds its `client_key`.
         """
-        door = self._running.door
-        return ({} if door is None else {"server_key": door.public_key}) | {
+        curve_keys = self._running.curve_keys
+        return ({} if curve_keys is None else {"server_key": curve_keys.public_key}) | {
             "address": self.address,
             "step_port": self.step_port,
             "state_port": self.state_port,
@@ -418,24 +442,25 @@ class _Opened:
 
     def __init__(self, config: _Config) -> None:
         self.host = numeric_host(config.host)
-        self.door = None if config.curve is None else Door(config.curve)
-        if self.door is None and not config.insecure_no_auth and not is_loopback(self.host):
+        self.curve_keys = None if config.curve is None else CurveKeys(config.curve)
+        if self.curve_keys is None and not config.insecure_no_auth and not is_loopback(self.host):
             raise UnprotectedServer(
                 f"{config.host} ({self.host}) can be reached from other machines, and a client can read and write "
                 "files of this one.",
                 hint="Protect the server with CURVE keys (--server-key and --allow-client, or curve=…), "
                 "or say --insecure-no-auth (insecure_no_auth=True).",
             )
+        self.health = Health()
         self._cameras: CameraStreams | None = None
         self._streams: StreamServer | None = None
-        self._scratch: Scratch | None = None
+        self._temporary_folder: TemporaryFolder | None = None
         self._injector: Injector | None = None
         self._dispatcher: Dispatcher | None = None
         self._plays = config.play
         self._faults = config.faults
         self._authored: object = None
         self._endpoint: RpcEndpoint | None = None
-        self._memory: SharedMemory | None = None
+        self._memory: SharedMemoryServer | None = None
         self._core: ServerCore | None = None
         self._closed = False
         self._pid = os.getpid()
@@ -473,7 +498,7 @@ class _Opened:
         return self._cameras
 
     @property
-    def memory(self) -> SharedMemory | None:
+    def memory(self) -> SharedMemoryServer | None:
         """The shared memory, if there is any."""
         return self._memory
 
@@ -486,26 +511,30 @@ class _Opened:
 
     def _start(self, config: _Config) -> None:
         ports = config.ports
-        memory = self._memory = None if config.shm_dir is None else SharedMemory(config.shm_dir)
-        cameras = self._cameras = CameraStreams(host=self.host, port=ports.camera, door=self.door, memory=memory)
+        memory = self._memory = None if config.shm_dir is None else SharedMemoryServer(config.shm_dir, self.health)
+        cameras = self._cameras = CameraStreams(
+            health=self.health, host=self.host, port=ports.camera, curve_keys=self.curve_keys, memory=memory
+        )
         self._streams = StreamServer(
             lambda scene: [
                 CameraEndpoint(camera.name, cameras.endpoint(index.key, camera.name))
                 for index in scene.articulations
                 for camera in index.cameras
             ],
+            health=self.health,
             host=self.host,
             state_port=ports.state,
             ctrl_port=ports.ctrl,
             info_port=ports.info,
-            door=self.door,
+            curve_keys=self.curve_keys,
             memory=memory,
         )
         core = ServerCore(
-            world=World(self._content(config), actor_names=config.actor_names),
+            world=EditorWorld(self._content(config), actor_names=config.actor_names),
             physics=config.physics,
             camera_endpoint=cameras.endpoint,
             shm_directory=None if memory is None else str(memory.directory),
+            health=self.health,
         )
         self._core = core
         if config.faults is not None:
@@ -517,7 +546,8 @@ class _Opened:
         # Bound before the models are read, which takes longer, and answering after: requests wait in the socket.
         self._dispatcher = Dispatcher(core, HANDLERS)
         answer = self._dispatcher.answer
-        where: dict[str, Any] = {"host": self.host, "port": ports.step, "door": self.door}
+        where: dict[str, Any] = {"host": self.host, "port": ports.step, "curve_keys": self.curve_keys}
+        where |= {"refuse": core.refuse, "health": self.health}
         where["request_bytes"] = config.limits.request_bytes
         self._endpoint = (
             RpcEndpoint(answer, **where) if self._injector is None else FaultyEndpoint(self._injector, answer, **where)
@@ -531,21 +561,24 @@ class _Opened:
             if core.play.wait(_NO_LIMIT) is not PIEState.READY:
                 raise ModelError(f"play cannot start: {core.play.compile_error}")
             # Whoever starts play with the server means what is there; actors to come are for a later begin_pie.
-            for problem in strangers(core.play.running().scene, config.physics):
+            for problem in unmatched_names(core.play.running().scene, config.physics):
                 raise ModelError(problem)
         self._authored = self._mark(core)
         self._endpoint.start()
         if memory is not None:
             memory.start(partial(answer, transport=Transport.SHM, max_reply_bytes=MAX_REPLY_BYTES))
-        if self.door is None and not is_loopback(self.host):
+        if not is_available():
+            tell = logger.info if is_loopback(self.host) else logger.warning
+            tell("this system has no Landlock: files that clients' models name are checked, but not kept from MuJoCo")
+        if self.curve_keys is None and not is_loopback(self.host):
             logger.warning("open to anyone who reaches %s, without authentication or encryption", self.host)
         logger.info("serving at %s:%d", tcp(self.host), self._endpoint.port)
 
     def _content(self, config: _Config) -> ContentRoot:
         folder = config.saved_dir
         if folder is None:
-            self._scratch = Scratch()
-            folder = self._scratch.path
+            self._temporary_folder = TemporaryFolder()
+            folder = self._temporary_folder.path
         roots = config.model_roots
         if roots is None:
             files = [Path(model).resolve() for model in config.models if Path(model).is_file()]
@@ -559,12 +592,16 @@ class _Opened:
             return False
         if self._faults is not None:
             self._faults.reset()
-        if not all(served.alive for served in self._served()):
+        if self.health.failure is not None or not all(served.alive for served in self._served()):
             return False
         with dispatcher.standstill(CLOSE_S) as idle:
             if not idle or self._mark(core) != self._authored:
                 return False
-            core.session, core.viewport, core.drawings = Session(), Viewport(), Drawings(limit=core.limits.markers)
+            core.session, core.viewport, core.drawings = (
+                ServerSession(),
+                Viewport(),
+                Drawings(limit=core.limits.markers),
+            )
             core.world.selected = ""
             if self._plays:
                 return core.begin_play_again(CLOSE_S)
@@ -581,13 +618,13 @@ class _Opened:
     def _mark(self, core: ServerCore) -> object:
         """Return something that compares equal for as long as nothing was authored or written."""
         files: set[tuple[Path, int, int]] = set()
-        if self._scratch is not None:
-            for file in self._scratch.path.rglob("*"):
+        if self._temporary_folder is not None:
+            for file in self._temporary_folder.path.rglob("*"):
                 status = file.lstat()
                 files.add((file, status.st_mtime_ns, status.st_size))
         return core.world.authored(), files
 
-    def _served(self) -> list[RpcEndpoint | StreamServer | CameraStreams | SharedMemory]:
+    def _served(self) -> list[RpcEndpoint | StreamServer | CameraStreams | SharedMemoryServer]:
         """Return what has a thread; shared memory last, since the streams write to it."""
         every = (self._endpoint, self._streams, self._cameras, self._memory)
         return [served for served in every if served is not None]
@@ -609,15 +646,15 @@ class _Opened:
             idle = served.join(max(0.0, deadline - time.monotonic())) and idle
         if not idle:
             logger.warning("a request was still under way when the server closed; its thread ends after it")
-        if self._scratch is not None:
-            self._scratch.close()
+        if self._temporary_folder is not None:
+            self._temporary_folder.close()
 
 
 def _is_level(model: str) -> bool:
     return model.lower().endswith(".json")
 
 
-def _populate(world: World, models: Sequence[str]) -> None:
+def _populate(world: EditorWorld, models: Sequence[str]) -> None:
     """Open the level among `models`, place the others, and see to a manager."""
     for level in filter(_is_level, models):
         world.load_level_file(Path(level))
@@ -631,7 +668,7 @@ def _populate(world: World, models: Sequence[str]) -> None:
     world.ensure_manager()
 
 
-def _place(world: World, model: str, sources: dict[str, str], edge: float | None) -> float | None:
+def _place(world: EditorWorld, model: str, sources: dict[str, str], edge: float | None) -> float | None:
     """Import a model and place it beyond `edge`, the largest y in use; return the new one.
 
     `sources` holds the files imported so far by blueprint.
@@ -645,14 +682,14 @@ def _place(world: World, model: str, sources: dict[str, str], edge: float | None
     other = sources.setdefault(blueprint.stem, path)
     if other != path:
         raise ModelError(f"{model} and {other} would both become blueprint '{blueprint.stem}': rename one of the files")
-    placed = world.spawn_actor(blueprint.class_path, _free_id(world, Path(path).stem))
-    bounds = world.get_actor_bounds(placed.actor_name, components_only=True)
+    actor = world.spawn_actor(blueprint.class_path, _free_id(world, Path(path).stem)).actor
+    bounds = world.get_actor_bounds(actor.name, components_only=True)
     if bounds.extents != (0.0, 0.0, 0.0) and edge is not None:
-        world.set_actor_transform(placed.actor_name, location=(0.0, edge + GAP_M - bounds.min[1], 0.0))
-    return _beyond(world, placed.actor_name, edge)
+        world.set_actor_transform(actor.name, location=(0.0, edge + GAP_M - bounds.min[1], 0.0))
+    return _beyond(world, actor.name, edge)
 
 
-def _free_id(world: World, stem: str) -> str:
+def _free_id(world: EditorWorld, stem: str) -> str:
     name, count = stem, 0
     while world.actor(name) is not None:
         count += 1
@@ -660,7 +697,7 @@ def _free_id(world: World, stem: str) -> str:
     return name
 
 
-def _beyond(world: World, actor_name: str, edge: float | None) -> float | None:
+def _beyond(world: EditorWorld, actor_name: str, edge: float | None) -> float | None:
     """Return the larger of `edge` and the actor's largest y; an actor without a box has none."""
     bounds = world.get_actor_bounds(actor_name, components_only=True)
     if bounds.extents == (0.0, 0.0, 0.0):

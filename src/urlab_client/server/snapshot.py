@@ -11,13 +11,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client.server.compile.scene import CompileFailed
 from urlab_client.server.core import ServerCore
-from urlab_client.server.dispatch import Dispatcher
 from urlab_client.server.handlers.viewport import look
-from urlab_client.server.picture import Picture
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.rendering import RenderingUnavailable, need_backend
-from urlab_client.server.scene import CompileFailed
+from urlab_client.server.render.camera_renderer import RenderingUnavailable, need_backend
+from urlab_client.server.render.viewport_picture import ViewportPicture
+from urlab_client.server.rpc.dispatch import Dispatcher
 
 __all__ = ["LARGEST_PIXELS", "take_snapshot"]
 
@@ -52,7 +52,7 @@ def take_snapshot(
         if not idle:
             raise RenderingUnavailable(f"a request was being answered for more than {PATIENCE_S:g} s")
         view = look(server)
-        picture = Picture(
+        picture = ViewportPicture(
             size=size,
             view=replace(view, fov=min(view.fov, _FRAMING_FOV)) if frame_all else view,
             fit=frame_all,
@@ -66,16 +66,16 @@ def take_snapshot(
             if running is not None:
                 with running.engine.lock:
                     job = running.cameras.capture_viewport(picture)
-                studio = running.cameras
+                renderer = running.cameras
             else:
-                studio = server.authored_studio()
-                job = studio.capture_viewport(picture)
+                renderer = server.authored_renderer()
+                job = renderer.capture_viewport(picture)
         except Refusal as refusal:
             raise RenderingUnavailable(f"the state cannot be read: {refusal.message}") from None
         except CompileFailed as error:
             raise RenderingUnavailable(f"the level does not compile: {error.message}") from None
     try:
-        return studio.paint(job)
+        return renderer.paint(job)
     finally:
         if running is None:
-            studio.close()
+            renderer.close()

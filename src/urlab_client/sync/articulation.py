@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from urlab_client.aio import articulation as aio
-from urlab_client.aio.handles import Actuator, Body, Joint, Sensor
+from urlab_client.aio.model.elements import Actuator, Body, Joint, Sensor
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.enums import ControlMode
 from urlab_client.protocol.names import NameMap

@@ -10,7 +10,7 @@ import numpy as np
 
 from urlab_client.aio import cameras as aio
 from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.publishers import SharedFrame
+from urlab_client.aio.live.publishers import SharedFrame
 from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraInfo
@@ -87,8 +87,9 @@ class URLabCameraView(Facade, twin=aio.URLabCameraView):
             policy: `latest`, or `all` within the buffer.
             buffer: Pictures that may wait, with `all`.
             buffer_bytes: Bytes that may wait, with `all`.
-            timeout: Seconds that iterating waits for each picture; by default the client's for the first one and then
-                without limit; None waits.
+            timeout: Seconds that iterating waits for each picture; by default the client's for the first one, or 30
+                where that is less and the server is there and in live mode (it may still be looking for OpenGL), and
+                then without limit; None waits.
 
         Raises:
             ValueError: Unknown policy, or an empty buffer.

@@ -26,6 +26,7 @@ from urlab_client.sync._portal import FacadeRoot
 from urlab_client.sync.articulation import URLabArticulation, URLabEntity
 from urlab_client.sync.cameras import URLabCameraView
 from urlab_client.sync.namespaces.debug import DebugNamespace
+from urlab_client.sync.namespaces.farm import FarmNamespace
 from urlab_client.sync.namespaces.outliner import OutlinerNamespace
 from urlab_client.sync.namespaces.recording import RecordingNamespace, ReplayNamespace
 from urlab_client.sync.namespaces.runtime import RuntimeNamespace
@@ -152,6 +153,11 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
     def viewport(self) -> ViewportNamespace:
         """The editor's perspective viewport."""
         return self._portal.wrap(ViewportNamespace, self._aio.viewport)
+
+    @property
+    def farm(self) -> FarmNamespace:
+        """Sharing servers among clients."""
+        return self._portal.wrap(FarmNamespace, self._aio.farm)
 
     @property
     def recording(self) -> RecordingNamespace:
@@ -299,7 +305,7 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
             URLabConnectionError: With `transport="shm"`, the server's shared memory is not on this machine.
             AuthenticationFailed: Server and client do not accept each other's keys.
         """
-        self._portal.call(self._aio.discover(observations, timeout=timeout))
+        self._portal.call(self._aio.discover, observations, timeout=timeout)
 
     def step(
         self,
@@ -333,7 +339,7 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
             NoSession: `discover()` was not called, or was broken off; nothing was sent.
         """
         return self._portal.call(
-            self._aio.step(n_steps, include_cameras=include_cameras, observations=observations, timeout=timeout)
+            self._aio.step, n_steps, include_cameras=include_cameras, observations=observations, timeout=timeout
         )
 
     def reset(
@@ -359,7 +365,7 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
             UnknownKeyframe: No keyframe, or more than one, has this name; nothing was reset.
             KeyError: Unknown articulation or joint; nothing was sent.
         """
-        return self._portal.call(self._aio.reset(keyframe_name, seed, per_articulation_qpos, timeout=timeout))
+        return self._portal.call(self._aio.reset, keyframe_name, seed, per_articulation_qpos, timeout=timeout)
 
     def resync(self, *, timeout: Timeout = DEFAULT) -> Resync:
         """Find out what became of steps, resets and mode changes whose replies were lost, and go on from there.
@@ -378,7 +384,7 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
         Raises:
             URLabConnectionError: The server is not back yet. What is in doubt stays so for the next attempt.
         """
-        return self._portal.call(self._aio.resync(timeout=timeout))
+        return self._portal.call(self._aio.resync, timeout=timeout)
 
     def state_stream(
         self,
@@ -467,27 +473,27 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
         Raises:
             URLabRPCError: The server refused.
         """
-        return self._portal.call(self._aio.call(request, timeout=timeout))
+        return self._portal.call(self._aio.call, request, timeout=timeout)
 
     def explain(self) -> Diagnosis:
         """Find out why a robot does not move: sockets, versions, play, pause, modes, controllers, set-points.
 
         Takes a few seconds at most, raises nothing about what it finds, and changes nothing on the server.
         """
-        return self._portal.call(self._aio.explain())
+        return self._portal.call(self._aio.explain)
 
     def meta(self, *, timeout: Timeout = DEFAULT) -> list[OpInfo]:
         """List the ops that the server offers; needs no session."""
-        return self._portal.call(self._aio.meta(timeout=timeout))
+        return self._portal.call(self._aio.meta, timeout=timeout)
 
     def close(self) -> None:
         """Take back a step mode that `discover()` promoted, and close the connection. Idempotent."""
-        self._portal.close(self._aio.close())
+        self._portal.close(self._aio.close)
 
     def __enter__(self) -> Self:
-        return self._portal.wrap(type(self), self._portal.call(self._aio.__aenter__()))
+        return self._portal.wrap(type(self), self._portal.call(self._aio.__aenter__))
 
     def __exit__(
         self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self._portal.close(self._aio.__aexit__(exc_type, exc, traceback))
+        self._portal.close(self._aio.__aexit__, exc_type, exc, traceback)

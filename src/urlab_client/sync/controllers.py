@@ -51,11 +51,11 @@ class URLabController(Facade, twin=aio.URLabController):
         Raises:
             ControllerSchemaViolation: A parameter does not fit the schema; nothing was sent.
         """
-        return self._portal.call(self._aio.configure(timeout=timeout, **params))
+        return self._portal.call(self._aio.configure, timeout=timeout, **params)
 
     def refresh(self, *, timeout: Timeout = DEFAULT) -> dict[str, Any]:
         """Pull the parameters from the server again and return them."""
-        return self._portal.call(self._aio.refresh(timeout=timeout))
+        return self._portal.call(self._aio.refresh, timeout=timeout)
 
 
 class URLabPDController(URLabController, twin=aio.URLabPDController):
@@ -95,7 +95,7 @@ class URLabPDController(URLabController, twin=aio.URLabPDController):
         Raises:
             ControllerSchemaViolation: An unknown actuator or a value below the minimum; nothing was sent.
         """
-        return self._portal.call(self._aio.set_gains(kp, kv, torque_limit, timeout=timeout))
+        return self._portal.call(self._aio.set_gains, kp, kv, torque_limit, timeout=timeout)
 
     def set_defaults(
         self,
@@ -110,4 +110,4 @@ class URLabPDController(URLabController, twin=aio.URLabPDController):
         Raises:
             ControllerSchemaViolation: A value is below the minimum; nothing was sent.
         """
-        return self._portal.call(self._aio.set_defaults(kp, kv, torque_limit, timeout=timeout))
+        return self._portal.call(self._aio.set_defaults, kp, kv, torque_limit, timeout=timeout)

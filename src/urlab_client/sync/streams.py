@@ -72,7 +72,8 @@ class Stream(Facade, Generic[T], twin=aio.Stream):
         """Return the next item.
 
         Args:
-            timeout: Seconds to wait; None waits without limit.
+            timeout: Seconds to wait; None waits without limit. By default the client's `rcv_timeout_ms`, or 30 s where
+                that is less and a server in live mode may still be preparing its first picture.
 
         Raises:
             URLabTimeoutError: Nothing came in time; says at which stage, and what to look at.
@@ -81,19 +82,19 @@ class Stream(Facade, Generic[T], twin=aio.Stream):
             ClientClosed: The client was closed, and what had arrived is read.
             URLabError: The stream was closed.
         """
-        return self._portal.call(self._aio.receive(timeout=timeout))
+        return self._portal.call(self._aio.receive, timeout=timeout)
 
     def close(self) -> None:
         """Stop receiving and drop what waits. A reader's iteration ends. Idempotent."""
-        self._portal.release(self._aio.aclose())
+        self._portal.release(self._aio.aclose)
 
     def __enter__(self) -> Self:
-        return self._portal.wrap(type(self), self._portal.call(self._aio.__aenter__()))
+        return self._portal.wrap(type(self), self._portal.call(self._aio.__aenter__))
 
     def __exit__(
         self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self._portal.release(self._aio.__aexit__(exc_type, exc, traceback))
+        self._portal.release(self._aio.__aexit__, exc_type, exc, traceback)
 
     def __iter__(self) -> Self:
         return self

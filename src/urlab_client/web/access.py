@@ -169,7 +169,7 @@ def _is_entrance(scope: Scope) -> bool:
 def _said(scope: Scope, refusal: _Refusal) -> Response:
     status, code, text = refusal
     if "text/html" in Headers(scope=scope).get("accept", ""):
-        return HTMLResponse(_PAGE.format(title="The door is closed", text=html.escape(text)), status)
+        return HTMLResponse(_PAGE.format(title="Access denied", text=html.escape(text)), status)
     return JSONResponse({"error": {"code": code, "message": text}}, status)
 
 

@@ -27,10 +27,10 @@ from urlab_client.protocol.errors import (
     URLabRPCError,
     URLabTimeoutError,
 )
-from urlab_client.web import studio
+from urlab_client.web import mujoco_viewer
 from urlab_client.web.access import Access, Guarded
-from urlab_client.web.desk import Audience, Desk
-from urlab_client.web.lease import Lease, NotDriving, Viewer
+from urlab_client.web.console_session import Audience, ConsoleSession
+from urlab_client.web.driving_lease import DrivingLease, NotDriving, Viewer
 from urlab_client.web.ops import encode, openapi, parse, served
 
 if TYPE_CHECKING:
@@ -59,32 +59,32 @@ def app(client: URLabClient, *, access: Access | None = None, lease_seconds: flo
         lease_seconds: How long a viewer keeps the controls without using them.
     """
     access = access or Access()
-    site = _Site(Desk(client, Lease(lease_seconds)), access)
+    site = _Site(ConsoleSession(client, DrivingLease(lease_seconds)), access)
 
     @contextlib.asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncGenerator[None]:
-        async with site.desk.open():
+        async with site.console.open():
             yield
 
     application = Starlette(routes=site.routes(), middleware=[Middleware(Guarded, access=access)], lifespan=lifespan)
     application.state.access = access
-    application.state.desk = site.desk
+    application.state.console = site.console
     return application
 
 
-class _Run(Struct):
+class _RunRequest(Struct):
     running: bool
 
 
-class _Steps(Struct):
+class _StepRequest(Struct):
     n_steps: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] = 1
 
 
-class _Frame(Struct):
+class _SeekRequest(Struct):
     frame: int
 
 
-class _Token(Struct):
+class _LoginRequest(Struct):
     token: str
 
 
@@ -99,8 +99,8 @@ class _Message(Struct):
 
 
 class _Site:
-    def __init__(self, desk: Desk, access: Access) -> None:
-        self.desk = desk
+    def __init__(self, console: ConsoleSession, access: Access) -> None:
+        self.console = console
         self._access = access
         self._viewers: dict[str, Viewer] = {}
 
@@ -132,7 +132,7 @@ class _Site:
         ]
 
     def _studio_routes(self) -> list[Route | WebSocketRoute | Mount]:
-        shipped = studio.files()
+        shipped = mujoco_viewer.files()
         if shipped is None:
             return []
 
@@ -155,56 +155,58 @@ class _Site:
         return _json(openapi())
 
     async def _world(self, request: Request) -> Response:
-        return _json(encode(self.desk.world))
+        return _json(encode(self.console.world))
 
     async def _status(self, request: Request) -> Response:
-        return _json(encode(self.desk.status(self._viewer(request))))
+        return _json(encode(self.console.status(self._viewer(request))))
 
     async def _state(self, request: Request) -> Response:
-        if self.desk.state_json is None:
+        if self.console.state_json is None:
             return _error(503, "no_state", "No state has arrived yet.", "Is play running?")
-        return _json(self.desk.state_json)
+        return _json(self.console.state_json)
 
     async def _log(self, request: Request) -> Response:
-        return _json(encode(list(self.desk.entries)))
+        return _json(encode(list(self.console.entries)))
 
     async def _op(self, request: Request) -> Response:
         op = served(request.path_params["op"])
         if op is None:
             return _error(404, "unknown_op", f"There is no op {request.path_params['op']!r} here.", "See openapi.json.")
         body = await _body(request)
-        return _json(encode(await self.desk.do(self._viewer(request), parse(op, body))))
+        return _json(encode(await self.console.do(self._viewer(request), parse(op, body))))
 
     async def _ctrl(self, request: Request) -> Response:
         values = msgspec.json.decode(await _body(request), type=dict[str, dict[str, float]])
-        self.desk.set_points(self._viewer(request), values)
+        self.console.set_points(self._viewer(request), values)
         return _json(b"{}")
 
     async def _run(self, request: Request) -> Response:
-        await self.desk.run(self._viewer(request), msgspec.json.decode(await _body(request), type=_Run).running)
+        await self.console.run(
+            self._viewer(request), msgspec.json.decode(await _body(request), type=_RunRequest).running
+        )
         return _json(b"{}")
 
     async def _step(self, request: Request) -> Response:
-        steps = msgspec.json.decode(await _body(request) or b"{}", type=_Steps)
-        return _json(encode(await self.desk.step(self._viewer(request), steps.n_steps)))
+        steps = msgspec.json.decode(await _body(request) or b"{}", type=_StepRequest)
+        return _json(encode(await self.console.step(self._viewer(request), steps.n_steps)))
 
     async def _seek(self, request: Request) -> Response:
-        wanted = msgspec.json.decode(await _body(request), type=_Frame).frame
-        frame, total = await self.desk.seek(self._viewer(request), wanted)
+        wanted = msgspec.json.decode(await _body(request), type=_SeekRequest).frame
+        frame, total = await self.console.seek(self._viewer(request), wanted)
         return _json(encode({"frame": frame, "total": total}))
 
     async def _lease(self, request: Request) -> Response:
         viewer = self._viewer(request)
         if request.method == "POST":
-            self.desk.lease.use(viewer)
+            self.console.lease.use(viewer)
         else:
-            self.desk.lease.release(viewer)
-        self.desk.tell()
-        return _json(encode(self.desk.status(viewer)))
+            self.console.lease.release(viewer)
+        self.console.tell()
+        return _json(encode(self.console.status(viewer)))
 
     async def _connection(self, request: Request) -> Response:
-        self.desk.lease.use(self._viewer(request))
-        self.desk.take_back()
+        self.console.lease.use(self._viewer(request))
+        self.console.take_back()
         return _json(b"{}")
 
     async def _invite(self, request: Request) -> Response:
@@ -212,13 +214,13 @@ class _Site:
         return _json(encode({"token": token, "path": f"{request.scope.get('root_path', '')}/?token={token}"}))
 
     async def _enter(self, request: Request) -> Response:
-        key = self._access.admit(msgspec.json.decode(await _body(request), type=_Token).token)
+        key = self._access.admit(msgspec.json.decode(await _body(request), type=_LoginRequest).token)
         if key is None:
             return _error(401, "bad_token", "This token is unknown, or was used before.")
         return _json(encode({"key": key}))
 
     async def _picture(self, request: Request) -> Response:
-        feed = self.desk.feed(request.path_params["path"])
+        feed = self.console.feed(request.path_params["path"])
         if feed is None:
             return _error(404, "unknown_camera", f"There is no camera {request.path_params['path']!r}.")
         async with feed.watch():
@@ -235,8 +237,8 @@ class _Site:
         self._viewers[viewer.key] = viewer
         one = Audience(viewer)
         flow = _Flow()
-        self.desk.audience.add(one)
-        self.desk.tell()
+        self.console.audience.add(one)
+        self.console.tell()
         try:
             await socket.send_json({"type": "you", "viewer": viewer.key, "name": viewer.name})
             async with anyio.create_task_group() as tasks:
@@ -245,33 +247,37 @@ class _Site:
                     await self._listen(socket, one, flow)
                 tasks.cancel_scope.cancel()
         finally:
-            self.desk.audience.discard(one)
-            self.desk.lease.release(viewer)
+            self.console.audience.discard(one)
+            self.console.lease.release(viewer)
             del self._viewers[viewer.key]
-            self.desk.tell()
+            self.console.tell()
 
     async def _send(self, socket: WebSocket, one: Audience, flow: _Flow) -> None:
-        desk = self.desk
+        console = self.console
         world = state = line = -1
         status = b""
         with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # gone; the listener ends the rest
             while True:
                 one.changed.clear()
-                if world != desk.world.version:
-                    world = desk.world.version
-                    await socket.send_text(desk.world_json.decode())
-                now = encode(desk.status(one.viewer))
+                if world != console.world.version:
+                    world = console.world.version
+                    await socket.send_text(console.world_json.decode())
+                now = encode(console.status(one.viewer))
                 if now != status:
                     status = now
                     await socket.send_text(now.decode())
-                news = [entry for entry in desk.entries if entry.n > line]
+                news = [entry for entry in console.entries if entry.n > line]
                 if news:
                     line = news[-1].n
                     await socket.send_text(encode({"type": "log", "entries": news}).decode())
-                if desk.state_json is not None and state != desk.state_seq and flow.sent - flow.acknowledged < _AHEAD:
-                    state = desk.state_seq
+                if (
+                    console.state_json is not None
+                    and state != console.state_seq
+                    and flow.sent - flow.acknowledged < _AHEAD
+                ):
+                    state = console.state_seq
                     flow.sent += 1
-                    await socket.send_text(desk.state_json.decode())
+                    await socket.send_text(console.state_json.decode())
                 await one.changed.wait()
 
     async def _listen(self, socket: WebSocket, one: Audience, flow: _Flow) -> None:
@@ -287,16 +293,16 @@ class _Site:
                         await socket.send_json({"type": "pong", "at": message.at, "now": _now_ms()})
                     case "name":
                         one.viewer.name = " ".join(message.name.split())[:24] or one.viewer.name
-                        self.desk.tell()
+                        self.console.tell()
                     case "ctrl":
-                        self.desk.set_points(one.viewer, message.values)
+                        self.console.set_points(one.viewer, message.values)
                     case _:
                         raise ValueError(f"there is no message of type {message.type!r}")  # noqa: TRY301 - answered
             except (NotDriving, ValueError, KeyError, RecursionError, msgspec.MsgspecError) as error:
                 await socket.send_text(encode({"type": "refused", "error": _explain(error)[1]}).decode())
 
     async def _pictures(self, socket: WebSocket) -> None:
-        feed = self.desk.feed(socket.path_params["path"])
+        feed = self.console.feed(socket.path_params["path"])
         await socket.accept()
         if feed is None:
             await socket.close(4404, "no such camera")
@@ -328,10 +334,10 @@ class _Site:
 
     async def _model(self, request: Request) -> Response:
         """Answer with the model, its size, or a part of it, as the viewer's page asks."""
-        shown = await self.desk.studio.shown()
+        shown = await self.console.mujoco_viewer.shown()
         query = request.query_params
         if shown is None or query.get("crc32", str(shown.crc)) != str(shown.crc):
-            return _error(404, "no_model", self.desk.studio.missing or "The model is another one now.")
+            return _error(404, "no_model", self.console.mujoco_viewer.missing or "The model is another one now.")
         if "total_bytes" in query:
             return _json(encode({"total_bytes": len(shown.bundle)}))
         start = int(query.get("offset_bytes", 0))
@@ -342,28 +348,28 @@ class _Site:
 
     async def _poses(self, socket: WebSocket) -> None:
         await socket.accept()
-        await socket.send_text(studio.SPECTATOR)
+        await socket.send_text(mujoco_viewer.SPECTATOR)
         flow = _Flow()
-        with self.desk.bell() as changed:
+        with self.console.bell() as changed:
 
             async def send() -> None:
                 sent = None
                 with contextlib.suppress(WebSocketDisconnect, RuntimeError):
                     while True:
                         changed.clear()
-                        snapshot = self.desk.snapshot
-                        shown = await self.desk.studio.shown()
+                        snapshot = self.console.snapshot
+                        shown = await self.console.mujoco_viewer.shown()
                         if shown and snapshot and snapshot is not sent and flow.sent - flow.acknowledged < _AHEAD:
                             sent = snapshot
                             flow.sent += 1
-                            await socket.send_bytes(self.desk.studio.write(shown, snapshot))
+                            await socket.send_bytes(self.console.mujoco_viewer.write(shown, snapshot))
                         await changed.wait()
 
             async with anyio.create_task_group() as tasks:
                 tasks.start_soon(send)
                 while (said := await socket.receive())["type"] == "websocket.receive":
                     # Besides this it asks for control of MuJoCo's own panels, which there are none of here.
-                    if said.get("text") == studio.SHOWN:
+                    if said.get("text") == mujoco_viewer.SHOWN:
                         flow.acknowledged += 1
                         changed.set()
                 tasks.cancel_scope.cancel()
@@ -371,7 +377,7 @@ class _Site:
     async def _taken(self, socket: WebSocket) -> None:
         with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # gone already
             await socket.accept()
-            await socket.close(studio.TAKEN, "this page watches")
+            await socket.close(mujoco_viewer.TAKEN, "this page watches")
 
     # Viewers
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 import msgspec
 import numpy as np
 
-from urlab_client.protocol.base import Op, Request, Timing
+from urlab_client.protocol.base import Effect, Op, Request
 from urlab_client.protocol.codec import from_wire_array
 from urlab_client.protocol.messages.runtime import (
     ConfigureController,
@@ -141,7 +141,7 @@ def openapi() -> bytes:
 
 def _operation(op: Op) -> dict[str, Any]:
     doc = (op.request.__doc__ or "").strip()
-    drives = op.effect is not Timing.READ
+    drives = op.effect is not Effect.READ
     note = "\n\nNeeds the controls: 423 while another viewer has them." if drives else ""
     return {
         "operationId": op.name,

@@ -22,14 +22,14 @@ from urlab_client.protocol.messages.streams import CameraSample
 if TYPE_CHECKING:
     from urlab_client.aio import URLabCameraView, URLabClient
 
-__all__ = ["Feed", "Picture", "jpeg"]
+__all__ = ["EncodedPicture", "Feed", "jpeg"]
 
 _FASTEST_S = 1 / 30
 _LOOK_S = 0.5
 _QUALITY = 80
 
 
-class Picture:
+class EncodedPicture:
     """One encoded picture.
 
     Attributes:
@@ -63,7 +63,7 @@ class Feed:
     """
 
     def __init__(self, client: URLabClient, view: URLabCameraView) -> None:
-        self.newest: Picture | None = None
+        self.newest: EncodedPicture | None = None
         self._client = client
         self.view = view
         self._watchers = 0
@@ -96,7 +96,7 @@ class Feed:
             task.cancel()
             await asyncio.wait((task,))
 
-    async def after(self, seq: int) -> Picture:
+    async def after(self, seq: int) -> EncodedPicture:
         """Return the newest picture once it is newer than number `seq`."""
         async with self._changed:
             while self.newest is None or self.newest.seq <= seq:
@@ -132,7 +132,7 @@ class Feed:
         encoded = await anyio.to_thread.run_sync(jpeg, pixels, mode, abandon_on_cancel=True)
         self._seq += 1
         async with self._changed:
-            self.newest = Picture(self._seq, received_ns, sim_time, mode, encoded)
+            self.newest = EncodedPicture(self._seq, received_ns, sim_time, mode, encoded)
             self._changed.notify_all()
 
 

@@ -15,6 +15,7 @@ from urlab_client.protocol.messages.debug import (
     DrawMarker,
     SetOverlayText,
 )
+from urlab_client.protocol.messages.farm import AcquireLease, ReleaseLease
 from urlab_client.protocol.messages.outliner import (
     AddQuickConvert,
     GetActorBounds,
@@ -36,7 +37,6 @@ from urlab_client.protocol.messages.scene import (
     ActorHierarchy,
     CreateLevel,
     CurrentLevel,
-    DestroyActor,
     DestroyAsset,
     EnsureManager,
     LoadLevel,
@@ -60,7 +60,7 @@ from urlab_client.protocol.types import (
     MocapPose,
 )
 
-__all__ = ["DebugOps", "OutlinerOps", "ReplayOps", "RuntimeOps", "SceneOps", "ViewportOps"]
+__all__ = ["DebugOps", "FarmOps", "OutlinerOps", "ReplayOps", "RuntimeOps", "SceneOps", "ViewportOps"]
 
 
 class RuntimeOps(Namespace):
@@ -107,6 +107,7 @@ class RuntimeOps(Namespace):
             MissingField: A required field is absent, empty or malformed.
             BadValue: A value outside the op's list of choices.
             UnknownArticulation: No articulation has this key or actor id.
+            NotControlOwner: Another client controls the robot, or nobody does; nothing was written.
         """
         await self._call(SetControlSource(source=source, articulation=articulation), timeout)
 
@@ -130,6 +131,7 @@ class RuntimeOps(Namespace):
             NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
             MissingField: A required field is absent, empty or malformed.
             UnknownArticulation: No articulation has this key or actor id.
+            NotControlOwner: Another client controls the robot, or nobody does; nothing was written.
             NoTwistController: The articulation has no twist controller.
         """
         await self._call(
@@ -270,20 +272,6 @@ class SceneOps(Namespace):
             SpawnFailed: The class cannot be spawned, or the actor id belongs to an actor of another class.
         """
         return (await self._call(EnsureManager(), timeout)).was_existing
-
-    async def destroy_actor(self, target: str, *, by_name: bool = False, timeout: Timeout = DEFAULT) -> None:
-        """Remove an actor from the edited level.
-
-        Args:
-            target: Actor id, or the engine's actor name with `by_name`.
-            by_name: Look `target` up by the engine's actor name instead of the actor id.
-            timeout: Seconds to wait; None waits without limit.
-
-        Raises:
-            MissingField: A required field is absent, empty or malformed.
-            DestroyFailed: No actor matches.
-        """
-        await self._call(DestroyActor(target=target, target_by=target_by(by_name)), timeout)
 
     async def destroy_asset(self, asset_path: str, *, timeout: Timeout = DEFAULT) -> bool:
         """Delete an asset by object path and return whether it existed.
@@ -791,3 +779,37 @@ class ViewportOps(Namespace):
             timeout: Seconds to wait; None waits without limit.
         """
         return (await self._call(Untrack(), timeout)).was_tracking
+
+
+class FarmOps(Namespace):
+    """Generated part of `client.farm`."""
+
+    async def acquire_lease(self, owner: str = "", *, ttl_s: float = 60.0, timeout: Timeout = DEFAULT) -> str:
+        """Take the server's one driver lease and return its id.
+
+            The server enforces nothing by it: it tells other clients that the server is in use. Every request keeps it
+            alive.
+
+        Args:
+            owner: Who takes it, for people.
+            ttl_s: Seconds without a request after which it ends; 0 or less ends it at once.
+            timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
+            LeaseBusy: Somebody holds the server's driver lease.
+        """
+        return (await self._call(AcquireLease(owner=owner, ttl_s=ttl_s), timeout)).lease_id
+
+    async def release_lease(self, lease_id: str, *, timeout: Timeout = DEFAULT) -> None:
+        """Give the driver lease back.
+
+        Args:
+            lease_id: What `acquire_lease` returned.
+            timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
+            BadRequest: The frame is neither a msgpack map nor a JSON object.
+        """
+        await self._call(ReleaseLease(lease_id=lease_id), timeout)

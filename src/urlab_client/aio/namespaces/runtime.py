@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import msgspec
@@ -11,10 +12,17 @@ from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.namespaces._base import Vector, fill, target_by
 from urlab_client.aio.namespaces._ops import RuntimeOps
 from urlab_client.aio.session import Session
-from urlab_client.aio.state import SimState
+from urlab_client.aio.state.sim_state import SimState
 from urlab_client.protocol.codec import building
 from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.messages.runtime import ContactFilter, GetContacts, SetMode, SetQpos, SetSimOptions
+from urlab_client.protocol.messages.runtime import (
+    ContactFilter,
+    GetContacts,
+    SetMode,
+    SetQpos,
+    SetSimOptions,
+    SetUserChannels,
+)
 from urlab_client.protocol.messages.session import Forward, ForwardOk
 from urlab_client.protocol.types import ContactsResult, SimOptions
 
@@ -99,6 +107,33 @@ class RuntimeNamespace(RuntimeOps):
             reply = await turn.call(SetSimOptions(options=options))
             self._state.mirror_options(reply.options)
             return reply.options
+
+    async def set_user_channels(
+        self,
+        arts: Mapping[str, Mapping[str, Any]] | None = None,
+        *,
+        scene: Mapping[str, Any] | None = None,
+        timeout: Timeout = DEFAULT,
+    ) -> dict[str, str]:
+        """Write values of channels that the level declares for its robots or the scene; they come back with the state.
+
+        Args:
+            arts: Articulation to channel to a bool, number, text, list of numbers, or map of `pos` and `quat`.
+            scene: Channel of the scene to value.
+            timeout: Seconds to wait; None waits without limit.
+
+        Returns:
+            Why a value was not taken, by `<articulation>/<channel>` or `scene/<channel>`; empty when all were.
+
+        Raises:
+            KeyError: Unknown articulation; nothing was sent.
+            UnknownOp: The server has no such channels.
+        """
+        request = SetUserChannels(
+            arts={self._state.articulations[key].prefix: dict(values) for key, values in (arts or {}).items()} or None,
+            scene=None if scene is None else dict(scene),
+        )
+        return (await self._call(request, timeout)).rejected
 
     async def set_mode(self, mode: StepMode | str, *, timeout: Timeout = DEFAULT) -> StepMode:
         """Switch the step mode and return the one in force. Any mode but live un-pauses physics.

@@ -10,8 +10,10 @@ from urlab_client.aio.namespaces._ops import SceneOps
 from urlab_client.protocol.errors import CreateLevelFailed
 from urlab_client.protocol.messages.outliner import ListActors
 from urlab_client.protocol.messages.scene import (
+    DestroyActor,
     DuplicateActor,
     ImportXml,
+    RemoveActor,
     Snapshot,
     SnapshotRow,
     SpawnActor,
@@ -147,6 +149,20 @@ class SceneNamespace(SceneOps):
             rotation_euler=reply.rotation_euler or euler,
             requires_pie_restart=reply.requires_pie_restart,
         )
+
+    async def destroy_actor(self, target: str, *, by_name: bool = False, timeout: Timeout = DEFAULT) -> None:
+        """Remove an actor from the edited level.
+
+        Args:
+            target: Actor id, or the engine's actor name with `by_name`.
+            by_name: Look `target` up by the engine's actor name instead of the actor id.
+            timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            DestroyFailed: No actor matches.
+        """
+        kind = RemoveActor if self._session.features.remove_op == "remove_actor" else DestroyActor
+        await self._call(kind(target=target, target_by=target_by(by_name)), timeout)
 
     async def snapshot(self, *, timeout: Timeout = DEFAULT) -> SceneSnapshot:
         """Describe every visible actor, with articulation metadata; the play world when it runs.

@@ -9,9 +9,9 @@ import msgspec
 
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.namespaces._base import Namespace
-from urlab_client.aio.recovery import leaves_open
 from urlab_client.aio.session import Session, Turn
-from urlab_client.aio.state import SimState
+from urlab_client.aio.state.recovery import leaves_open
+from urlab_client.aio.state.sim_state import SimState
 from urlab_client.protocol.enums import PIEState
 from urlab_client.protocol.errors import URLabPIEError, URLabTimeoutError
 from urlab_client.protocol.messages.sim import BeginPie, BeginPieOk, PieStatus, PieStatusOk, StopPie
@@ -59,7 +59,7 @@ class SimNamespace(Namespace):
         """
         async with self._session.turn(BeginPie, timeout=timeout, each=True) as turn:
             reply = await self._play(turn, level_path, timeout_s, on_progress)
-            state = PIEState(reply.state)
+            state = reply.state
             payload = reply.handshake_payload
             result = PIEStartResult(state=state, compile_error=reply.compile_error)
             if payload is not None:
@@ -93,14 +93,14 @@ class SimNamespace(Namespace):
         return reply
 
     async def _begin(self, turn: Turn, level_path: str | None, timeout_s: float) -> BeginPieOk:
-        doubts = self._state.doubts
+        pending = self._state.pending
         try:
             reply = await turn.call(BeginPie(level_path=level_path, timeout_s=timeout_s), takes=timeout_s + _SLACK_S)
         except BaseException as error:
-            doubts.play = doubts.play or (turn.sent and leaves_open(error))
+            pending.play = pending.play or (turn.sent and leaves_open(error))
             raise
         # Until the handshake has been taken over, or there will be none.
-        doubts.play = reply.state in (PIEState.READY, PIEState.TIMEOUT)
+        pending.play = reply.state in (PIEState.READY, PIEState.TIMEOUT)
         return reply
 
     async def stop(self, *, timeout: Timeout = DEFAULT) -> None:
@@ -138,4 +138,4 @@ class SimNamespace(Namespace):
 
 
 def _status(reply: PieStatusOk) -> PIEStatus:
-    return PIEStatus(state=PIEState(reply.state), compile_error=reply.compile_error, sim_time=reply.sim_time)
+    return PIEStatus(state=reply.state, compile_error=reply.compile_error, sim_time=reply.sim_time)

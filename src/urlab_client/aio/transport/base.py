@@ -12,7 +12,7 @@ from urlab_client.protocol.base import Op
 from urlab_client.protocol.messages.session import HelloOk
 from urlab_client.protocol.messages.streams import ClientEvent
 
-__all__ = ["LateReply", "Transport", "TransportStats"]
+__all__ = ["LateReply", "RequestTransport", "TransportStats"]
 
 LateReply: TypeAlias = Callable[[asyncio.Future[bytes]], None]
 """Told of a request that left and whose caller gave up: the future gets the reply, or is cancelled when none can come.
@@ -39,7 +39,7 @@ class TransportStats(Struct):
     over_zmq: dict[str, int] = {}
 
 
-class Transport(Protocol):
+class RequestTransport(Protocol):
     """One request at a time goes out, one reply comes back. Used from one event loop."""
 
     stats: TransportStats

@@ -12,6 +12,8 @@ from typing import Final
 
 import zmq
 
+from urlab_client._uninterrupted import uninterrupted
+
 __all__ = ["borrow", "give_back"]
 
 Context = zmq.Context[zmq.Socket[bytes]]
@@ -20,7 +22,7 @@ _MOST_SOCKETS: Final = 16_384
 """ZeroMQ's default is 1023, about 340 clients; the table is that of their addresses alone. Windows allows one less."""
 
 
-class _Shared:
+class _SharedContext:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._context: Context | None = None
@@ -42,15 +44,16 @@ class _Shared:
             if self._users:
                 return
             self._context = None
-        context.term()
+        with uninterrupted():
+            context.term()
 
 
-_shared = _Shared()
+_shared = _SharedContext()
 
 
 def _start_over() -> None:
     global _shared  # noqa: PLW0603  # a fork's copy of the context has no threads behind it
-    _shared = _Shared()
+    _shared = _SharedContext()
 
 
 if hasattr(os, "register_at_fork"):

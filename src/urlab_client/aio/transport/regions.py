@@ -1,6 +1,6 @@
 """Streams out of shared memory: state and pictures, with the sockets beside them for while a region is not there.
 
-One reader per region serves all sinks. A region keeps the newest publication alone, so streams that want all of them
+One reader per region serves all handlers. A region keeps the newest publication alone, so streams that want all of them
 receive from the sockets anyway.
 """
 
@@ -16,10 +16,16 @@ from typing import Protocol, TypeVar, cast
 
 from msgspec import Struct
 
-from urlab_client.aio.transport.mapping import Mapping
-from urlab_client.aio.transport.shm import SharedMemory
-from urlab_client.aio.transport.subscriber import MessageGone, Sink, Subscription, Subscriptions, client_closed
-from urlab_client.aio.transport.waiter import Stream
+from urlab_client.aio.transport.mapped_region import MappedRegion
+from urlab_client.aio.transport.poller import StreamPoll
+from urlab_client.aio.transport.shm import SharedMemoryRegions
+from urlab_client.aio.transport.subscriber import (
+    MessageGone,
+    MessageHandler,
+    Subscription,
+    Subscriptions,
+    client_closed,
+)
 from urlab_client.protocol import doorbell
 from urlab_client.protocol.errors import ProtocolError, URLabError
 from urlab_client.protocol.rows import BytesLike
@@ -45,7 +51,7 @@ class Place(Struct, frozen=True):
 
     Attributes:
         file: Name of the region's file.
-        topic: What the sinks are told as topic.
+        topic: What the handlers are told as topic.
         ring: Which ring of the doorbell tells of them.
     """
 
@@ -72,7 +78,7 @@ class SharedPicture:
     Stands for the payload: as long as one, and its source knows how to read it.
     """
 
-    def __init__(self, reader: _Reader, sequence: int, size: int) -> None:
+    def __init__(self, reader: _RegionReader, sequence: int, size: int) -> None:
         self.reader = reader
         self.sequence = sequence
         self._size = size
@@ -90,14 +96,14 @@ class SharedPicture:
         return self.reader.read(take)
 
 
-class _Reader:
+class _RegionReader:
     """One mapped region and those it feeds."""
 
     def __init__(self, path: Path, place: Place) -> None:
-        self.mapping = Mapping(path)
+        self.mapping = MappedRegion(path)
         self.place = place
-        self.sinks: dict[Sink, None] = {}
-        self.watch: Stream | None = None
+        self.handlers: dict[MessageHandler, None] = {}
+        self.watch: StreamPoll | None = None
         self.silent = False
         self.seen = 0
         self.changed_at = 0.0
@@ -122,7 +128,7 @@ class _Reader:
         region = self.mapping.region
         if self.place.ring == doorbell.CAMERA:
             self.seen = region.sequence
-            # The sinks measure it and hand it back to their source, which knows what it is.
+            # The handlers measure it and hand it back to their source, which knows what it is.
             return cast("BytesLike", SharedPicture(self, self.seen, region.max_payload)) if self.seen else None
         found = region.read_latest()
         if found is None:
@@ -166,11 +172,11 @@ class Regions:
         subscriptions: The sockets beside them.
     """
 
-    def __init__(self, memory: SharedMemory, subscriptions: Subscriptions) -> None:
+    def __init__(self, memory: SharedMemoryRegions, subscriptions: Subscriptions) -> None:
         self._memory = memory
         self._subscriptions = subscriptions
-        self._sources: dict[Sink, RegionSource] = {}
-        self._readers: dict[str, _Reader] = {}
+        self._sources: dict[MessageHandler, RegionSource] = {}
+        self._readers: dict[str, _RegionReader] = {}
         self._refused: dict[str, str] = {}
         self._timer: asyncio.TimerHandle | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -179,33 +185,33 @@ class Regions:
         for ring in _WANTS:
             memory.rung[ring].append(self._look_at_all)
 
-    def attach(self, sink: Sink, source: RegionSource) -> None:
-        """Let `sink` have what `source` describes, from the region if it is there, else from the socket."""
+    def attach(self, handler: MessageHandler, source: RegionSource) -> None:
+        """Let `handler` have what `source` describes, from the region if it is there, else from the socket."""
         if self._closed:
             raise client_closed()
         self._loop = asyncio.get_running_loop()
         reader = self._reader(source)
         if reader is None or reader.silent:
-            self._subscriptions.attach(sink, source.subscription)
+            self._subscriptions.attach(handler, source.subscription)
         else:
-            self._feed(reader, sink)
-        self._sources[sink] = source
+            self._feed(reader, handler)
+        self._sources[handler] = source
         if self._timer is None:
             self._timer = self._loop.call_later(_SUPERVISE_S, self._supervise)
 
-    def detach(self, sink: Sink) -> None:
-        """Stop receiving for `sink`. Does nothing if it does not receive."""
-        if self._sources.pop(sink, None) is None:
+    def detach(self, handler: MessageHandler) -> None:
+        """Stop receiving for `handler`. Does nothing if it does not receive."""
+        if self._sources.pop(handler, None) is None:
             return
-        self._subscriptions.detach(sink)
+        self._subscriptions.detach(handler)
         for reader in tuple(self._readers.values()):
-            reader.sinks.pop(sink, None)
-            if not reader.sinks and not reader.silent:
+            reader.handlers.pop(handler, None)
+            if not reader.handlers and not reader.silent:
                 self._close_reader(reader)
 
-    def path(self, sink: Sink) -> Path | None:
-        """Return the file from which `sink` receives; None if that is a socket, or nothing."""
-        return next((r.mapping.path for r in self._readers.values() if sink in r.sinks), None)
+    def path(self, handler: MessageHandler) -> Path | None:
+        """Return the file from which `handler` receives; None if that is a socket, or nothing."""
+        return next((r.mapping.path for r in self._readers.values() if handler in r.handlers), None)
 
     def refresh(self) -> None:
         """Follow a handshake: play may have begun, and the regions may be others."""
@@ -234,16 +240,16 @@ class Regions:
         self._closed = True
         if self._timer is not None:
             self._timer.cancel()
-        ended = [sink for reader in self._readers.values() for sink in reader.sinks]
+        ended = [handler for reader in self._readers.values() for handler in reader.handlers]
         for reader in tuple(self._readers.values()):
             self._close_reader(reader)
         self._sources.clear()
-        for sink in ended:
-            sink.on_end(client_closed)
+        for handler in ended:
+            handler.on_end(client_closed)
 
     # Readers
 
-    def _reader(self, source: RegionSource) -> _Reader | None:
+    def _reader(self, source: RegionSource) -> _RegionReader | None:
         """Return the reader of a source's region, opening it if there is one with something in it."""
         if self._away:
             return None
@@ -255,7 +261,7 @@ class Regions:
             path = self._memory.find(place.file)
             if path is None:
                 return None
-            reader = _Reader(path, place)
+            reader = _RegionReader(path, place)
         except (OSError, ProtocolError) as error:
             log.debug("not from shared memory: %s", error)
             return None
@@ -270,22 +276,22 @@ class Regions:
         log.debug("receiving from %s", path)
         return reader
 
-    def _feed(self, reader: _Reader, sink: Sink) -> None:
-        reader.sinks[sink] = None
+    def _feed(self, reader: _RegionReader, handler: MessageHandler) -> None:
+        reader.handlers[handler] = None
         if self._loop is not None:
-            # What is there already counts, too; a sink that attaches is not ready for it at this very moment.
-            self._loop.call_soon(self._welcome, reader, sink)
+            # What is there already counts, too; a handler that attaches is not ready for it at this very moment.
+            self._loop.call_soon(self._welcome, reader, handler)
 
-    def _welcome(self, reader: _Reader, sink: Sink) -> None:
+    def _welcome(self, reader: _RegionReader, handler: MessageHandler) -> None:
         if self._readers.get(reader.place.file) is reader and reader.news():
             self._look_at(reader)
         else:
-            self._deliver(reader, (sink,))
+            self._deliver(reader, (handler,))
 
-    def _rouse(self, reader: _Reader) -> None:
+    def _rouse(self, reader: _RegionReader) -> None:
         """See to it that news of a reader's region is noticed."""
         if self._memory.bell is None and reader.watch is None:
-            reader.watch = Stream(reader.news, lambda: self._look_at(reader))
+            reader.watch = StreamPoll(reader.news, lambda: self._look_at(reader))
             self._memory.waiter.add(reader.watch)
         elif self._memory.bell is not None and reader.watch is not None:
             self._memory.waiter.remove(reader.watch)
@@ -296,7 +302,7 @@ class Regions:
             self._rouse(reader)
             self._look_at(reader)
 
-    def _look_at(self, reader: _Reader) -> None:
+    def _look_at(self, reader: _RegionReader) -> None:
         """Hand out what is new in a region."""
         if self._readers.get(reader.place.file) is not reader:
             return
@@ -311,55 +317,55 @@ class Regions:
             reader.changed_at = self._now()
             if reader.silent:
                 self._resume(reader)
-            self._deliver(reader, tuple(reader.sinks))
+            self._deliver(reader, tuple(reader.handlers))
         if reader.watch is not None:
             reader.watch.resume()
 
-    def _deliver(self, reader: _Reader, sinks: Iterable[Sink]) -> None:
+    def _deliver(self, reader: _RegionReader, handlers: Iterable[MessageHandler]) -> None:
         if self._readers.get(reader.place.file) is not reader or not reader.mapping.intact():
             return
         try:
             payload = reader.message()
         except ProtocolError as error:
             reader.seen = reader.region_sequence
-            for sink in sinks:
-                sink.on_malformed(str(error.args[0]))
+            for handler in handlers:
+                handler.on_malformed(str(error.args[0]))
             return
         if payload is None:
             return
-        for sink in sinks:
-            if sink in reader.sinks:
-                sink.on_message(reader.place.topic, payload)
-                sink.on_drained()
+        for handler in handlers:
+            if handler in reader.handlers:
+                handler.on_message(reader.place.topic, payload)
+                handler.on_drained()
 
-    def _lose(self, reader: _Reader) -> None:
+    def _lose(self, reader: _RegionReader) -> None:
         """Go on without a region."""
-        sinks = tuple(reader.sinks)
+        handlers = tuple(reader.handlers)
         self._close_reader(reader)
-        for sink in sinks:
-            self._subscribe(sink)
+        for handler in handlers:
+            self._subscribe(handler)
 
-    def _close_reader(self, reader: _Reader) -> None:
+    def _close_reader(self, reader: _RegionReader) -> None:
         self._readers.pop(reader.place.file, None)
         if reader.watch is not None:
             self._memory.waiter.remove(reader.watch)
             reader.watch = None
-        reader.sinks.clear()
+        reader.handlers.clear()
         reader.close()
 
-    def _subscribe(self, sink: Sink) -> None:
-        source = self._sources.get(sink)
+    def _subscribe(self, handler: MessageHandler) -> None:
+        source = self._sources.get(handler)
         if source is not None:
             with contextlib.suppress(URLabError, ValueError):  # an address that is none: as silent as a closed port
-                self._subscriptions.attach(sink, source.subscription)
+                self._subscriptions.attach(handler, source.subscription)
 
-    def _resume(self, reader: _Reader) -> None:
-        """Take the sinks that had to do without back to a region that has come to life again."""
+    def _resume(self, reader: _RegionReader) -> None:
+        """Take the handlers that had to do without back to a region that has come to life again."""
         reader.silent = False
-        for sink, source in self._sources.items():
-            if source.place().file == reader.place.file:
-                self._subscriptions.detach(sink)
-                reader.sinks[sink] = None
+        for handler, source in self._sources.items():
+            if _file_of(source) == reader.place.file:
+                self._subscriptions.detach(handler)
+                reader.handlers[handler] = None
 
     # Supervision
 
@@ -376,10 +382,10 @@ class Regions:
                 elif idle > _SILENT_S and reader.place.ring == doorbell.STATE and not reader.silent:
                     # While play runs there is always news; a snapshot that outgrew its slot comes by socket only.
                     reader.silent = True
-                    sinks = tuple(reader.sinks)
-                    reader.sinks.clear()
-                    for sink in sinks:
-                        self._subscribe(sink)
+                    handlers = tuple(reader.handlers)
+                    reader.handlers.clear()
+                    for handler in handlers:
+                        self._subscribe(handler)
         self._settle_all()
         if self._sources and self._loop is not None:
             self._timer = self._loop.call_later(_SUPERVISE_S, self._supervise)
@@ -388,15 +394,15 @@ class Regions:
                 self._close_reader(reader)
 
     def _settle_all(self) -> None:
-        """Take sinks that receive from sockets to their regions, where these are there by now."""
-        for sink, source in tuple(self._sources.items()):
-            if self.path(sink) is None:
+        """Take handlers that receive from sockets to their regions, where these are there by now."""
+        for handler, source in tuple(self._sources.items()):
+            if self.path(handler) is None:
                 reader = self._reader(source)
                 if reader is not None and not reader.silent:
-                    self._subscriptions.detach(sink)
-                    self._feed(reader, sink)
+                    self._subscriptions.detach(handler)
+                    self._feed(reader, handler)
 
-    def _moved(self, reader: _Reader) -> bool:
+    def _moved(self, reader: _RegionReader) -> bool:
         try:
             return self._memory.find(reader.place.file) != reader.mapping.path
         except (OSError, ProtocolError):  # what a server calls its directory may be anything
@@ -404,3 +410,10 @@ class Regions:
 
     def _now(self) -> float:
         return 0.0 if self._loop is None else self._loop.time()
+
+
+def _file_of(source: RegionSource) -> str | None:
+    try:
+        return source.place().file
+    except ProtocolError:  # what a server calls its cameras may be anything
+        return None

@@ -20,13 +20,13 @@ from typing import Final
 import msgspec
 from msgspec import Struct
 
-from urlab_client.aio.transport.base import LateReply, Transport
-from urlab_client.aio.transport.mapping import Mapping, RegionInUse
-from urlab_client.aio.transport.spin import Spin
-from urlab_client.aio.transport.waiter import Doorbell, Reply, Waiter
+from urlab_client.aio.transport.base import LateReply, RequestTransport
+from urlab_client.aio.transport.busy_poll import BusyPoll
+from urlab_client.aio.transport.mapped_region import MappedRegion, RegionInUse
+from urlab_client.aio.transport.poller import Doorbell, Poller, ReplyPoll
 from urlab_client.aio.transport.windows import NamedEvent
 from urlab_client.protocol import doorbell
-from urlab_client.protocol.base import Needs, Op, Timing
+from urlab_client.protocol.base import Effect, Needs, Op
 from urlab_client.protocol.codec import encode_request
 from urlab_client.protocol.errors import (
     ClientClosed,
@@ -42,7 +42,7 @@ from urlab_client.protocol.messages.session import HelloOk, StateReply
 from urlab_client.protocol.messages.streams import ClientEvent, ServerLost
 from urlab_client.protocol.shm import REPLY_FILE, REQUEST_FILE, RegionNotReady, region_directories
 
-__all__ = ["SharedMemory", "ShmTransport"]
+__all__ = ["SharedMemoryRegions", "ShmTransport"]
 
 log = logging.getLogger("urlab_client.transport")
 
@@ -65,7 +65,7 @@ _LONGEST_SPIN_S = 2e-3
 _SYNC: Final = "sync-"
 
 
-class SharedMemory:
+class SharedMemoryRegions:
     """Where one client's server has its regions, and how the client learns of news in them.
 
     Args:
@@ -80,15 +80,15 @@ class SharedMemory:
         self.directory: Path | None = None
         self.rung: dict[bytes, list[Callable[[], None]]] = {doorbell.STATE: [], doorbell.CAMERA: [], doorbell.REPLY: []}
         self._given = None if directory is None else Path(directory).absolute()
-        self._waiter: Waiter | None = None
+        self._waiter: Poller | None = None
         self._bell: Doorbell | None = None
         self._wanted: set[bytes] = set()
 
     @property
-    def waiter(self) -> Waiter:
+    def waiter(self) -> Poller:
         """The thread that looks, where there is no doorbell."""
         if self._waiter is None:
-            self._waiter = Waiter(asyncio.get_running_loop())
+            self._waiter = Poller(asyncio.get_running_loop())
         return self._waiter
 
     @property
@@ -206,13 +206,13 @@ def _opening(op: Op) -> bytes:
     return msgspec.msgpack.encode({"op": op.reply_name})[1:]
 
 
-class _Channel:
+class _RegionChannel:
     """The pair of request and reply region, for the one client that holds the lock."""
 
     def __init__(self, requests: Path, replies: Path) -> None:
-        self.requests = Mapping(requests, writable=True, exclusive=True)
+        self.requests = MappedRegion(requests, writable=True, exclusive=True)
         try:
-            self.replies = Mapping(replies)
+            self.replies = MappedRegion(replies)
         except BaseException:
             self.requests.close()
             raise
@@ -275,7 +275,7 @@ class _Pending:
     def __init__(self, op: Op, future: asyncio.Future[bytes]) -> None:
         self.op = op
         self.future = future
-        self.watch: Reply | None = None
+        self.watch: ReplyPoll | None = None
         self.glance: asyncio.TimerHandle | None = None
 
 
@@ -287,14 +287,14 @@ class ShmTransport:
         memory: Where the server's regions are.
     """
 
-    def __init__(self, inner: Transport, memory: SharedMemory) -> None:
+    def __init__(self, inner: RequestTransport, memory: SharedMemoryRegions) -> None:
         self.on_event: Callable[[ClientEvent], None] | None = None
         self.stats = inner.stats
         self._inner = inner
         self._memory = memory
         inner.on_event = self._on_event
         memory.rung[doorbell.REPLY].append(self._on_ring)
-        self._channel: _Channel | None = None
+        self._channel: _RegionChannel | None = None
         self._obstacle = "no handshake yet"
         self._retry_at = 0.0
         self._used_at = 0.0
@@ -302,11 +302,11 @@ class ShmTransport:
         self._closed = False
         self._refused: dict[str, str] = {}
         self._largest_state = 0
-        self._spin = Spin(_SPIN_S, _LONGEST_SPIN_S)
+        self._busy_poll = BusyPoll(_SPIN_S, _LONGEST_SPIN_S)
 
     @property
     def state_port(self) -> int | None:
-        """See `Transport.state_port`."""
+        """See `RequestTransport.state_port`."""
         return self._inner.state_port
 
     @property
@@ -363,7 +363,7 @@ class ShmTransport:
     async def request(
         self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
     ) -> bytes:
-        """See `Transport.request`. Late replies are told of where they come over ZMQ, as those to handshakes do."""
+        """See `RequestTransport.request`. Where late replies come is told of what goes over ZMQ, as handshakes do."""
         detour = self._detour(frame, op)
         channel = None
         if not detour:
@@ -386,7 +386,7 @@ class ShmTransport:
         return answer
 
     async def aclose(self) -> None:
-        """See `Transport.aclose`."""
+        """See `RequestTransport.aclose`."""
         self._closed = True
         closed = ClientClosed(f"The client of {self.endpoint} was closed.", hint="Make a new client.")
         self._fail(lambda _: closed)
@@ -406,7 +406,7 @@ class ShmTransport:
             return "pictures"
         return self._refused.get(op.name, "")
 
-    def _usable_channel(self) -> _Channel | None:
+    def _usable_channel(self) -> _RegionChannel | None:
         """Return the channel if it may be used right now."""
         loop = asyncio.get_running_loop()
         now = loop.time()
@@ -433,11 +433,11 @@ class ShmTransport:
             return None
         return channel
 
-    def _settling(self, channel: _Channel) -> bool:
+    def _settling(self, channel: _RegionChannel) -> bool:
         """Whether `channel` has yet to become clean, unless it is gone or another task's request is in it by now."""
         return self._channel is channel and self._pending is None and not self._is_clean(channel)
 
-    def _is_clean(self, channel: _Channel) -> bool:
+    def _is_clean(self, channel: _RegionChannel) -> bool:
         try:
             waits = channel.dirty and channel.intact() and not channel.synchronised()
             if waits and channel.ask_for_sync(asyncio.get_running_loop().time()):
@@ -447,8 +447,8 @@ class ShmTransport:
             self._put_off(error)
         return not channel.dirty
 
-    def _open(self) -> _Channel:
-        """Open the regions. Raises as `Mapping` does."""
+    def _open(self) -> _RegionChannel:
+        """Open the regions. Raises as `MappedRegion` does."""
         paths: list[Path] = []
         for file in (REQUEST_FILE, REPLY_FILE):
             path = self._memory.find(file)
@@ -456,7 +456,7 @@ class ShmTransport:
                 looked = ", ".join(map(str, self._memory.candidates(file)))
                 raise FileNotFoundError(f"there is no {looked}")
             paths.append(path)
-        self._channel = _Channel(*paths)
+        self._channel = _RegionChannel(*paths)
         self._memory.connect_bell()
         self._used_at = asyncio.get_running_loop().time()
         log.info(
@@ -478,7 +478,7 @@ class ShmTransport:
             self._refused[op.name] = "refused by the server"
         elif code == "reply_too_large":
             self._refused[op.name] = "reply too large"
-            if op.effect is not Timing.READ:
+            if op.effect is not Effect.READ:
                 return ""
         return self._refused.get(op.name, "")
 
@@ -488,7 +488,7 @@ class ShmTransport:
 
     # Over shared memory
 
-    async def _over_shm(self, channel: _Channel, frame: bytes, op: Op, deadline: float | None) -> bytes:
+    async def _over_shm(self, channel: _RegionChannel, frame: bytes, op: Op, deadline: float | None) -> bytes:
         loop = asyncio.get_running_loop()
         pending = self._pending = _Pending(op, loop.create_future())
         timer: asyncio.TimerHandle | None = None
@@ -503,8 +503,8 @@ class ShmTransport:
             self._ring()
             if deadline is not None:
                 timer = loop.call_at(deadline, self._expire, pending, deadline - started)
-            if self._spin.pays(op.name):
-                await self._spin.look(op.name, pending.future, lambda: self._look_at(channel))
+            if self._busy_poll.pays(op.name):
+                await self._busy_poll.look(op.name, pending.future, lambda: self._look_at(channel))
             if not pending.future.done():
                 if self._memory.bell is None:
                     self._watch()
@@ -520,7 +520,7 @@ class ShmTransport:
             self._used_at = loop.time()
         channel.dirty = False
         self.stats.received += 1
-        self._spin.note(op.name, time.perf_counter() - sent)
+        self._busy_poll.note(op.name, time.perf_counter() - sent)
         return answer
 
     def _ring(self) -> None:
@@ -528,7 +528,7 @@ class ShmTransport:
         if bell is not None:
             bell.ring(doorbell.REQUEST)
 
-    def _look_at(self, channel: _Channel) -> None:
+    def _look_at(self, channel: _RegionChannel) -> None:
         # Between two looks another task may have had the loop for as long as a server takes to start again.
         if not channel.replies.intact() or channel.replies.region.sequence != channel.seen:
             self._look()
@@ -550,7 +550,7 @@ class ShmTransport:
         def news() -> bool:
             return not replies.intact() or replies.region.sequence != channel.seen
 
-        pending.watch = Reply(news, self._look, event.wait if event.exists else None)
+        pending.watch = ReplyPoll(news, self._look, event.wait if event.exists else None)
         self._memory.waiter.add(pending.watch)
 
     def _unwatch(self) -> None:
@@ -610,7 +610,7 @@ class ShmTransport:
         self._look()
         if pending.future.done():
             return
-        executed = "" if pending.op.effect is Timing.READ else " The request was sent and may still be executed."
+        executed = "" if pending.op.effect is Effect.READ else " The request was sent and may still be executed."
         pending.future.set_exception(
             URLabTimeoutError(
                 f"{pending.op.name}: no reply in shared memory within {seconds * 1000:.0f} ms.{executed}",
@@ -644,7 +644,7 @@ class ShmTransport:
 
     def _lost(self, op: Op) -> URLabError:
         text = f"{op.name}: the server at {self.endpoint} was lost after the request was sent."
-        if op.effect is Timing.READ:
+        if op.effect is Effect.READ:
             return ConnectionLost(text, op=op.name, hint="The op changes nothing: it can be sent again.")
         return OutcomeUnknown(
             text, op=op.name, hint="Whether it was executed is unknown: call discover() and look at the state."

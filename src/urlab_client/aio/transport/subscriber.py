@@ -5,7 +5,7 @@ second copy on the wire and no second wake-up of the loop (at 1 kHz about 40 µs
 100 µs with a socket of its own), and messages of different topics keep the order in which the server sent them, in
 which a snapshot closes the rows of its tick.
 
-The socket is read whenever the loop runs, wanted or not: what waits is bounded by what the sinks keep, never by how
+The socket is read whenever the loop runs, wanted or not: what waits is bounded by what the handlers keep, never by how
 fast they are read, and a subscriber that is not read cannot fill the server's queues.
 """
 
@@ -21,13 +21,14 @@ import zmq
 from msgspec import Struct
 from zmq.utils.monitor import recv_monitor_message
 
-from urlab_client.aio.transport import line
+from urlab_client._uninterrupted import uninterrupted
+from urlab_client.aio.transport import connection_status
 from urlab_client.aio.transport.curve import SERVER_KEY_HINT, ClientKeys
 from urlab_client.aio.transport.readiness import Readiness, watch_socket
 from urlab_client.protocol.errors import ClientClosed, ProtocolError, URLabError
 from urlab_client.protocol.rows import BytesLike
 
-__all__ = ["Line", "MessageGone", "Sink", "Subscription", "Subscriptions", "client_closed"]
+__all__ = ["ConnectionStatus", "MessageGone", "MessageHandler", "Subscription", "Subscriptions", "client_closed"]
 
 log = logging.getLogger("urlab_client.transport")
 
@@ -53,7 +54,7 @@ class MessageGone(ProtocolError):
     """A message was overwritten or removed before anybody looked at it. Nothing is wrong with either side."""
 
 
-class Sink(ABC):
+class MessageHandler(ABC):
     """Takes what a subscription brings. Called on the event loop; must not block and must not raise."""
 
     @abstractmethod
@@ -68,13 +69,13 @@ class Sink(ABC):
     def on_end(self, error: Callable[[], URLabError]) -> None:
         """Take note that nothing will come any more, and why."""
 
-    def on_drained(self) -> None:  # noqa: B027 - a sink that acts on each message needs nothing here
+    def on_drained(self) -> None:  # noqa: B027 - a handler that acts on each message needs nothing here
         """Act on the messages that just came, after the last of a batch."""
 
-    def on_line(self, connected: bool) -> None:  # noqa: B027 - most sinks need not know
+    def on_connection(self, connected: bool) -> None:  # noqa: B027 - most handlers need not know
         """Take note that the connection was made or lost."""
 
-    def on_gap(self, why: str) -> None:  # noqa: B027 - a sink that keeps only the newest misses nothing
+    def on_gap(self, why: str) -> None:  # noqa: B027 - a handler that keeps only the newest misses nothing
         """Take note that messages are missing before the next one."""
 
 
@@ -94,7 +95,7 @@ class Subscription(Struct, frozen=True):
     pictures: bool = False
 
 
-class Line(Struct, frozen=True):
+class ConnectionStatus(Struct, frozen=True):
     """How the connection to a publisher stands.
 
     Attributes:
@@ -125,17 +126,17 @@ class _Subscriber:
         self.endpoint = endpoint
         self.connected = False
         self.connects = 0
-        self.obstacle = line.UNANSWERED
+        self.obstacle = connection_status.UNANSWERED
         self._loop = loop
         self._copy = not pictures
-        self._sinks: dict[Sink, Subscription] = {}
-        self._routes: dict[bytes, tuple[Sink, ...]] = {}
+        self._handlers: dict[MessageHandler, Subscription] = {}
+        self._routes: dict[bytes, tuple[MessageHandler, ...]] = {}
         self._down_since: float | None = None
         self._retrying = False
         self._closed = False
-        self._attempts = line.Attempts(loop.time())
+        self._attempts = connection_status.Attempts(loop.time())
         socket = self._socket = context.socket(zmq.SUB)
-        line.configure(socket)
+        connection_status.configure(socket)
         socket.rcvhwm = _QUEUED_PICTURES if pictures else _QUEUED_MESSAGES
         # A full queue holds heartbeats up until the connection is given up. Without this, libzmq 4.3.5 (issue 3937)
         # ends the whole process when the queue is read after that: the next connection would have the old one's pipe.
@@ -143,7 +144,7 @@ class _Subscriber:
         socket.maxmsgsize = _MAX_MESSAGE_BYTES
         if keys is not None:
             keys.protect(socket)
-        self._monitor = socket.get_monitor_socket(line.WATCHED)
+        self._monitor = socket.get_monitor_socket(connection_status.WATCHED)
         self._watched: tuple[Readiness, ...] = ()
         try:
             socket.connect(endpoint)
@@ -156,18 +157,18 @@ class _Subscriber:
     @property
     def idle(self) -> bool:
         """Whether nobody listens."""
-        return not self._sinks
+        return not self._handlers
 
-    def attach(self, sink: Sink, subscription: Subscription) -> None:
+    def attach(self, handler: MessageHandler, subscription: Subscription) -> None:
         for prefix in subscription.filters:
-            self._socket.subscribe(prefix)  # counted by the socket: equal filters of several sinks are kept apart
-        self._sinks[sink] = subscription
+            self._socket.subscribe(prefix)  # counted by the socket: equal filters of several handlers are kept apart
+        self._handlers[handler] = subscription
         self._routes.clear()
         # Any use of the socket may consume its descriptor's edge.
         self._loop.call_soon(self._on_readable)
 
-    def detach(self, sink: Sink) -> None:
-        for prefix in self._sinks.pop(sink).filters:
+    def detach(self, handler: MessageHandler) -> None:
+        for prefix in self._handlers.pop(handler).filters:
             self._socket.unsubscribe(prefix)
         self._routes.clear()
         self._loop.call_soon(self._on_readable)
@@ -181,7 +182,7 @@ class _Subscriber:
         self._socket.close(linger=0)
 
     def _on_readable(self) -> None:
-        socket, touched = self._socket, dict[Sink, None]()
+        socket, touched = self._socket, dict[MessageHandler, None]()
         messages = size = 0
         drained = self._closed
         try:
@@ -199,10 +200,10 @@ class _Subscriber:
             # The descriptor is edge-triggered: leaving messages behind without coming back would be for good.
             if not drained and not self._closed:
                 self._loop.call_soon(self._on_readable)
-        for sink in touched:
-            sink.on_drained()
+        for handler in touched:
+            handler.on_drained()
 
-    def _take(self, topic: bytes, touched: dict[Sink, None]) -> int:
+    def _take(self, topic: bytes, touched: dict[MessageHandler, None]) -> int:
         """Receive the rest of a message, all of which is there, and hand it to whom it concerns; return its size."""
         socket = self._socket
         payload: BytesLike | None = None
@@ -219,18 +220,18 @@ class _Subscriber:
                 extra += 1
                 more = bool(socket.getsockopt(zmq.RCVMORE))
         route = self._routes.get(topic)
-        for sink in self._route(topic) if route is None else route:
+        for handler in self._route(topic) if route is None else route:
             if payload is None or extra:
-                sink.on_malformed(f"topic {topic[:64]!r}: {2 + extra if extra else 1} frames, expected 2.")
+                handler.on_malformed(f"topic {topic[:64]!r}: {2 + extra if extra else 1} frames, expected 2.")
             else:
-                touched[sink] = None
-                sink.on_message(topic, payload)
+                touched[handler] = None
+                handler.on_message(topic, payload)
         return 0 if payload is None else len(payload)
 
-    def _route(self, topic: bytes) -> tuple[Sink, ...]:
+    def _route(self, topic: bytes) -> tuple[MessageHandler, ...]:
         if len(self._routes) >= _REMEMBERED_TOPICS:
             self._routes.clear()
-        route = tuple(sink for sink, subscription in self._sinks.items() if subscription.accepts(topic))
+        route = tuple(handler for handler, subscription in self._handlers.items() if subscription.accepts(topic))
         self._routes[topic] = route
         return route
 
@@ -241,7 +242,7 @@ class _Subscriber:
 
     def _note(self, event: zmq.Event, value: int) -> None:
         obstacle = self._attempts.obstacle(event, value, self._loop.time())
-        self._retrying = self._retrying or event in line.RETRYING
+        self._retrying = self._retrying or event in connection_status.RETRYING
         if event is zmq.Event.HANDSHAKE_SUCCEEDED:
             self.connected = True
             self.connects += 1
@@ -250,8 +251,8 @@ class _Subscriber:
             if self._down_since is not None:
                 why = f"reconnected after {self._loop.time() - self._down_since:.2f} s"
                 self._down_since = None
-                for sink in tuple(self._sinks):
-                    sink.on_gap(why)
+                for handler in tuple(self._handlers):
+                    handler.on_gap(why)
         elif event is zmq.Event.DISCONNECTED:
             if self.connected:
                 self.obstacle = "the connection was lost and not restored"
@@ -259,17 +260,19 @@ class _Subscriber:
                 self.connected = False
                 self._down_since = self._loop.time()
                 self._retrying = False
-                self._loop.call_later(line.REVIVE_S, self._revive)
+                self._loop.call_later(connection_status.REVIVE_S, self._revive)
                 self._tell_line()
         elif obstacle is not None and self.connects == 0:
-            self.obstacle = f"{obstacle}. {SERVER_KEY_HINT}" if event in line.FAILED_HANDSHAKES else obstacle
+            self.obstacle = (
+                f"{obstacle}. {SERVER_KEY_HINT}" if event in connection_status.FAILED_HANDSHAKES else obstacle
+            )
         if event in (zmq.Event.HANDSHAKE_FAILED_AUTH, zmq.Event.HANDSHAKE_FAILED_PROTOCOL):
             # ZeroMQ does not try again by itself, but the server may learn the key.
-            self._loop.call_later(line.RECONNECT_MAX_MS / 1000, self._reconnect)
+            self._loop.call_later(connection_status.RECONNECT_MAX_MS / 1000, self._reconnect)
 
     def _reconnect(self) -> None:
         if not self._closed:
-            line.reconnect(self._socket, self.endpoint)
+            connection_status.reconnect(self._socket, self.endpoint)
 
     def _revive(self) -> None:
         self._on_event()
@@ -277,8 +280,8 @@ class _Subscriber:
             self._reconnect()
 
     def _tell_line(self) -> None:
-        for sink in tuple(self._sinks):
-            sink.on_line(self.connected)
+        for handler in tuple(self._handlers):
+            handler.on_connection(self.connected)
 
 
 class Subscriptions:
@@ -293,11 +296,11 @@ class Subscriptions:
         self._context: zmq.Context[zmq.Socket[bytes]] | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._subscribers: dict[tuple[str, bool], _Subscriber] = {}
-        self._attached: dict[Sink, tuple[Subscription, Callable[[], Subscription]]] = {}
+        self._attached: dict[MessageHandler, tuple[Subscription, Callable[[], Subscription]]] = {}
         self.closed = False
 
-    def attach(self, sink: Sink, wanted: Callable[[], Subscription]) -> None:
-        """Let `sink` have what `wanted` describes, which `refresh` asks again.
+    def attach(self, handler: MessageHandler, wanted: Callable[[], Subscription]) -> None:
+        """Let `handler` have what `wanted` describes, which `refresh` asks again.
 
         Raises:
             ClientClosed: The client was closed.
@@ -312,56 +315,57 @@ class Subscriptions:
             )
         self._loop = loop
         subscription = wanted()
-        self._connect(sink, subscription)
-        self._attached[sink] = subscription, wanted
+        self._connect(handler, subscription)
+        self._attached[handler] = subscription, wanted
 
-    def detach(self, sink: Sink) -> None:
-        """Stop receiving for `sink`. Does nothing if it does not receive."""
-        found = self._attached.pop(sink, None)
+    def detach(self, handler: MessageHandler) -> None:
+        """Stop receiving for `handler`. Does nothing if it does not receive."""
+        found = self._attached.pop(handler, None)
         if found is not None:
-            self._disconnect(sink, found[0])
+            self._disconnect(handler, found[0])
 
     def refresh(self) -> None:
         """Follow publishers that moved, as cameras do when a new play session begins."""
-        for sink, (before, wanted) in tuple(self._attached.items()):
+        for handler, (before, wanted) in tuple(self._attached.items()):
             try:
                 after = wanted()
                 if (after.endpoint, after.filters) == (before.endpoint, before.filters):
                     continue
-                self.detach(sink)
-                self._connect(sink, after)
+                self.detach(handler)
+                self._connect(handler, after)
             except (ProtocolError, ValueError) as error:
-                self.detach(sink)
-                sink.on_end(_unusable(str(error)))
+                self.detach(handler)
+                handler.on_end(_unusable(str(error)))
             else:
-                self._attached[sink] = after, wanted
-                sink.on_gap(f"moved from {before.endpoint} to {after.endpoint}")
+                self._attached[handler] = after, wanted
+                handler.on_gap(f"moved from {before.endpoint} to {after.endpoint}")
 
-    def line(self, sink: Sink) -> Line | None:
-        """Return how the connection stands over which `sink` receives; None if it does not receive."""
-        found = self._attached.get(sink)
+    def line(self, handler: MessageHandler) -> ConnectionStatus | None:
+        """Return how the connection stands over which `handler` receives; None if it does not receive."""
+        found = self._attached.get(handler)
         if found is None:
             return None
         subscriber = self._subscribers[_key(found[0])]
-        return Line(subscriber.endpoint, subscriber.connected, subscriber.connects, subscriber.obstacle)
+        return ConnectionStatus(subscriber.endpoint, subscriber.connected, subscriber.connects, subscriber.obstacle)
 
     def close(self) -> None:
         """End every subscription with `ClientClosed` and release the sockets. Idempotent."""
         if self.closed:
             return
         self.closed = True
-        sinks = tuple(self._attached)
+        handlers = tuple(self._attached)
         self._attached.clear()
         for subscriber in self._subscribers.values():
             subscriber.close()
         self._subscribers.clear()
         if self._context is not None:
-            self._context.term()
+            with uninterrupted():
+                self._context.term()
             _contexts.discard(self._context)
-        for sink in sinks:
-            sink.on_end(client_closed)
+        for handler in handlers:
+            handler.on_end(client_closed)
 
-    def _connect(self, sink: Sink, subscription: Subscription) -> None:
+    def _connect(self, handler: MessageHandler, subscription: Subscription) -> None:
         assert self._loop is not None  # noqa: S101  # set by `attach`
         key = _key(subscription)
         subscriber = self._subscribers.get(key)
@@ -373,12 +377,12 @@ class Subscriptions:
                 self._context, self._loop, subscription.endpoint, pictures=subscription.pictures, keys=self._keys
             )
             self._subscribers[key] = subscriber
-        subscriber.attach(sink, subscription)
+        subscriber.attach(handler, subscription)
 
-    def _disconnect(self, sink: Sink, subscription: Subscription) -> None:
+    def _disconnect(self, handler: MessageHandler, subscription: Subscription) -> None:
         key = _key(subscription)
         subscriber = self._subscribers[key]
-        subscriber.detach(sink)
+        subscriber.detach(handler)
         if subscriber.idle:
             del self._subscribers[key]
             subscriber.close()

@@ -18,13 +18,13 @@ from typing import Any, cast
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
+from urlab_client.aio.transport import connection_status
 from urlab_client.aio.transport import context as shared_context
-from urlab_client.aio.transport import line
 from urlab_client.aio.transport.base import LateReply, TransportStats
+from urlab_client.aio.transport.busy_poll import BusyPoll
 from urlab_client.aio.transport.curve import ClientKeys
 from urlab_client.aio.transport.readiness import Readiness, watch_socket
-from urlab_client.aio.transport.spin import Spin
-from urlab_client.protocol.base import Op, Timing
+from urlab_client.protocol.base import Effect, Op
 from urlab_client.protocol.codec import MAX_REPLY_BYTES
 from urlab_client.protocol.errors import (
     AuthenticationFailed,
@@ -97,15 +97,15 @@ class ZmqTransport:
         self._events: Readiness | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._due = 0.0
-        self._spin = Spin(_SPIN_S, _LONGEST_SPIN_S)
+        self._busy_poll = BusyPoll(_SPIN_S, _LONGEST_SPIN_S)
         self._sent: dict[bytes, _Sent] = {}
         self._late: dict[bytes, asyncio.Future[bytes]] = {}
         self._waiting: set[asyncio.Future[None]] = set()
         self._last_id = 0
         self._connected = False
         self._closed = False
-        self._obstacle = line.UNANSWERED
-        self._attempts = line.Attempts(0.0)
+        self._obstacle = connection_status.UNANSWERED
+        self._attempts = connection_status.Attempts(0.0)
         self.lost_at = 0.0
         self._silent_since: float | None = None
         self._retrying = False
@@ -129,7 +129,7 @@ class ZmqTransport:
     async def request(
         self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
     ) -> bytes:
-        """See `Transport.request`."""
+        """See `RequestTransport.request`."""
         loop, socket, replies = self._open()
         send = socket.send
         while True:
@@ -158,8 +158,8 @@ class ZmqTransport:
             self._expire_at(loop, deadline)
         try:
             # Sending may have consumed the descriptor's edge, so look at least once for what arrived meanwhile.
-            if self._spin.pays(op.name):
-                await self._spin.look(op.name, entry.reply, self._on_readable)
+            if self._busy_poll.pays(op.name):
+                await self._busy_poll.look(op.name, entry.reply, self._on_readable)
             elif cast("int", socket.get(_EVENTS)) & _POLLIN:
                 loop.call_soon(self._on_readable)
             if not entry.reply.done():
@@ -171,7 +171,7 @@ class ZmqTransport:
             raise
         finally:
             self._sent.pop(key, None)
-        self._spin.note(op.name, time.perf_counter() - sent)
+        self._busy_poll.note(op.name, time.perf_counter() - sent)
         return answer
 
     async def follow(self, hello: HelloOk) -> None:
@@ -212,14 +212,14 @@ class ZmqTransport:
             return loop, self._socket, self._replies
         context = shared_context.borrow()
         socket = context.socket(zmq.DEALER)
-        line.configure(socket)
+        connection_status.configure(socket)
         # A request must not wait in a queue for a server that is gone: it would reach the next one.
         socket.immediate = True
         socket.maxmsgsize = MAX_REPLY_BYTES  # refused when it is announced, before it fills the memory
         if self._keys is not None:
             self._keys.protect(socket)
-        monitor = socket.get_monitor_socket(line.WATCHED)
-        self._attempts = line.Attempts(loop.time())
+        monitor = socket.get_monitor_socket(connection_status.WATCHED)
+        self._attempts = connection_status.Attempts(loop.time())
         try:
             socket.connect(self._endpoint)
         except zmq.ZMQError as error:
@@ -258,7 +258,7 @@ class ZmqTransport:
         if self._given_up and self._socket is not None:
             # Told why, ZeroMQ does not try again by itself; by now the server may have learnt the key.
             self._given_up = False
-            line.reconnect(self._socket, self._endpoint)
+            connection_status.reconnect(self._socket, self._endpoint)
 
         def give_up() -> None:
             self._on_event()  # as in `_expire`
@@ -301,7 +301,7 @@ class ZmqTransport:
                     self._expire_at(loop, entry.deadline)
 
     def _give_up(self, entry: _Sent, seconds: float) -> None:
-        executed = "" if entry.op.effect is Timing.READ else " The request was sent and may still be executed."
+        executed = "" if entry.op.effect is Effect.READ else " The request was sent and may still be executed."
         entry.reply.set_exception(
             URLabTimeoutError(
                 f"{entry.op.name}: no reply from {self._endpoint} within {_ms(seconds)}.{executed}",
@@ -354,7 +354,7 @@ class ZmqTransport:
 
     def _note(self, event: zmq.Event, value: int) -> None:
         obstacle = self._attempts.obstacle(event, value, 0.0 if self._loop is None else self._loop.time())
-        self._retrying = self._retrying or event in line.RETRYING
+        self._retrying = self._retrying or event in connection_status.RETRYING
         if event is zmq.Event.HANDSHAKE_SUCCEEDED:
             self._connected = True
             self._rejections = 0
@@ -368,7 +368,7 @@ class ZmqTransport:
             self._lose()
         elif obstacle is not None:
             self._obstacle = obstacle
-            if event in line.FAILED_HANDSHAKES and value != errno.EAGAIN:  # which says that time was up
+            if event in connection_status.FAILED_HANDSHAKES and value != errno.EAGAIN:  # which says that time was up
                 self._rejections += 1
                 self._note_rejection(event, value)
 
@@ -404,7 +404,9 @@ class ZmqTransport:
         if self._loop is not None:
             # Also when a handshake broke off: ZeroMQ does not try again after garbage in it.
             self._retrying = False
-            self._loop.call_later(line.REVIVE_S if self._connected else line.RETRY_S, self._revive)
+            self._loop.call_later(
+                connection_status.REVIVE_S if self._connected else connection_status.RETRY_S, self._revive
+            )
         self._connected = False
         self._silent_since = None
         self._fail_sent(self._lost)
@@ -412,7 +414,7 @@ class ZmqTransport:
     def _revive(self) -> None:
         self._on_event()
         if not self._retrying and not self._closed and self._socket is not None:
-            line.reconnect(self._socket, self._endpoint)
+            connection_status.reconnect(self._socket, self._endpoint)
 
     def _tell_connected(self) -> None:
         if self.stats.connects == 1 or self._loop is None:
@@ -427,7 +429,7 @@ class ZmqTransport:
     def _lost(self, entry: _Sent) -> URLabError:
         name = entry.op.name
         text = f"{name}: the connection to {self._endpoint} was lost after the request was sent."
-        if entry.op.effect is Timing.READ:
+        if entry.op.effect is Effect.READ:
             return ConnectionLost(text, op=name, hint="The op changes nothing: it can be sent again.")
         return OutcomeUnknown(
             text, op=name, hint="Whether it was executed is unknown: client.resync() finds out, and goes on."

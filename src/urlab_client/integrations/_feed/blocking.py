@@ -36,13 +36,13 @@ class BlockingTwin(Generic[F]):
         self._portal = portal
 
     def __enter__(self) -> Self:
-        self._portal.call(self._aio.__aenter__())
+        self._portal.call(self._aio.__aenter__)
         return self
 
     def __exit__(
         self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
     ) -> None:
         try:
-            self._portal.call(self._aio.__aexit__(exc_type, exc, traceback))
+            self._portal.call(self._aio.__aexit__, exc_type, exc, traceback)
         except ClientClosed:
             self._aio.finish()

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Sequence
-from typing import Literal
+from collections.abc import Callable, Coroutine, Sequence
+from typing import Any, Literal
 
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
-from urlab_client.aio.state import SimState
-from urlab_client.integrations._feed.samples import Picture, Schedule, State
-from urlab_client.integrations._feed.scene import CameraLayout, Scene
+from urlab_client.aio.state.sim_state import SimState
+from urlab_client.integrations._feed.samples import CameraPicture, Schedule, State
+from urlab_client.integrations._feed.scene_messages import CameraLayout, SceneMessages
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import ClientClosed, StreamOverflow, URLabError
 from urlab_client.protocol.messages.session import HelloOk, ResetOk, StateReply, StepOk
@@ -59,15 +59,15 @@ class Follower:
         self._pictures = Schedule(self._camera_ns)
         self._needs_model = needs_model
         self._buffer = buffer
-        self._put: Callable[[State | Picture], None] | None = None
-        self._scene: Scene | None = None
+        self._put: Callable[[State | CameraPicture], None] | None = None
+        self._scene: SceneMessages | None = None
         self._described: HelloOk | None = None
-        self._expected = False
-        self._tasks: list[asyncio.Task[None]] = []
+        self._due_at: int | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
         self._camera_tasks: list[asyncio.Task[None]] = []
         self._live = False
 
-    def check(self) -> Scene:
+    def check(self) -> SceneMessages:
         """Describe what there is.
 
         Raises:
@@ -88,7 +88,7 @@ class Follower:
             raise KeyError(unknown)
         return self._current()
 
-    def start(self, put: Callable[[State | Picture], None]) -> None:
+    def start(self, put: Callable[[State | CameraPicture], None]) -> None:
         """Hand on what comes from now on; `put` is called on the event loop and must be quick."""
         self._put = put
         self._state.observers.append(self)
@@ -108,9 +108,7 @@ class Follower:
 
     async def ended(self) -> None:
         """Wait until nothing of it runs."""
-        for outcome in await asyncio.gather(*self._tasks, return_exceptions=True):
-            if isinstance(outcome, Exception):
-                log.warning("%s: a stream was not followed to its end: %s", self._name, outcome)
+        await asyncio.gather(*self._tasks, return_exceptions=True)
 
     # What the client calls
 
@@ -132,8 +130,9 @@ class Follower:
             return asked
         timestep = 0.0 if state.mirror.model is None else state.mirror.model.opt.timestep
         then = round((state.sim_time + max(n_steps, 1) * timestep) * _NS)
-        self._expected = self._pictures.due(then)
-        if asked is True or not self._expected:
+        # The period counts as used only once the step was taken: it may be refused, or never answered.
+        self._due_at = then if self._pictures.is_due(then) else None
+        if asked is True or self._due_at is None:
             return asked
         chosen = dict(asked or {})
         known = {id(state.camera(name)) for name in chosen}
@@ -144,14 +143,14 @@ class Follower:
 
     # Inside
 
-    def _current(self) -> Scene:
+    def _current(self) -> SceneMessages:
         """Return the scene, described anew when there was another handshake."""
         hello = self._state.hello
         if self._scene is None or hello is not self._described:
             if self._scene is not None and (unknown := self._unknown_cameras()):
                 log.warning("%s: in the new scene there is %s", self._name, unknown)
             self._described = hello
-            self._scene = Scene.of(self._state, self._views())
+            self._scene = SceneMessages.of(self._state, self._views())
             if self._live:
                 self._follow_cameras(self._scene)
         return self._scene
@@ -186,27 +185,37 @@ class Follower:
         wall_ns = state.recv_wall_time_ns if wall is None else wall.sec * _NS + wall.nsec
         set_points = {key: record.ctrl.tolist() for key, record in state.records.items()}
         put(State(scene, reply, set_points, nanoseconds, isinstance(reply, ResetOk), wall_ns))
-        if isinstance(reply, StepOk) and reply.cameras and self._expected:
-            self._expected = False
-            for name, frame in reply.cameras.items():
+        if isinstance(reply, StepOk) and self._due_at is not None:
+            self._pictures.done(self._due_at)
+            self._due_at = None
+            for name, frame in (reply.cameras or {}).items():
                 camera = scene.cameras.get(id(state.camera(name)))
                 if camera is not None:
-                    put(Picture(camera, frame, nanoseconds, wall_ns))
+                    put(CameraPicture(camera, frame, nanoseconds, wall_ns))
 
     def _listen(self) -> None:
         """Follow the streams, as live mode brings nothing by replies."""
         scene = self._current()
         self._live = True
-        self._tasks.append(asyncio.create_task(self._follow_states(), name="urlab-feed"))
+        self._begin(self._follow_states())
         self._follow_cameras(scene)
 
-    def _follow_cameras(self, scene: Scene) -> None:
+    def _follow_cameras(self, scene: SceneMessages) -> None:
         """Follow this scene's cameras instead of those before."""
         for task in self._camera_tasks:
             task.cancel()
-        cameras = scene.cameras.values()
-        self._camera_tasks = [asyncio.create_task(self._follow_camera(camera), name="urlab-feed") for camera in cameras]
-        self._tasks += self._camera_tasks
+        self._camera_tasks = [self._begin(self._follow_camera(camera)) for camera in scene.cameras.values()]
+
+    def _begin(self, following: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        task = asyncio.create_task(following, name="urlab-feed")
+        self._tasks.add(task)
+        task.add_done_callback(self._on_end)
+        return task
+
+    def _on_end(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            log.warning("%s: a stream was not followed to its end: %s", self._name, error)
 
     def _ignore(self) -> None:
         self._live = False
@@ -241,4 +250,4 @@ class Follower:
                     return
                 nanoseconds = round((self._state.sim_time if sample.sim_time is None else sample.sim_time) * _NS)
                 if self._put is not None and schedule.due(nanoseconds):
-                    self._put(Picture(camera, sample.pixels, nanoseconds, sample.recv_wall_time_ns))
+                    self._put(CameraPicture(camera, sample.pixels, nanoseconds, sample.recv_wall_time_ns))

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from urlab_client.integrations._feed.messages import CompressedImage, RawImage, Time
-from urlab_client.integrations._feed.scene import CameraLayout, Scene
+from urlab_client.integrations._feed.scene_messages import CameraLayout, SceneMessages
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraFrame, StateReply
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.rows import Pixels, decode_camera
 
-__all__ = ["Clock", "Picture", "Schedule", "State", "compressed", "picture_message"]
+__all__ = ["CameraPicture", "SampleClock", "Schedule", "State", "compressed", "picture_message"]
 
 _FALLBACK_NS = 1_000_000
 
@@ -23,7 +23,7 @@ _FALLBACK_NS = 1_000_000
 class State:
     """One state on its way to whoever keeps or shows it."""
 
-    scene: Scene
+    scene: SceneMessages
     reply: StateReply | StateSnapshot
     set_points: dict[str, list[float]]
     nanoseconds: int
@@ -32,7 +32,7 @@ class State:
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class CameraPicture:
     """One picture on its way likewise; without a time of its own it belongs to the last state before it."""
 
     camera: CameraLayout
@@ -56,17 +56,25 @@ class Schedule:
         self._slack = period_ns // 100  # times are rounded on their way
         self._next = 0
 
+    def is_due(self, now: int) -> bool:
+        """Return whether it is due at `now`, nanoseconds."""
+        return not self._next - self._period <= now + self._slack < self._next
+
+    def done(self, now: int) -> None:
+        """Wait for the next period: it happened at `now`, nanoseconds."""
+        now += self._slack
+        self._next = now - now % self._period + self._period  # also when time was set back
+
     def due(self, now: int) -> bool:
         """Return whether it is due at `now`, nanoseconds, and wait for the next period if so."""
-        now += self._slack
-        if self._next - self._period <= now < self._next:
-            return False
-        self._next = now - now % self._period + self._period  # also when time was set back
-        return True
+        due = self.is_due(now)
+        if due:
+            self.done(now)
+        return due
 
 
 @dataclass(slots=True)
-class Clock:
+class SampleClock:
     """The clock of a run: simulation time that goes on where a reset sets it back."""
 
     offset: int = 0
@@ -102,7 +110,7 @@ def compressed(pixels: Pixels, mode: str, jpeg_quality: int | None) -> bytes:
     return target.getvalue()
 
 
-def picture_message(picture: Picture, stamp: Time, jpeg_quality: int | None) -> CompressedImage | RawImage:
+def picture_message(picture: CameraPicture, stamp: Time, jpeg_quality: int | None) -> CompressedImage | RawImage:
     """Return a picture as a message: depths as they are, colours as JPEG if there is a quality, all others as PNG."""
     pixels, name, mode = picture.pixels(), picture.camera.name, picture.camera.view.mode
     if pixels.dtype == np.float32:

@@ -13,15 +13,15 @@ from gymnasium.vector import AutoresetMode
 from mujoco.batch import Batch
 from numpy.typing import NDArray
 
-from urlab_client.aio.layout import ArticulationLayout
-from urlab_client.aio.mirror import model_names
+from urlab_client.aio.model.layout import ArticulationLayout
+from urlab_client.aio.model.mirror import model_names
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn
 from urlab_client.integrations.gym.episode import fields_of
 from urlab_client.integrations.gym.spaces import Field, Observation, SpaceMapping, SpaceMode
 from urlab_client.integrations.gym.vectorized import Floats, Indices, Vectorized
 from urlab_client.protocol.enums import ControllerKind
 from urlab_client.protocol.errors import UnknownKeyframe, URLabError
-from urlab_client.server.controllers import Controller, ControllerConfig, PassthroughController, PDController
+from urlab_client.server.physics.controllers import Controller, ControllerConfig, PassthroughController, PDController
 from urlab_client.sync.client import URLabClient
 
 __all__ = ["URLabBatchEnv"]
@@ -188,7 +188,7 @@ def _fetch(
 
 @dataclass(frozen=True)
 class _Actuated:
-    """See `urlab_client.server.controllers.Actuated`."""
+    """See `urlab_client.server.physics.controllers.Actuated`."""
 
     actuators: Indices
     actuator_names: tuple[str, ...]

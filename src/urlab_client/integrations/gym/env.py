@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Coroutine, Sequence
-from typing import Any, Final, Literal, TypeVar
+from collections.abc import Callable, Sequence
+from typing import Any, Final, Literal
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.integrations.gym.episode import Episode
+from urlab_client.integrations.gym.episode import EnvEpisode
 from urlab_client.integrations.gym.spaces import Observation, SpaceMapping, SpaceMode
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.sync._portal import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
 
 __all__ = ["RewardFn", "TerminationFn", "URLabEnv", "keyframe_option"]
-
-T = TypeVar("T")
 
 RewardFn = Callable[[Observation, Any, Observation, dict[str, Any]], Any]
 """`(observation, action, next_observation, info) -> reward`."""
@@ -97,7 +95,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         self.client = client
         self.render_mode = render_mode
         self._rendered = () if render_mode is None else (render_camera or _first_camera(client),)
-        self._episode = Episode(
+        self._episode = EnvEpisode(
             aio_of(client),
             space_mode=space_mode,
             observations=observations,
@@ -140,7 +138,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         """
         super().reset(seed=seed)
         keyframe = keyframe_option(options)
-        self._observation = self._run(self._episode.reset(self.np_random, keyframe))
+        self._observation = portal_of(self.client).call(self._episode.reset, self.np_random, keyframe)
         self._elapsed = 0
         return self._observation, self._info()
 
@@ -154,7 +152,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         if self._observation is None:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
         before = self._observation
-        after = self._observation = self._run(self._episode.step(action))
+        after = self._observation = portal_of(self.client).call(self._episode.step, action)
         self._elapsed += 1
         info = self._info()
         reward = 0.0 if self.reward_fn is None else float(self.reward_fn(before, action, after, info))
@@ -181,9 +179,6 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         if self._owns_client:
             self.client.close()
         super().close()
-
-    def _run(self, coro: Coroutine[Any, Any, T]) -> T:
-        return portal_of(self.client).call(coro)
 
     def _info(self) -> dict[str, Any]:
         client = self.client

@@ -16,7 +16,7 @@ from urlab_client.protocol.enums import CameraMode, ObservationLevel, StepMode
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.rows import Pixels
 
-__all__ = ["Episode"]
+__all__ = ["EnvEpisode"]
 
 
 def fields_of(observations: str | Sequence[str]) -> tuple[Field, ...]:
@@ -34,7 +34,7 @@ def fields_of(observations: str | Sequence[str]) -> tuple[Field, ...]:
     return LEVELS[observations]
 
 
-class Episode:
+class EnvEpisode:
     """One client that is reset and stepped as an environment.
 
     Attributes:

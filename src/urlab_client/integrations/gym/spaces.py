@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 import numpy as np
 from gymnasium import spaces
 
-from urlab_client.aio.layout import ArticulationLayout, articulation_layouts
+from urlab_client.aio.model.layout import ArticulationLayout, articulation_layouts
 from urlab_client.protocol.base import Floats
 
 if TYPE_CHECKING:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Coroutine, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Mapping, Sequence
+from functools import partial
 from types import MappingProxyType
 from typing import Any, TypeVar
 
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.launch import SCHEME
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn
-from urlab_client.integrations.gym.episode import Episode
+from urlab_client.integrations.gym.episode import EnvEpisode
 from urlab_client.integrations.gym.spaces import Observation, SpaceMode
 from urlab_client.integrations.gym.vectorized import Indices, Vectorized
 from urlab_client.protocol.errors import URLabError
@@ -32,7 +33,7 @@ class _Session:
     def __init__(self, address: str, client_options: Mapping[str, Any], episode_options: Mapping[str, Any]) -> None:
         self.address = address
         self.restarts = -1
-        self.episode: Episode | None = None
+        self.episode: EnvEpisode | None = None
         self._client_options = client_options
         self._episode_options = episode_options
 
@@ -55,12 +56,12 @@ class _Session:
         if episode is not None:
             await episode.client.close()
 
-    async def open(self) -> Episode:
+    async def open(self) -> EnvEpisode:
         """Start the session."""
         client = URLabClient(self.address, **self._client_options)
         try:
             await client.discover()
-            self.episode = Episode(client, **self._episode_options)
+            self.episode = EnvEpisode(client, **self._episode_options)
         except BaseException:
             await client.close()
             raise
@@ -138,7 +139,7 @@ class URLabVectorEnv(Vectorized):
         self._sessions = [_Session(address, client_options, episode_options) for address in addresses]
         self._portal = Portal()
         try:
-            first = self._portal.call(self._open_all())
+            first = self._portal.call(self._open_all)
         except BaseException:
             self.close_extras()
             raise
@@ -156,9 +157,9 @@ class URLabVectorEnv(Vectorized):
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the clients, and the servers they started."""
-        self._portal.close(self._close_all())
+        self._portal.close(self._close_all)
 
-    async def _open_all(self) -> Episode:
+    async def _open_all(self) -> EnvEpisode:
         found = await asyncio.gather(*(session.open() for session in self._sessions), return_exceptions=True)
         for i, episode in enumerate(found):
             if isinstance(episode, BaseException):
@@ -175,11 +176,14 @@ class URLabVectorEnv(Vectorized):
 
     def _reset_some(self, indices: Indices, keyframe: str | None) -> tuple[Observation, Mapping[int, Exception]]:
         timeout = self._step_timeout
-        return self._gather({i: self._sessions[i].reset(self._rngs[i], keyframe, timeout) for i in map(int, indices)})
+        return self._gather(
+            {i: partial(self._sessions[i].reset, self._rngs[i], keyframe, timeout) for i in map(int, indices)}
+        )
 
     def _step_some(self, indices: Indices, actions: Any) -> tuple[Observation, Mapping[int, Exception]]:
         each = list(iterate(self.action_space, actions))
-        return self._gather({i: self._sessions[i].step(each[i], self._step_timeout) for i in map(int, indices)})
+        timeout = self._step_timeout
+        return self._gather({i: partial(self._sessions[i].step, each[i], timeout) for i in map(int, indices)})
 
     def _clocks(self) -> dict[str, NDArray[Any]]:
         for i, session in enumerate(self._sessions):
@@ -190,9 +194,9 @@ class URLabVectorEnv(Vectorized):
         return {"sim_time": self._sim_time.copy(), "step_count": self._step_count.copy(), "restarts": restarts}
 
     def _gather(
-        self, calls: Mapping[int, Coroutine[Any, Any, Observation]]
+        self, calls: Mapping[int, Callable[[], Coroutine[Any, Any, Observation]]]
     ) -> tuple[Observation, Mapping[int, Exception]]:
-        results = self._portal.call(self._all(calls))
+        results = self._portal.call(self._all, calls)
         errors = {i: result for i, result in results.items() if isinstance(result, Exception)}
         single = self.single_observation_space
         rows = [
@@ -201,8 +205,8 @@ class URLabVectorEnv(Vectorized):
         ]
         return concatenate(single, rows, create_empty_array(single, len(rows))), errors
 
-    async def _all(self, calls: Mapping[int, Coroutine[Any, Any, T]]) -> dict[int, T | Exception]:
-        found = await asyncio.gather(*calls.values(), return_exceptions=True)
+    async def _all(self, calls: Mapping[int, Callable[[], Coroutine[Any, Any, T]]]) -> dict[int, T | Exception]:
+        found = await asyncio.gather(*(call() for call in calls.values()), return_exceptions=True)
         results: dict[int, T | Exception] = {}
         for i, result in zip(calls, found, strict=True):
             if isinstance(result, TimeoutError) and not isinstance(result, URLabError):

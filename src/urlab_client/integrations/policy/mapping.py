@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client.aio.controllers import URLabController as AsyncController
-from urlab_client.aio.handles import Actuator, Joint, Sensor
+from urlab_client.aio.model.elements import Actuator, Joint, Sensor
 from urlab_client.integrations.policy.spec import (
     AngularVelocity,
     BaseHeight,
-    Clock,
     CommandTerm,
     Gravity,
     JointPosition,
@@ -26,6 +25,7 @@ from urlab_client.integrations.policy.spec import (
     LastAction,
     LinearVelocity,
     Numbers,
+    PhaseClock,
     PolicySpec,
     SensorTerm,
     Term,
@@ -35,7 +35,7 @@ from urlab_client.protocol.enums import ControlMode
 from urlab_client.protocol.errors import URLabError
 from urlab_client.sync.controllers import URLabController
 
-__all__ = ["PolicyMapping", "PolicyMismatch", "Robot", "RobotState"]
+__all__ = ["PolicyMapping", "PolicyMismatch", "PolicyRobot", "RobotState"]
 
 _SCALAR_JOINTS: Final = (2, 3)  # slide, hinge
 _COMMAND: Final = 3
@@ -45,7 +45,7 @@ class PolicyMismatch(URLabError):
     """A policy does not fit the robot or the session; says what is there, what it requires, and how to get it."""
 
 
-class Robot(Protocol):
+class PolicyRobot(Protocol):
     """What a policy uses of an articulation of either flavour."""
 
     @property
@@ -117,7 +117,7 @@ class RobotState(NamedTuple):
     sensors: Mapping[str, Floats] = {}
 
     @classmethod
-    def of(cls, robot: Robot) -> RobotState:
+    def of(cls, robot: PolicyRobot) -> RobotState:
         """Return the state that an articulation has now."""
         return cls(robot.qpos_array, robot.qvel_array, robot.get_sensors())
 
@@ -171,7 +171,7 @@ class PolicyMapping:
         ctrl: Position of each output in `ctrl_array`.
     """
 
-    def __init__(self, spec: PolicySpec, robot: Robot, source: str) -> None:
+    def __init__(self, spec: PolicySpec, robot: PolicyRobot, source: str) -> None:
         """Bind.
 
         Args:
@@ -285,7 +285,7 @@ class PolicyMapping:
         )
         return np.where(self.fallen(state), 0.0, gain - cost)
 
-    def _term(self, robot: Robot, term: Term, where: str) -> tuple[int, _Read]:
+    def _term(self, robot: PolicyRobot, term: Term, where: str) -> tuple[int, _Read]:
         """Return how many numbers a term has, and how to read them."""
         match term:
             case JointPosition():
@@ -302,14 +302,14 @@ class PolicyMapping:
                 return sensor.dim, lambda moment: moment.state.sensors[name]
             case LastAction():
                 return self.action_size, lambda moment: moment.last_action
-            case Clock() | CommandTerm():
+            case PhaseClock() | CommandTerm():
                 return _free_term(term)
             case _:
                 if not self._has_base:
                     raise self._misfit(where, f"needs a free base; {robot.prefix!r} has none")
                 return _base_term(term)
 
-    def _joints(self, robot: Robot, names: Sequence[str], where: str) -> list[Joint]:
+    def _joints(self, robot: PolicyRobot, names: Sequence[str], where: str) -> list[Joint]:
         found: list[Joint] = []
         for index, name in enumerate(names):
             joint = robot.joints.get(name)
@@ -324,7 +324,7 @@ class PolicyMapping:
         return PolicyMismatch(f"{self._source}: {where}: {problem}.")
 
 
-def _free_term(term: Clock | CommandTerm) -> tuple[int, _Read]:
+def _free_term(term: PhaseClock | CommandTerm) -> tuple[int, _Read]:
     if isinstance(term, CommandTerm):
         return _COMMAND, lambda moment: moment.command
     rate = 2 * math.pi * term.hz
@@ -343,7 +343,7 @@ def _base_term(term: BaseHeight | Gravity | LinearVelocity | AngularVelocity) ->
             return 3, lambda moment: moment.state.angular_velocity
 
 
-def _actuator(robot: Robot, joint: Joint, source: str) -> Actuator:
+def _actuator(robot: PolicyRobot, joint: Joint, source: str) -> Actuator:
     """Return the actuator that drives a joint."""
     found = [actuator for actuator in robot.actuators.values() if actuator.joint == joint.name]
     if len(found) != 1 or found[0].ctrl_local.stop - found[0].ctrl_local.start != 1:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from urlab_client.integrations.policy.mapping import PolicyMapping, PolicyMismatch, Robot, RobotState
+from urlab_client.integrations.policy.mapping import PolicyMapping, PolicyMismatch, PolicyRobot, RobotState
 from urlab_client.integrations.policy.network import Network, OnnxNetwork
 from urlab_client.integrations.policy.spec import PolicyFileError, PolicySpec, read_spec
 from urlab_client.protocol.base import Floats
@@ -39,7 +39,7 @@ class Policy:
         self.source = source
         self._network = network
         self._command: Floats = np.zeros(3) if spec.command is None else np.array(spec.command.default)
-        self._robot: Robot | None = None
+        self._robot: PolicyRobot | None = None
         self._mapping: PolicyMapping | None = None
         self._targets: Floats = np.zeros(0)
         self.reset()
@@ -72,7 +72,7 @@ class Policy:
         """The last outputs after clipping, shape (n_joints,); zeros before the first."""
         return self._action.copy()
 
-    def bind(self, robot: Robot) -> PolicyMapping:
+    def bind(self, robot: PolicyRobot) -> PolicyMapping:
         """Fit the policy to an articulation of a discovered client, and return how.
 
         Raises:
@@ -100,7 +100,7 @@ class Policy:
         self._action: Floats = np.zeros(len(self.spec.action.joints))
         self._history: list[Floats] = []
 
-    def act(self, robot: Robot, time: float | None = None) -> Floats:
+    def act(self, robot: PolicyRobot, time: float | None = None) -> Floats:
         """Look at a robot, and write its set-points for the next `decimation` physics steps.
 
         With `via = "client"` they are the torques for the present state; `hold` computes them for later ones.
@@ -138,7 +138,7 @@ class Policy:
             robot.ctrl_array[mapping.ctrl] = self._targets
         return self._targets
 
-    def hold(self, robot: Robot) -> None:
+    def hold(self, robot: PolicyRobot) -> None:
         """Write the torques that pull a robot, as it is now, towards the targets of the last action.
 
         To be called before each physics step between two actions, for a policy with `via = "client"`.

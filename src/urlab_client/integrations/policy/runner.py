@@ -182,7 +182,7 @@ async def run(
         before = {name: {key: controller.params[name][key] for key in wanted[name]} for name in wanted}
         await controller.configure(timeout=DEFAULT, **wanted)
     try:
-        return await _Run(client, robot, policy, on_action).until(seconds)
+        return await _PolicyLoop(client, robot, policy, on_action).until(seconds)
     finally:
         if controller is not None and client.connected:
             with contextlib.suppress(URLabError):  # a courtesy: play may be over
@@ -198,11 +198,11 @@ def run_blocking(
     on_action: OnAction | None = None,
 ) -> PolicyRun:
     """Do what `run` does with a blocking client."""
-    coro = run(aio_of(client), policy, articulation=articulation, seconds=seconds, on_action=on_action)
-    return portal_of(client).call(coro)
+    portal = portal_of(client)
+    return portal.call(run, aio_of(client), policy, articulation=articulation, seconds=seconds, on_action=on_action)
 
 
-class _Run:
+class _PolicyLoop:
     """One run of a policy, and what it adds up."""
 
     def __init__(

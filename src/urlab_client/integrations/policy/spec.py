@@ -21,7 +21,6 @@ __all__ = [
     "Action",
     "AngularVelocity",
     "BaseHeight",
-    "Clock",
     "Command",
     "CommandTerm",
     "Fall",
@@ -32,6 +31,7 @@ __all__ = [
     "LastAction",
     "LinearVelocity",
     "Numbers",
+    "PhaseClock",
     "PolicyFileError",
     "PolicySpec",
     "SensorTerm",
@@ -125,7 +125,7 @@ class LastAction(_Term, tag="last_action", kw_only=True, forbid_unknown_fields=T
     """The network's last output after clipping, zeros at the start; one number for each joint of the action."""
 
 
-class Clock(_Term, tag="clock", kw_only=True, forbid_unknown_fields=True, frozen=True):
+class PhaseClock(_Term, tag="clock", kw_only=True, forbid_unknown_fields=True, frozen=True):
     """Sine and cosine of a phase that goes on by itself; 2 numbers.
 
     Attributes:
@@ -145,7 +145,7 @@ Term = (
     | SensorTerm
     | CommandTerm
     | LastAction
-    | Clock
+    | PhaseClock
 )
 
 

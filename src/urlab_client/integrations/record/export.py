@@ -155,8 +155,8 @@ def write_lerobot(
     _check_lerobot(python)
     table = run.table(progress)
     names = run.cameras() if cameras is None else list(cameras)
-    with tempfile.TemporaryDirectory(prefix="urlab-lerobot-") as scratch:
-        work = Path(scratch)
+    with tempfile.TemporaryDirectory(prefix="urlab-lerobot-") as temporary:
+        work = Path(temporary)
         times = {name: _save_pictures(run, name, work / str(i), progress) for i, name in enumerate(names)}
         rows = _resampled(table, fps, [when[0] for when in times.values()])
         if not len(rows):

@@ -27,7 +27,7 @@ from urlab_client.integrations._feed.messages import (
     RawImage,
     schema_name,
 )
-from urlab_client.integrations._feed.scene import Layout, from_metadata
+from urlab_client.integrations._feed.scene_messages import SceneLayout, from_metadata
 from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.rows import Pixels
@@ -188,17 +188,17 @@ class Camera:
 
 
 @dataclass(slots=True)
-class _Entry:
+class _IndexEntry:
     topic: str
     schema: str
-    layout: Layout
+    layout: SceneLayout
 
 
 @dataclass(slots=True)
 class _Builder:
     """Rows of one articulation or entity."""
 
-    layout: Layout
+    layout: SceneLayout
     samples: list[int] = field(default_factory=list[int])
     fields: dict[str, list[list[_Number]]] = field(default_factory=dict[str, list[list[_Number]]])
     names: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
@@ -335,7 +335,7 @@ class Run:
     def _take_state(
         self,
         record: Message,
-        entry: _Entry,
+        entry: _IndexEntry,
         rows: dict[int, tuple[float, float, int, int, int]],
         builders: dict[str, _Builder],
     ) -> None:
@@ -372,7 +372,7 @@ class Run:
     def _take_entity(
         self,
         record: Message,
-        entry: _Entry,
+        entry: _IndexEntry,
         rows: dict[int, tuple[float, float, int, int, int]],
         builders: dict[str, _Builder],
     ) -> None:
@@ -384,11 +384,11 @@ class Run:
         rows.setdefault(entity.sample, (*times, entity.step, entity.episode))
         builder.add(entity.sample, pose=[*entity.position, *entity.orientation], qvel=entity.qvel)
 
-    def _records(self, progress: Callable[[int], None] | None) -> Iterator[tuple[object, _Entry | None]]:
+    def _records(self, progress: Callable[[int], None] | None) -> Iterator[tuple[object, _IndexEntry | None]]:
         """Yield every record, up to where a file that was not finished breaks off; `damage` says why."""
         self.damage = ""
         schemas: dict[int, str] = {}
-        entries: dict[int, _Entry] = {}
+        entries: dict[int, _IndexEntry] = {}
         with self.path.open("rb") as file:
             reader = StreamReader(file, validate_crcs=True, record_size_limit=os.fstat(file.fileno()).st_size + 1)
             records, count = iter(reader.records), 0
@@ -414,7 +414,7 @@ class Run:
                     schemas[record.id] = record.name
                 elif isinstance(record, Channel):
                     layout = from_metadata(record.metadata)
-                    entries[record.id] = _Entry(record.topic, schemas.get(record.schema_id, ""), layout)
+                    entries[record.id] = _IndexEntry(record.topic, schemas.get(record.schema_id, ""), layout)
                 yield record, entries.get(record.channel_id) if isinstance(record, Message) else None
 
 

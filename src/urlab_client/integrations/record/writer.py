@@ -31,8 +31,8 @@ from urlab_client.integrations._feed.messages import (
     schema_of,
     values,
 )
-from urlab_client.integrations._feed.samples import Clock, Picture, Schedule, State, picture_message
-from urlab_client.integrations._feed.scene import Scene, Simulation, calibration, to_metadata
+from urlab_client.integrations._feed.samples import CameraPicture, SampleClock, Schedule, State, picture_message
+from urlab_client.integrations._feed.scene_messages import SceneMessages, Simulation, calibration, to_metadata
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import CameraFrame, EntityState, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
@@ -110,11 +110,11 @@ class WriterThread:
         self.path = path
         self.error: OSError | RecordingError | None = None
         self._options = options
-        self._queue: deque[tuple[State | Picture, int]] = deque()
+        self._queue: deque[tuple[State | CameraPicture, int]] = deque()
         # Each number has one writer, so no lock: the producer adds, the thread takes away.
         self._put_bytes = self._taken_bytes = 0
         self._dropped_states = self._dropped_frames = 0
-        self._file: _File | None = None
+        self._file: _McapFile | None = None
         self._sink: _Sink | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="urlab-record", daemon=True)
@@ -125,7 +125,7 @@ class WriterThread:
         Raises:
             OSError: The file cannot be made, or exists already.
         """
-        self._file = _File(self.path, "wb" if self._options.overwrite else "xb")
+        self._file = _McapFile(self.path, "wb" if self._options.overwrite else "xb")
         try:
             self._sink = _Sink(self._file, self._options)
         except BaseException:
@@ -146,7 +146,7 @@ class WriterThread:
             file_bytes=file.written if file else 0,
         )
 
-    def put(self, item: State | Picture) -> None:
+    def put(self, item: State | CameraPicture) -> None:
         """Queue an item, or drop it: pictures give way at half the queue's size, so that states find room."""
         size = _size(item)
         limit, waiting = self._options.buffer_bytes, self._put_bytes - self._taken_bytes
@@ -217,7 +217,7 @@ class WriterThread:
                 self._dropped_frames += 1
 
 
-class _File:
+class _McapFile:
     """A file without a buffer in this process, which a forked child would write a second time."""
 
     def __init__(self, path: Path, mode: str) -> None:
@@ -255,14 +255,14 @@ class _Topic:
 class _Sink:
     """Encodes items and writes them. All of it happens in the writing thread, apart from making it."""
 
-    file: _File
+    file: _McapFile
     options: WriterOptions
     states: int = 0
     frames: int = 0
-    _clock: Clock = field(default_factory=Clock)
+    _clock: SampleClock = field(default_factory=SampleClock)
     _schemas: dict[type[Struct], int] = field(default_factory=dict[type[Struct], int])
     _topics: dict[tuple[str, str], _Topic] = field(default_factory=dict[tuple[str, str], _Topic])
-    _scene: Scene | None = None
+    _scene: SceneMessages | None = None
     _simulation: Simulation | None = None
     _reported: tuple[int, int] = (0, 0)
     _dirty_since: float | None = None
@@ -274,7 +274,7 @@ class _Sink:
         started = datetime.now(UTC).isoformat(timespec="milliseconds")
         self._writer.add_metadata("urlab", {"format": FORMAT, "started": started, **self.options.about})
 
-    def write(self, item: State | Picture) -> None:
+    def write(self, item: State | CameraPicture) -> None:
         """Write one item."""
         if isinstance(item, State):
             self._write_state(item)
@@ -354,7 +354,7 @@ class _Sink:
         if self.options.contacts:
             self._add("/contacts", ContactsMessage(stamp, simulation.contacts()), now, wall_ns, {})
 
-    def _write_picture(self, item: Picture) -> None:
+    def _write_picture(self, item: CameraPicture) -> None:
         clock, camera = self._clock, item.camera
         sim = clock.sim if item.nanoseconds is None else item.nanoseconds
         now = max(0, clock.offset + sim)
@@ -365,7 +365,7 @@ class _Sink:
         self._add(f"{topic}/calibration", calibration(camera, stamp), now, item.wall_ns, {})
         self.frames += 1
 
-    def _use(self, scene: Scene) -> None:
+    def _use(self, scene: SceneMessages) -> None:
         self._scene = scene
         wanted = scene.model is not None and self.options.pose_ns > 0
         self._simulation = Simulation(scene, scene.model) if wanted and scene.model is not None else None
@@ -396,8 +396,8 @@ class _Sink:
         return topic
 
 
-def _size(item: State | Picture) -> int:
-    if isinstance(item, Picture):
+def _size(item: State | CameraPicture) -> int:
+    if isinstance(item, CameraPicture):
         return len(item.frame.data) if isinstance(item.frame, CameraFrame) else item.frame.nbytes
     states = item.reply.per_articulation.values()
     return _STATE_BYTES * (1 + sum(1 for _ in states)) + sum(8 * (len(s.qpos) + len(s.qvel)) for s in states)

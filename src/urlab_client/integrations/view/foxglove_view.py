@@ -22,8 +22,8 @@ from urlab_client.integrations._feed.messages import (
     schema_of,
     values,
 )
-from urlab_client.integrations._feed.samples import Picture, State, picture_message
-from urlab_client.integrations._feed.scene import Scene, Simulation, calibration, to_metadata
+from urlab_client.integrations._feed.samples import CameraPicture, State, picture_message
+from urlab_client.integrations._feed.scene_messages import SceneMessages, Simulation, calibration, to_metadata
 from urlab_client.integrations.view.geometry import Kind, Shape, shapes_of
 from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewOptions, make_view
 from urlab_client.protocol.errors import URLabError
@@ -66,17 +66,17 @@ class _Foxglove:
         return f"ws://{host}:{self._server.port}"
 
     def open(self) -> None:
-        """See `Sink`."""
+        """See `ViewBackend`."""
         import foxglove  # noqa: PLC0415
         from foxglove.channels import SceneUpdateChannel  # noqa: PLC0415
         from foxglove.websocket import ServerListener  # noqa: PLC0415
 
-        sink = self
+        backend = self
 
         class Listener(ServerListener):
             def on_subscribe(self, client: Client, channel: ChannelView) -> None:
                 del client, channel
-                sink._joined = True
+                backend._joined = True
 
         self._context = foxglove.Context()
         self._scene_channel = SceneUpdateChannel("/scene", context=self._context)
@@ -93,8 +93,8 @@ class _Foxglove:
         except RuntimeError as error:
             raise URLabError(f"foxglove_view: port {self._port} of {self._host} cannot be used: {error}") from None
 
-    def use(self, simulation: Simulation, scene: Scene) -> None:
-        """See `Sink`."""
+    def use(self, simulation: Simulation, scene: SceneMessages) -> None:
+        """See `ViewBackend`."""
         self._shapes = shapes_of(simulation.model, simulation.bodies)
         del scene
         if self._server is not None and self._last is not None:
@@ -104,7 +104,7 @@ class _Foxglove:
         self._joined = True
 
     def show(self, moment: Moment) -> None:
-        """See `Sink`."""
+        """See `ViewBackend`."""
         self._last = moment
         stamp, simulation = Time.of(moment.ns), moment.simulation
         self._send("/tf", lambda: FrameTransforms(simulation.transforms(stamp)), moment.ns)
@@ -116,14 +116,14 @@ class _Foxglove:
         if moment.contacts:
             self._send_contacts(moment)
 
-    def show_picture(self, picture: Picture, ns: int) -> None:
-        """See `Sink`."""
+    def show_picture(self, picture: CameraPicture, ns: int) -> None:
+        """See `ViewBackend`."""
         stamp, topic = Time.of(ns), f"/camera/{picture.camera.name}"
         self._send(topic, lambda: picture_message(picture, stamp, _JPEG_QUALITY), ns)
         self._send(f"{topic}/calibration", lambda: calibration(picture.camera, stamp), ns)
 
     def idle(self) -> bool:
-        """See `Sink`."""
+        """See `ViewBackend`."""
         if self._joined and self._last is not None:
             self._joined = False
             self._send_geometry(self._last.ns)
@@ -131,7 +131,7 @@ class _Foxglove:
         return True
 
     def close(self) -> None:
-        """See `Sink`."""
+        """See `ViewBackend`."""
         for channel in self._channels.values():
             channel.close()
         if self._server is not None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.aio.mirror import model_names
+from urlab_client.aio.model.mirror import model_names
 
 if TYPE_CHECKING:
     import mujoco

@@ -12,8 +12,8 @@ import numpy as np
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.integrations._extras import need
 from urlab_client.integrations._feed.messages import FrameTransform, Time
-from urlab_client.integrations._feed.samples import Picture, State, compressed
-from urlab_client.integrations._feed.scene import Scene, Simulation, calibration
+from urlab_client.integrations._feed.samples import CameraPicture, State, compressed
+from urlab_client.integrations._feed.scene_messages import SceneMessages, Simulation, calibration
 from urlab_client.integrations.view.geometry import Kind, Shape, shapes_of
 from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewOptions, make_view
 from urlab_client.protocol.enums import CameraMode
@@ -45,7 +45,7 @@ class _Rerun:
 
     @property
     def address(self) -> str:
-        """See `Sink`."""
+        """See `ViewBackend`."""
         return f"http://127.0.0.1:{self._web_port}" if self._web else ""
 
     @property
@@ -55,7 +55,7 @@ class _Rerun:
         return self._stream
 
     def open(self) -> None:
-        """See `Sink`."""
+        """See `ViewBackend`."""
         import rerun as rr  # noqa: PLC0415
 
         recording = rr.RecordingStream("urlab")
@@ -71,8 +71,8 @@ class _Rerun:
             recording.spawn(port=self._grpc_port)
         self._stream = recording
 
-    def use(self, simulation: Simulation, scene: Scene) -> None:
-        """See `Sink`."""
+    def use(self, simulation: Simulation, scene: SceneMessages) -> None:
+        """See `ViewBackend`."""
         import rerun as rr  # noqa: PLC0415
 
         recording = self._recording
@@ -90,7 +90,7 @@ class _Rerun:
             recording.log(where, before[where].cleared(), static=True)  # type: ignore[attr-defined]  # of each archetype
 
     def show(self, moment: Moment) -> None:
-        """See `Sink`."""
+        """See `ViewBackend`."""
         import rerun as rr  # noqa: PLC0415
 
         recording = self._recording
@@ -109,8 +109,8 @@ class _Rerun:
             recording.log("world/contacts/points", rr.Points3D(origins, radii=0.008, labels=labels, show_labels=False))
             recording.log("world/contacts/forces", rr.Arrows3D(vectors=_NEWTON_M * forces, origins=origins))
 
-    def show_picture(self, picture: Picture, ns: int) -> None:
-        """See `Sink`."""
+    def show_picture(self, picture: CameraPicture, ns: int) -> None:
+        """See `ViewBackend`."""
         import rerun as rr  # noqa: PLC0415
 
         recording, camera = self._recording, picture.camera
@@ -134,11 +134,11 @@ class _Rerun:
             recording.log(f"{where}/image", rr.EncodedImage(contents=data, media_type=media))
 
     def idle(self) -> bool:
-        """See `Sink`."""
+        """See `ViewBackend`."""
         return True
 
     def close(self) -> None:
-        """See `Sink`."""
+        """See `ViewBackend`."""
         recording, self._stream = self._recording, None
         recording.flush(timeout_sec=5.0)
         recording.disconnect()
@@ -148,11 +148,11 @@ class _Rerun:
         recording.set_time("sim_time", duration=np.timedelta64(ns, "ns"))
         recording.set_time("wall_time", timestamp=np.datetime64(wall_ns, "ns"))
 
-    def _entity_of(self, scene: Scene, frame: FrameTransform) -> str:
+    def _entity_of(self, scene: SceneMessages, frame: FrameTransform) -> str:
         name = frame.child_frame_id
         return _camera(name) if any(camera.name == name for camera in scene.cameras.values()) else _body(name)
 
-    def _show_values(self, state: State, scene: Scene) -> None:
+    def _show_values(self, state: State, scene: SceneMessages) -> None:
         import rerun as rr  # noqa: PLC0415
 
         recording = self._recording
@@ -291,5 +291,5 @@ def rerun_view(
         raise ValueError("give one of save, connect and web")
     options = ViewOptions(cameras=cameras, camera_hz=camera_hz, max_hz=max_hz, contacts=contacts)
     path = None if save is None else Path(save)
-    sink = _Rerun(save=path, connect=connect, web=web, web_port=web_port, grpc_port=grpc_port, sensors=sensors)
-    return make_view(client, sink, options, "rerun_view")
+    backend = _Rerun(save=path, connect=connect, web=web, web_port=web_port, grpc_port=grpc_port, sensors=sensors)
+    return make_view(client, backend, options, "rerun_view")

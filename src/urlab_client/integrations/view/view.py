@@ -18,8 +18,8 @@ from msgspec import Struct
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.integrations._feed.blocking import BlockingTwin
 from urlab_client.integrations._feed.follower import Follower
-from urlab_client.integrations._feed.samples import Clock, Picture, State
-from urlab_client.integrations._feed.scene import Scene, Simulation
+from urlab_client.integrations._feed.samples import CameraPicture, SampleClock, State
+from urlab_client.integrations._feed.scene_messages import SceneMessages, Simulation
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import EntityState, StepOk
@@ -27,7 +27,7 @@ from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.sync._portal import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
 
-__all__ = ["AsyncView", "Moment", "Sink", "View", "ViewOptions", "ViewStats", "make_view"]
+__all__ = ["AsyncView", "Moment", "View", "ViewBackend", "ViewOptions", "ViewStats", "make_view"]
 
 log = logging.getLogger("urlab_client.view")
 
@@ -78,14 +78,14 @@ class Moment:
     ns: int
     wall_ns: int
     step: int
-    scene: Scene
+    scene: SceneMessages
     simulation: Simulation
     episode: int
     contacts: bool
     state: State | None
 
 
-class Sink(Protocol):
+class ViewBackend(Protocol):
     """Where a view shows things. Used by the view's thread alone, except `open` and `address`."""
 
     @property
@@ -102,7 +102,7 @@ class Sink(Protocol):
         """
         ...
 
-    def use(self, simulation: Simulation, scene: Scene) -> None:
+    def use(self, simulation: Simulation, scene: SceneMessages) -> None:
         """Show this scene from now on instead of the one before."""
         ...
 
@@ -110,7 +110,7 @@ class Sink(Protocol):
         """Show a state."""
         ...
 
-    def show_picture(self, picture: Picture, ns: int) -> None:
+    def show_picture(self, picture: CameraPicture, ns: int) -> None:
         """Show a picture taken at `ns` of the view's clock."""
         ...
 
@@ -127,7 +127,7 @@ class Sink(Protocol):
 class _Start:
     """The state that the client has when the view starts."""
 
-    scene: Scene
+    scene: SceneMessages
     qpos: Floats
     qvel: Floats
     nanoseconds: int
@@ -137,20 +137,20 @@ class _Start:
 class AsyncView:
     """A view that is open between `async with` and its end. Made by `rerun_view` and its siblings."""
 
-    def __init__(self, client: AsyncClient, sink: Sink, options: ViewOptions, name: str) -> None:
+    def __init__(self, client: AsyncClient, backend: ViewBackend, options: ViewOptions, name: str) -> None:
         self._client = client
-        self._sink = sink
+        self._backend = backend
         self._options = options
         self._name = name
         self._follower = Follower(
             client, name=name, cameras=options.cameras, camera_hz=options.camera_hz, needs_model="", buffer=0
         )
         self._states: deque[State | _Start] = deque(maxlen=1)
-        self._pictures: dict[int, Picture] = {}
+        self._pictures: dict[int, CameraPicture] = {}
         self._counts = {"states": 0, "frames": 0, "dropped_states": 0, "dropped_frames": 0}
-        self._clock = Clock()
+        self._clock = SampleClock()
         self._simulation: Simulation | None = None
-        self._scene: Scene | None = None
+        self._scene: SceneMessages | None = None
         self._shown: int = 0
         self._stop = threading.Event()
         self._gone = threading.Event()
@@ -166,7 +166,7 @@ class AsyncView:
     @property
     def address(self) -> str:
         """Where what is served can be seen; empty before the block, and where nothing is served."""
-        return self._sink.address
+        return self._backend.address
 
     @property
     def closed(self) -> bool:
@@ -183,7 +183,7 @@ class AsyncView:
             raise URLabError("A view opens once.", hint="Call the function that made it again.")
         scene = self._follower.check()
         self._opened = True
-        await anyio.to_thread.run_sync(self._sink.open)
+        await anyio.to_thread.run_sync(self._backend.open)
         state = self._client._state  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
         with state.mirror.lock:
             data = state.mirror.data
@@ -209,7 +209,7 @@ class AsyncView:
 
     # On the client's loop
 
-    def _put(self, item: State | Picture) -> None:
+    def _put(self, item: State | CameraPicture) -> None:
         if self._gone.is_set():
             return
         if isinstance(item, State):
@@ -231,7 +231,7 @@ class AsyncView:
             while not self._stop.wait(pause):
                 started = time.monotonic()
                 self._drain()
-                if not self._sink.idle():
+                if not self._backend.idle():
                     return
                 took = time.monotonic() - started
                 pause = max(period - took, took)  # at most half of a processor's time
@@ -242,7 +242,7 @@ class AsyncView:
         finally:
             self._gone.set()
             try:
-                self._sink.close()
+                self._backend.close()
             except Exception as error:  # noqa: BLE001
                 self._error = self._error or error
                 log.warning("%s: the view could not be closed well: %s", self._name, error)
@@ -253,7 +253,7 @@ class AsyncView:
         while self._pictures:
             _, picture = self._pictures.popitem()
             ns = self._shown if picture.nanoseconds is None else max(0, self._clock.offset + picture.nanoseconds)
-            self._sink.show_picture(picture, ns)
+            self._backend.show_picture(picture, ns)
             self._counts["frames"] += 1
 
     def _show(self, item: State | _Start) -> None:
@@ -263,7 +263,7 @@ class AsyncView:
                 return  # what follows has no model; the last scene stays
             simulation = Simulation(item.scene, item.scene.model)
             self._simulation, self._scene = simulation, item.scene
-            self._sink.use(simulation, item.scene)
+            self._backend.use(simulation, item.scene)
         state = item if isinstance(item, State) else None
         contacts = self._options.contacts
         if isinstance(item, State):
@@ -277,7 +277,7 @@ class AsyncView:
             simulation.start_from(item.qpos, item.qvel, forces=contacts)
             step, wall_ns, restarts = item.step, time.time_ns(), False
         self._shown = self._clock.advance(item.nanoseconds, restarts)
-        self._sink.show(
+        self._backend.show(
             Moment(self._shown, wall_ns, step, item.scene, simulation, self._clock.episode, contacts, state)
         )
         self._counts["states"] += 1
@@ -308,12 +308,16 @@ class View(BlockingTwin[AsyncView]):
 
 
 @overload
-def make_view(client: AsyncClient, sink: Sink, options: ViewOptions, name: str) -> AsyncView: ...
+def make_view(client: AsyncClient, backend: ViewBackend, options: ViewOptions, name: str) -> AsyncView: ...
 @overload
-def make_view(client: URLabClient, sink: Sink, options: ViewOptions, name: str) -> View: ...
+def make_view(client: URLabClient, backend: ViewBackend, options: ViewOptions, name: str) -> View: ...
 @overload
-def make_view(client: AsyncClient | URLabClient, sink: Sink, options: ViewOptions, name: str) -> AsyncView | View: ...
-def make_view(client: AsyncClient | URLabClient, sink: Sink, options: ViewOptions, name: str) -> AsyncView | View:
+def make_view(
+    client: AsyncClient | URLabClient, backend: ViewBackend, options: ViewOptions, name: str
+) -> AsyncView | View: ...
+def make_view(
+    client: AsyncClient | URLabClient, backend: ViewBackend, options: ViewOptions, name: str
+) -> AsyncView | View:
     """Return a view of the client's own flavour.
 
     Raises:
@@ -323,7 +327,7 @@ def make_view(client: AsyncClient | URLabClient, sink: Sink, options: ViewOption
         if not 0 < value <= 1000:
             raise ValueError(f"{key} is above 0 and at most 1000, not {value}")
     core = aio_of(client) if isinstance(client, URLabClient) else client
-    view = AsyncView(core, sink, options, name)
+    view = AsyncView(core, backend, options, name)
     if isinstance(client, URLabClient):
         return View(view, portal_of(client))
     return view

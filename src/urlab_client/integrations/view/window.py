@@ -8,8 +8,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, overload
 
 from urlab_client.aio.client import URLabClient as AsyncClient
-from urlab_client.integrations._feed.samples import Picture
-from urlab_client.integrations._feed.scene import Scene, Simulation
+from urlab_client.integrations._feed.samples import CameraPicture
+from urlab_client.integrations._feed.scene_messages import SceneMessages, Simulation
 from urlab_client.integrations.view.view import AsyncView, Moment, View, ViewOptions, make_view
 from urlab_client.protocol.errors import URLabError
 from urlab_client.sync.client import URLabClient
@@ -38,19 +38,19 @@ class _Window:
 
     @property
     def address(self) -> str:
-        """See `Sink`."""
+        """See `ViewBackend`."""
         return ""
 
     def open(self) -> None:
-        """See `Sink`."""
+        """See `ViewBackend`."""
         missing = missing_for_window()
         if missing:
             raise URLabError(
                 f"window_view: {missing}.", hint="Use rerun_view, foxglove_view or `urlab console`, or set a display."
             )
 
-    def use(self, simulation: Simulation, scene: Scene) -> None:
-        """See `Sink`."""
+    def use(self, simulation: Simulation, scene: SceneMessages) -> None:
+        """See `ViewBackend`."""
         import mujoco  # noqa: PLC0415
 
         viewer: Any = import_module("mujoco.viewer")
@@ -60,7 +60,7 @@ class _Window:
         self._viewer = viewer.launch_passive(simulation.model, self._data, show_left_ui=False, show_right_ui=False)
 
     def show(self, moment: Moment) -> None:
-        """See `Sink`."""
+        """See `ViewBackend`."""
         import mujoco  # noqa: PLC0415
 
         if self._data is None or not self._viewer.is_running():
@@ -70,15 +70,15 @@ class _Window:
             self._data.time = moment.ns / 1e9
         self._viewer.sync()
 
-    def show_picture(self, picture: Picture, ns: int) -> None:
-        """See `Sink`."""
+    def show_picture(self, picture: CameraPicture, ns: int) -> None:
+        """See `ViewBackend`."""
 
     def idle(self) -> bool:
-        """See `Sink`."""
+        """See `ViewBackend`."""
         return self._viewer is None or bool(self._viewer.is_running())
 
     def close(self) -> None:
-        """See `Sink`."""
+        """See `ViewBackend`."""
         viewer, self._viewer = self._viewer, None
         if viewer is not None:
             viewer.close()

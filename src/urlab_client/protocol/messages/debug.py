@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Final
 
 from msgspec import field
 
-from urlab_client.protocol.base import Color, EulerDeg, Quat, Reply, Request, Vec3, doc
+from urlab_client.protocol.base import EDITOR_TIMEOUT_S, Color, EulerDeg, Op, Quat, Reply, Request, Vec3, doc
 
 __all__ = [
+    "OPS",
     "ClearMarkers",
     "ClearMarkersOk",
     "DrawArrow",
@@ -127,3 +128,56 @@ class SetOverlayText(Request[SetOverlayTextOk], tag="set_overlay_text", kw_only=
 
     text: Annotated[str, doc("The text.")]
     anchor: Annotated[str, doc("Accepted; the plugin always uses the top left.")] = "top_left"
+
+
+OPS: Final = (
+    Op(
+        request=DrawMarker,
+        ns="debug",
+        timeout=EDITOR_TIMEOUT_S,
+        errors=("missing_field", "no_world"),
+        generated=True,
+        positional=2,
+    ),
+    Op(
+        request=DrawLine,
+        ns="debug",
+        timeout=EDITOR_TIMEOUT_S,
+        errors=("missing_field", "no_world"),
+        generated=True,
+        positional=3,
+    ),
+    Op(
+        request=DrawBox,
+        ns="debug",
+        timeout=EDITOR_TIMEOUT_S,
+        errors=("missing_field", "no_world"),
+        generated=True,
+        positional=3,
+    ),
+    Op(
+        request=DrawArrow,
+        ns="debug",
+        timeout=EDITOR_TIMEOUT_S,
+        errors=("missing_field", "no_world"),
+        generated=True,
+        positional=3,
+    ),
+    Op(
+        request=DrawAxes,
+        ns="debug",
+        timeout=EDITOR_TIMEOUT_S,
+        errors=("missing_field", "no_world"),
+        generated=True,
+        positional=1,
+    ),
+    Op(request=ClearMarkers, ns="debug", timeout=EDITOR_TIMEOUT_S, errors=("no_world",), generated=True),
+    Op(
+        request=SetOverlayText,
+        ns="debug",
+        timeout=EDITOR_TIMEOUT_S,
+        errors=("missing_field", "no_engine"),
+        generated=True,
+        positional=1,
+    ),
+)

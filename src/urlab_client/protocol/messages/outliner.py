@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Final
 
 from msgspec import Struct, field
 
 from urlab_client.protocol.base import (
+    EDITOR_TIMEOUT_S,
     ActorId,
     ActorTarget,
+    Effect,
     Location,
+    Op,
     QuatXYZW,
     Reply,
     Request,
@@ -18,9 +21,10 @@ from urlab_client.protocol.base import (
     Vec3,
     doc,
 )
-from urlab_client.protocol.types import BlueprintInfo
+from urlab_client.protocol.types import ActorBounds, BlueprintInfo
 
 __all__ = [
+    "OPS",
     "ActorRow",
     "AddQuickConvert",
     "AddQuickConvertOk",
@@ -171,3 +175,55 @@ class RemoveQuickConvert(Request[RemoveQuickConvertOk], tag="remove_quick_conver
 
     target: ActorTarget
     target_by: TargetBy = "actor_id"
+
+
+OPS: Final = (
+    Op(request=ListActors, ns="outliner", effect=Effect.READ, timeout=EDITOR_TIMEOUT_S, errors=("list_actors_failed",)),
+    Op(
+        request=ListBlueprints,
+        ns="outliner",
+        effect=Effect.READ,
+        timeout=EDITOR_TIMEOUT_S,
+        errors=("list_blueprints_failed",),
+        generated=True,
+        returns="blueprints",
+    ),
+    Op(request=FindActors, ns="outliner", effect=Effect.READ, timeout=EDITOR_TIMEOUT_S, errors=("find_actors_failed",)),
+    Op(
+        request=GetActorBounds,
+        ns="outliner",
+        effect=Effect.READ,
+        timeout=EDITOR_TIMEOUT_S,
+        errors=("missing_field", "get_actor_bounds_failed"),
+        generated=True,
+        returns=ActorBounds,
+        positional=1,
+    ),
+    Op(
+        request=SelectActor,
+        ns="outliner",
+        timeout=EDITOR_TIMEOUT_S,
+        errors=("missing_field", "select_failed"),
+        generated=True,
+        positional=1,
+        declares=("op:string", "target:string"),
+    ),
+    Op(
+        request=AddQuickConvert,
+        ns="outliner",
+        timeout=EDITOR_TIMEOUT_S,
+        errors=("missing_field", "add_quick_convert_failed"),
+        generated=True,
+        positional=1,
+        declares=("op:string", "target:string"),
+    ),
+    Op(
+        request=RemoveQuickConvert,
+        ns="outliner",
+        timeout=EDITOR_TIMEOUT_S,
+        errors=("missing_field", "remove_quick_convert_failed"),
+        generated=True,
+        positional=1,
+        declares=("op:string", "target:string"),
+    ),
+)

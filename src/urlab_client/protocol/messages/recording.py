@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Final
 
-from urlab_client.protocol.base import Reply, Request, doc
+from urlab_client.protocol.base import Effect, Needs, Op, Reply, Request, doc
+from urlab_client.protocol.types import RecordingSummary, ReplayStatus
 
 __all__ = [
+    "OPS",
     "RecordingClear",
     "RecordingClearOk",
     "RecordingSave",
@@ -123,3 +125,89 @@ class ReplayStopOk(Reply, tag="replay_stop_ok", kw_only=True):
 
 class ReplayStop(Request[ReplayStopOk], tag="replay_stop", kw_only=True):
     """Stop playing."""
+
+
+# The plugin declares no reply fields for these.
+OPS: Final = (
+    Op(
+        request=RecordingStart,
+        ns="recording",
+        method="start",
+        needs=Needs.MANAGER,
+        errors=("not_ready", "recording_already_active"),
+        declares=(),
+    ),
+    Op(
+        request=RecordingStop,
+        ns="recording",
+        method="stop",
+        needs=Needs.MANAGER,
+        errors=("not_ready", "recording_not_active"),
+        returns=RecordingSummary,
+        declares=(),
+    ),
+    Op(
+        request=RecordingSave,
+        ns="recording",
+        method="save",
+        needs=Needs.MANAGER,
+        timeout=60.0,
+        errors=("not_ready", "path_not_writable"),
+        declares=(),
+    ),
+    Op(
+        request=RecordingClear,
+        ns="recording",
+        method="clear",
+        needs=Needs.MANAGER,
+        errors=("not_ready",),
+        declares=(),
+    ),
+    Op(
+        request=ReplayLoad,
+        ns="replay",
+        method="load",
+        needs=Needs.MANAGER,
+        timeout=60.0,
+        errors=("not_ready", "missing_field", "path_not_readable"),
+        undeclared=("path",),
+        declares=(),
+    ),
+    Op(
+        request=ReplayListSessions,
+        ns="replay",
+        method="list_sessions",
+        needs=Needs.MANAGER,
+        effect=Effect.READ,
+        errors=("not_ready",),
+        generated=True,
+        returns="sessions",
+        declares=(),
+    ),
+    Op(
+        request=ReplaySetActive,
+        ns="replay",
+        method="set_active",
+        needs=Needs.MANAGER,
+        errors=("not_ready", "missing_field", "replay_session_not_found"),
+        undeclared=("name",),
+        declares=(),
+    ),
+    Op(
+        request=ReplayStart,
+        ns="replay",
+        method="start",
+        needs=Needs.MANAGER,
+        errors=("not_ready", "replay_requires_stepped"),
+        returns=ReplayStatus,
+        declares=(),
+    ),
+    Op(
+        request=ReplayStop,
+        ns="replay",
+        method="stop",
+        needs=Needs.MANAGER,
+        errors=("not_ready",),
+        declares=(),
+    ),
+)

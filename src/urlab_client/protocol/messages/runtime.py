@@ -2,14 +2,29 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 from msgspec import Struct
 
-from urlab_client.protocol.base import ActorId, Floats, QuatWXYZ, Reply, Request, TargetBy, Vec3, doc
-from urlab_client.protocol.types import Contact, KeyframeInfo, SimOptions
+from urlab_client.protocol.base import (
+    ActorId,
+    ControlRequest,
+    Effect,
+    Floats,
+    Needs,
+    Op,
+    QuatWXYZ,
+    Reply,
+    Request,
+    TargetBy,
+    Vec3,
+    doc,
+)
+from urlab_client.protocol.enums import StepMode
+from urlab_client.protocol.types import Contact, KeyframeInfo, MocapPose, SimOptions
 
 __all__ = [
+    "OPS",
     "ConfigureController",
     "ConfigureControllerOk",
     "ContactFilter",
@@ -35,14 +50,16 @@ __all__ = [
     "SetSimSpeedOk",
     "SetTwist",
     "SetTwistOk",
+    "SetUserChannels",
+    "SetUserChannelsOk",
 ]
 
 
 class SetModeOk(Reply, tag="set_mode_ok", kw_only=True):
     """The mode before and after."""
 
-    previous_mode: Annotated[str, doc("Step mode before the call.")]
-    current_mode: Annotated[str, doc("Step mode now.")]
+    previous_mode: Annotated[StepMode, doc("Step mode before the call.")]
+    current_mode: Annotated[StepMode, doc("Step mode now.")]
 
 
 class SetMode(Request[SetModeOk], tag="set_mode", kw_only=True):
@@ -83,7 +100,7 @@ class SetControlSourceOk(Reply, tag="set_control_source_ok", kw_only=True, omit_
     articulation: Annotated[str | None, doc("Articulation key, with that scope.")] = None
 
 
-class SetControlSource(Request[SetControlSourceOk], tag="set_control_source", kw_only=True, omit_defaults=True):
+class SetControlSource(ControlRequest[SetControlSourceOk], tag="set_control_source", kw_only=True, omit_defaults=True):
     """Choose whose set-points drive the actuators: those of this protocol or those of the editor's panel."""
 
     source: Annotated[str, doc("`zmq` or `ui`.")]
@@ -98,7 +115,7 @@ class SetTwistOk(Reply, tag="set_twist_ok", kw_only=True):
     angular: Annotated[Vec3, doc("(0, 0, yaw rate), rad/s.")]
 
 
-class SetTwist(Request[SetTwistOk], tag="set_twist", kw_only=True, omit_defaults=True):
+class SetTwist(ControlRequest[SetTwistOk], tag="set_twist", kw_only=True, omit_defaults=True):
     """Store a commanded base velocity for policies to read; it does not drive the simulation."""
 
     articulation: Annotated[str, doc("Articulation key.")]
@@ -116,7 +133,7 @@ class SetQposOk(Reply, tag="set_qpos_ok", kw_only=True, omit_defaults=True):
     free_base_shortcut: Annotated[bool, doc("True when only the free base was written.")]
 
 
-class SetQpos(Request[SetQposOk], tag="set_qpos", kw_only=True, omit_defaults=True):
+class SetQpos(ControlRequest[SetQposOk], tag="set_qpos", kw_only=True, omit_defaults=True):
     """Write joint positions of an articulation and run `mj_forward`; velocities and time stay."""
 
     target: Annotated[str, doc("Actor id, or the articulation key with `by_name`.")]
@@ -136,7 +153,7 @@ class SetMocapPoseOk(MocapReply, tag="set_mocap_pose_ok", kw_only=True):
     """The pose in force."""
 
 
-class SetMocapPose(Request[SetMocapPoseOk], tag="set_mocap_pose", kw_only=True, omit_defaults=True):
+class SetMocapPose(ControlRequest[SetMocapPoseOk], tag="set_mocap_pose", kw_only=True, omit_defaults=True):
     """Place a mocap body; body poses follow at the next step or `forward()`."""
 
     body: Annotated[str, doc("Compiled body name, prefix included.")]
@@ -202,6 +219,32 @@ class ConfigureController(Request[ConfigureControllerOk], tag="configure_control
     params: Annotated[dict[str, Any], doc("Parameters to change.")]
 
 
+class SetUserChannelsOk(Reply, tag="set_user_channels_ok", kw_only=True):
+    """What became of the values; a success even if none was taken."""
+
+    applied: Annotated[int, doc("Number of values taken.")]
+    rejected: Annotated[
+        dict[str, str],
+        doc(
+            "Reason by `<articulation>/<channel>` or `scene/<channel>`: `undeclared_or_kind_mismatch`, "
+            "`unsupported_value`, `unsupported_object` or `null_value`."
+        ),
+    ]
+
+
+class SetUserChannels(Request[SetUserChannelsOk], tag="set_user_channels", kw_only=True, omit_defaults=True):
+    """Write values of channels that the level declares for its robots or the scene; they come back with the state.
+
+    Returns the reason by `<articulation>/<channel>` or `scene/<channel>` for each value that was not taken.
+    """
+
+    arts: Annotated[
+        dict[str, dict[str, Any]] | None,
+        doc("Articulation to channel to a bool, number, text, list of numbers, or map of `pos` and `quat`."),
+    ] = None
+    scene: Annotated[dict[str, Any] | None, doc("Channel of the scene to value.")] = None
+
+
 class SetSimOptionsOk(Reply, tag="set_sim_options_ok", kw_only=True):
     """The options in force."""
 
@@ -212,3 +255,122 @@ class SetSimOptions(Request[SetSimOptionsOk], tag="set_sim_options", kw_only=Tru
     """Change fields of `mjOption`; effective from the next step."""
 
     options: Annotated[SimOptions, doc("Fields to change; None leaves a field alone.")]
+
+
+OPS: Final = (
+    Op(
+        request=SetMode,
+        ns="runtime",
+        needs=Needs.MANAGER,
+        errors=("not_ready", "mode_locked_by_server", "missing_field", "bad_mode"),
+        undeclared=("mode",),
+    ),
+    Op(
+        request=SetPaused,
+        ns="runtime",
+        needs=Needs.MANAGER,
+        errors=("not_ready", "missing_field"),
+        generated=True,
+        returns="paused",
+        positional=1,
+    ),
+    Op(
+        request=ConfigureController,
+        ns="runtime",
+        needs=Needs.MANAGER,
+        errors=(
+            "not_ready",
+            "missing_field",
+            "unknown_articulation",
+            "no_controller",
+            "controller_schema_violation",
+        ),
+    ),
+    Op(
+        request=SetSimOptions,
+        ns="runtime",
+        needs=Needs.MANAGER,
+        errors=("not_ready", "missing_field", "bad_value"),
+        undeclared=("options",),
+        declares=("op:string",),
+    ),
+    Op(
+        request=SetSimSpeed,
+        ns="runtime",
+        needs=Needs.MANAGER,
+        errors=("not_ready", "missing_field"),
+        generated=True,
+        returns="percent",
+        positional=1,
+    ),
+    Op(
+        request=SetControlSource,
+        ns="runtime",
+        needs=Needs.MANAGER,
+        errors=("not_ready", "missing_field", "bad_value", "unknown_articulation", "not_control_owner"),
+        generated=True,
+        positional=1,
+        undeclared=("source",),
+        declares=("op:string",),
+    ),
+    Op(
+        request=SetTwist,
+        ns="runtime",
+        needs=Needs.MANAGER,
+        errors=("not_ready", "missing_field", "unknown_articulation", "not_control_owner", "no_twist_controller"),
+        generated=True,
+        positional=1,
+        undeclared=("articulation",),
+        declares=("op:string",),
+    ),
+    Op(
+        request=SetQpos,
+        ns="runtime",
+        needs=Needs.MANAGER,
+        errors=("not_ready", "missing_field", "unknown_articulation", "not_control_owner", "no_joints", "dim_mismatch"),
+        declares=(
+            "op:string",
+            "target:string",
+            "actor_id:string?",
+            "actor_name:string?",
+            "qpos:array",
+            "free_base_shortcut:bool",
+        ),
+    ),
+    Op(
+        request=SetMocapPose,
+        ns="runtime",
+        needs=Needs.MANAGER,
+        errors=("not_ready", "missing_field", "unknown_body", "not_mocap_body"),
+        generated=True,
+        returns=MocapPose,
+        positional=1,
+    ),
+    Op(
+        request=ReadMocapPose,
+        ns="runtime",
+        needs=Needs.MANAGER,
+        effect=Effect.READ,
+        errors=("not_ready", "missing_field", "unknown_body", "not_mocap_body"),
+        generated=True,
+        returns=MocapPose,
+        positional=1,
+    ),
+    Op(request=GetContacts, ns="runtime", needs=Needs.MANAGER, effect=Effect.READ, errors=("not_ready",)),
+    Op(
+        request=ListKeyframes,
+        ns="runtime",
+        needs=Needs.MANAGER,
+        effect=Effect.READ,
+        errors=("not_ready",),
+        generated=True,
+        returns="keyframes",
+    ),
+    Op(
+        request=SetUserChannels,
+        ns="runtime",
+        needs=Needs.MANAGER,
+        errors=("not_ready",),
+        dialects=("beta",),
+    ),
+)

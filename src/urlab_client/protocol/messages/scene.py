@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Final
 
 from msgspec import Struct, field
 
 from urlab_client.protocol.base import (
+    EDITOR_TIMEOUT_S,
     ActorId,
     ActorTarget,
     Color,
+    Effect,
     EulerDeg,
     Location,
+    Op,
     QuatXYZW,
     Reply,
     Request,
@@ -23,6 +26,7 @@ from urlab_client.protocol.base import (
 from urlab_client.protocol.types import ActorHierarchyNode
 
 __all__ = [
+    "OPS",
     "ActorHierarchy",
     "ActorHierarchyOk",
     "CreateLevel",
@@ -42,6 +46,8 @@ __all__ = [
     "ImportXmlOk",
     "LoadLevel",
     "LoadLevelOk",
+    "RemoveActor",
+    "RemoveActorOk",
     "SaveLevel",
     "SaveLevelOk",
     "SetActorTransform",
@@ -232,6 +238,19 @@ class DestroyActor(Request[DestroyActorOk], tag="destroy_actor", kw_only=True, o
     target_by: TargetBy = "actor_id"
 
 
+class RemoveActorOk(Reply, tag="remove_actor_ok", kw_only=True):
+    """The actor is gone from the edited level."""
+
+    requires_pie_restart: RequiresPieRestart
+
+
+class RemoveActor(Request[RemoveActorOk], tag="remove_actor", kw_only=True, omit_defaults=True):
+    """Remove an actor from the edited level; the beta's name of `destroy_actor`."""
+
+    target: ActorTarget
+    target_by: TargetBy = "actor_id"
+
+
 class DestroyAssetOk(Reply, tag="destroy_asset_ok", kw_only=True):
     """The asset is gone."""
 
@@ -326,3 +345,129 @@ class SnapshotOk(Reply, tag="snapshot_ok", kw_only=True):
 
 class Snapshot(Request[SnapshotOk], tag="snapshot", kw_only=True):
     """Describe every visible actor with articulation metadata."""
+
+
+OPS: Final = (
+    Op(
+        request=ImportXml,
+        job=True,
+        ns="scene",
+        timeout=120.0,
+        errors=("missing_field", "import_failed"),
+    ),
+    Op(
+        request=CreateLevel,
+        job=True,
+        ns="scene",
+        timeout=EDITOR_TIMEOUT_S,
+        errors=("missing_field", "create_level_failed"),
+        generated=True,
+        positional=1,
+    ),
+    Op(
+        request=LoadLevel,
+        job=True,
+        ns="scene",
+        timeout=EDITOR_TIMEOUT_S,
+        errors=("missing_field", "load_level_failed"),
+        generated=True,
+        positional=1,
+    ),
+    Op(
+        request=SaveLevel, job=True, ns="scene", timeout=EDITOR_TIMEOUT_S, errors=("save_level_failed",), generated=True
+    ),
+    Op(
+        request=CurrentLevel,
+        ns="scene",
+        effect=Effect.READ,
+        timeout=EDITOR_TIMEOUT_S,
+        errors=("not_in_editor", "no_world"),
+        generated=True,
+        returns="level_path",
+    ),
+    Op(
+        request=EnsureManager,
+        ns="scene",
+        timeout=EDITOR_TIMEOUT_S,
+        errors=("not_in_editor", "no_world", "spawn_failed"),
+        generated=True,
+        returns="was_existing",
+    ),
+    Op(request=SpawnActor, job=True, ns="scene", timeout=EDITOR_TIMEOUT_S, errors=("missing_field", "spawn_failed")),
+    Op(
+        request=SpawnGrid,
+        job=True,
+        ns="scene",
+        timeout=60.0,
+        errors=("missing_field", "invalid_count", "too_many_cells", "spawn_failed"),
+    ),
+    Op(
+        request=SpawnLight,
+        job=True,
+        ns="scene",
+        timeout=EDITOR_TIMEOUT_S,
+        errors=("spawn_failed",),
+        declares=(
+            "op:string",
+            "actor_id:string",
+            "actor_name:string",
+            "actor_path:string",
+            "kind:string",
+            "intensity:float",
+            "color:array",
+            "location:array",
+            "requires_pie_restart:bool",
+        ),
+    ),
+    Op(
+        request=DestroyActor,
+        ns="scene",
+        timeout=EDITOR_TIMEOUT_S,
+        errors=("missing_field", "destroy_failed"),
+        dialects=("alpha",),
+    ),
+    Op(
+        request=RemoveActor,
+        ns="scene",
+        timeout=EDITOR_TIMEOUT_S,
+        errors=("missing_field", "destroy_failed"),
+        dialects=("beta",),
+        job=True,
+    ),
+    Op(
+        request=DestroyAsset,
+        ns="scene",
+        timeout=EDITOR_TIMEOUT_S,
+        errors=("missing_field", "destroy_asset_failed"),
+        generated=True,
+        returns="was_found",
+        positional=1,
+    ),
+    Op(
+        request=SetActorTransform,
+        ns="scene",
+        timeout=EDITOR_TIMEOUT_S,
+        errors=("missing_field", "set_actor_transform_failed"),
+        generated=True,
+        positional=1,
+        declares=("op:string", "target:string", "actor_name:string", "requires_pie_restart:bool"),
+    ),
+    Op(
+        request=DuplicateActor,
+        job=True,
+        ns="scene",
+        timeout=EDITOR_TIMEOUT_S,
+        errors=("missing_field", "duplicate_failed"),
+    ),
+    Op(
+        request=ActorHierarchy,
+        ns="scene",
+        effect=Effect.READ,
+        timeout=EDITOR_TIMEOUT_S,
+        errors=("missing_field", "actor_hierarchy_failed"),
+        generated=True,
+        returns="root",
+        positional=1,
+    ),
+    Op(request=Snapshot, ns="scene", effect=Effect.READ, timeout=EDITOR_TIMEOUT_S, errors=("snapshot_failed",)),
+)

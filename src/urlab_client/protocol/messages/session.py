@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Final
+from collections.abc import Mapping
+from typing import Annotated, Any, Final, TypeAlias
 
 import msgspec
-from msgspec import Struct
+from msgspec import Struct, field
 
-from urlab_client.protocol.base import Floats, QuatWXYZ, Reply, Request, Vec3, doc
+from urlab_client.protocol.base import ControlRequest, Effect, Floats, Needs, Op, QuatWXYZ, Reply, Request, Vec3, doc
 
 __all__ = [
     "NOT_SENT",
+    "OPS",
     "ArticulationCommand",
     "ArticulationInfo",
     "ArticulationState",
     "BodyPose",
+    "CameraChoice",
     "CameraFrame",
     "CameraInfo",
     "Clock",
@@ -26,6 +29,7 @@ __all__ = [
     "ForwardOk",
     "Hello",
     "HelloOk",
+    "InstanceInfo",
     "Meta",
     "MetaOk",
     "OpInfo",
@@ -34,6 +38,9 @@ __all__ = [
     "ReplayProgress",
     "Reset",
     "ResetOk",
+    "RobotEntry",
+    "ShmRpcInfo",
+    "StateReply",
     "Step",
     "StepOk",
     "TwistState",
@@ -44,12 +51,23 @@ NOT_SENT: Final = msgspec.Raw()
 """Stands in an undecoded field for what is not there; a field is left out when it holds this very object."""
 
 
+# Some servers leave these fields out, ours never does: msgspec omits what `dict` and `list` themselves made, only.
+def _empty_map() -> dict[str, Any]:
+    return {}
+
+
+def _empty_list() -> list[Any]:
+    return []
+
+
 class ErrorReply(Reply, tag="error", kw_only=True, omit_defaults=True):
     """The server refused a request."""
 
     code: Annotated[str, doc("Short stable code.")]
     message: Annotated[str, doc("Text for people; absent from one plugin reply.")] = ""
     absolute_path: Annotated[str | None, doc("Path that `recording_save` could not write.")] = None
+    owner: Annotated[str | None, doc("Who owns the robot, or `(unclaimed)`; with a refused claim or write.")] = None
+    lease_id: Annotated[str | None, doc("Lease of the holder, with code `busy`.")] = None
 
 
 class Clock(Struct, kw_only=True):
@@ -78,13 +96,28 @@ class ArticulationState(Struct, kw_only=True, omit_defaults=True):
 
     qpos: Annotated[Floats, doc("Joint positions, shape (nq of the articulation,).")]
     qvel: Annotated[Floats, doc("Joint velocities, shape (nv of the articulation,).")]
-    ctrl: Annotated[Floats | None, doc("`mjData.ctrl`, what was applied after any controller. Level standard.")] = None
-    act: Annotated[Floats | None, doc("First activation per actuator, 0 where stateless. Level standard.")] = None
+    ctrl: Annotated[
+        Floats | None,
+        doc(
+            "`mjData.ctrl`, what was applied after any controller: the inputs of each actuator, nearly always one, in "
+            "actuator order. Level standard."
+        ),
+    ] = None
+    act: Annotated[
+        Floats | None,
+        doc("First activation of the actuator of each input, 0 where stateless; ordered as `ctrl`. Level standard."),
+    ] = None
     sensors: Annotated[
         dict[str, list[float]] | None, doc("Raw `sensordata` by unprefixed sensor name. Level standard.")
     ] = None
+    user: Annotated[
+        dict[str, Any] | None, doc("User channels that the robot declares, by name. Level standard, from the beta on.")
+    ] = None
     bodies: Annotated[dict[str, BodyPose] | None, doc("World pose by unprefixed body name. Level full.")] = None
-    actuator_force: Annotated[Floats | None, doc("`mjData.actuator_force`, ordered as `ctrl`. Level full.")] = None
+    actuator_force: Annotated[
+        Floats | None,
+        doc("`mjData.actuator_force`: the outputs of each actuator, nearly always one, in actuator order. Level full."),
+    ] = None
     twist: Annotated[TwistState | None, doc("Commanded twist, at every level.")] = None
     actions: Annotated[int | None, doc("Bit field of pressed action keys, bits 0 to 9.")] = None
 
@@ -98,11 +131,13 @@ class EntityState(Struct, kw_only=True, omit_defaults=True):
     qvel: Annotated[Floats | None, doc("Free joint velocity, shape (6,): linear world, angular body frame.")] = None
 
 
-class CameraFrame(Struct, kw_only=True):
+class CameraFrame(Struct, kw_only=True, omit_defaults=True):
     """Pixels of one camera, top row first."""
 
     width: Annotated[int, doc("Pixels per row.")]
     height: Annotated[int, doc("Rows.")]
+    frame_id: Annotated[int | None, doc("Snapshot of the state that the picture shows; the alpha sends none.")] = None
+    sim_time: Annotated[float | None, doc("Its simulation time, seconds; the alpha sends none.")] = None
     dtype: Annotated[str, doc("`bgra8`, or `float32` for depth in centimetres.")]
     data: Annotated[bytes, doc("width * height * 4 bytes.")]
 
@@ -120,9 +155,19 @@ class StateReply(Reply, kw_only=True, omit_defaults=True):
 
     time: Annotated[float, doc("`mjData.time`, seconds.")]
     step: Annotated[int, doc("Step counter of the session; constant in live mode.")]
-    per_articulation: Annotated[dict[str, ArticulationState], doc("State by articulation key.")]
+    per_articulation: Annotated[dict[str, ArticulationState], doc("State by articulation key.")] = field(
+        default_factory=_empty_map
+    )
     sim_time: Annotated[Clock | None, doc("`time` as two integers.")] = None
     wall_time: Annotated[Clock | None, doc("UTC when the reply was built.")] = None
+    arts: Annotated[
+        dict[str, ArticulationState] | None, doc("What the beta sends as `per_articulation`, which then is the same.")
+    ] = None
+
+    def __post_init__(self) -> None:
+        """Bring a reply of either generation into one shape."""
+        if self.arts is not None:
+            self.per_articulation = self.arts
 
 
 class ReplayProgress(Struct, kw_only=True):
@@ -139,12 +184,25 @@ class StepOk(StateReply, tag="step_ok", kw_only=True, omit_defaults=True):
     cameras: Annotated[dict[str, CameraFrame] | None, doc("Frames, keyed exactly as requested.")] = None
     perturbation: Annotated[Perturbation | None, doc("Only in puppet mode pinned by the project.")] = None
     replay: Annotated[ReplayProgress | None, doc("While a recording plays; the plugin never sends it.")] = None
+    frame_id: Annotated[
+        int | None, doc("Number of the state's snapshot, which pictures of it carry; the alpha sends none.")
+    ] = None
+    scene: Annotated[
+        dict[str, EntityState] | None, doc("What the beta sends as `entities`, which then is the same.")
+    ] = None
+
+    def __post_init__(self) -> None:
+        """See the base class."""
+        if self.arts is not None:
+            self.per_articulation = self.arts
+        if self.scene is not None:
+            self.entities = self.scene
 
 
 class ArticulationCommand(Struct, kw_only=True, omit_defaults=True):
     """What a direct or live step tells one articulation."""
 
-    ctrl: Annotated[list[float] | None, doc("Set-points in actuator order.")] = None
+    ctrl: Annotated[list[float] | None, doc("Set-points, in the order of the state's `ctrl`.")] = None
     ctrl_map: Annotated[dict[str, float] | None, doc("Set-points by actuator name; wins over `ctrl`. Direct only.")] = (
         None
     )
@@ -154,12 +212,24 @@ class ArticulationCommand(Struct, kw_only=True, omit_defaults=True):
     ] = None
 
 
-class Step(Request[StepOk], tag="step", kw_only=True, omit_defaults=True):
+CameraChoice: TypeAlias = bool | Mapping[str, str | dict[str, float] | None]
+"""What a step says about pictures: all or none, or camera name to which picture."""
+
+
+class Step(ControlRequest[StepOk], tag="step", kw_only=True, omit_defaults=True):
     """Advance physics, or exchange state, as the step mode says."""
 
     n_steps: Annotated[int, doc("Sub-steps; values below 1 count as 1. Direct only.")] = 1
     observations: Annotated[str | None, doc("Observation level; sticky on the server.")] = None
-    include_cameras: Annotated[bool | dict[str, str | None], doc("True, or camera name to `sync` or `latest`.")] = False
+    include_cameras: Annotated[
+        CameraChoice,
+        doc("True, or camera name to `sync`, `latest` or, not in the alpha, `{frame_id: N}` for one of N or later."),
+    ] = False
+    wait_cameras: Annotated[bool, doc("Wait for pictures of this step. Not in the alpha.")] = False
+    render: Annotated[
+        str | None, doc("`sync` renders for this step and waits, `async` does not wait. Not in the alpha.")
+    ] = None
+    camera_timeout_ms: Annotated[float | None, doc("Longest wait for pictures, 200 by default.")] = None
     per_articulation: Annotated[dict[str, ArticulationCommand] | None, doc("Commands by articulation key.")] = None
     qpos: Annotated[Floats | None, doc("Full `mjData.qpos`, shape (nq,). Puppet only.")] = None
     qvel: Annotated[Floats | None, doc("Full `mjData.qvel`, shape (nv,). Puppet only.")] = None
@@ -194,7 +264,7 @@ class ControllerInfo(Struct, kw_only=True):
 
     kind: Annotated[str, doc("`pd`; the plugin's passthrough controller says `base`.")]
     params: Annotated[dict[str, Any], doc("Current parameters.")]
-    schema: Annotated[dict[str, Any], doc("Parameter name to `{type, dtype, min}`.")]
+    schema: Annotated[dict[str, dict[str, Any]], doc("Parameter name to `{type, dtype, min}`.")]
 
 
 class CameraInfo(Struct, kw_only=True):
@@ -221,11 +291,27 @@ class ArticulationInfo(Struct, kw_only=True, omit_defaults=True):
 
     prefix: Annotated[str, doc("Articulation key, no trailing underscore.")]
     actor_id: Annotated[str, doc("Stable id; empty when unset.")]
-    default_control_mode: Annotated[str, doc("`ue_controller` with a controller attached, else `raw`.")]
+    actor_name: Annotated[
+        str | None, doc("Engine's object name, which compiled names begin with; in the alpha that is `prefix`.")
+    ] = None
+    default_control_mode: Annotated[str, doc("`ue_controller` with a controller attached, else `raw`.")] = field(
+        default_factory=str
+    )
     controller: Annotated[ControllerInfo | None, doc("The attached controller.")] = None
-    actuator_types: Annotated[dict[str, str], doc("Authored kind by short actuator name.")]
-    original_names: Annotated[OriginalNames, doc("Elements that were renamed.")]
-    camera_topics: Annotated[dict[str, CameraInfo], doc("Cameras by name.")]
+    actuator_types: Annotated[dict[str, str], doc("Authored kind by short actuator name.")] = field(
+        default_factory=_empty_map
+    )
+    original_names: Annotated[OriginalNames, doc("Elements that were renamed; none from the beta on.")] = field(
+        default_factory=OriginalNames
+    )
+    camera_topics: Annotated[dict[str, CameraInfo], doc("Cameras by name; the beta says `<prefix>/<name>`.")] = field(
+        default_factory=_empty_map
+    )
+
+    @property
+    def compiled_prefix(self) -> str:
+        """What compiled names of its elements begin with, before an underscore."""
+        return self.prefix if self.actor_name is None else self.actor_name
 
 
 class EntityInfo(Struct, kw_only=True, omit_defaults=True):
@@ -233,10 +319,49 @@ class EntityInfo(Struct, kw_only=True, omit_defaults=True):
 
     id: Annotated[int, doc("MuJoCo body id.")]
     has_free_base: Annotated[bool, doc("True when its first joint is free.")]
-    free_joint: Annotated[str | None, doc("Name of the free joint, when it has one.")] = None
-    free_joint_id: Annotated[int | None, doc("MuJoCo joint id.")] = None
+    free_joint_id: Annotated[int | None, doc("MuJoCo joint id, when it has a free joint.")] = None
     qpos_offset: Annotated[int | None, doc("Start of its 7 values in `mjData.qpos`.")] = None
     qvel_offset: Annotated[int | None, doc("Start of its 6 values in `mjData.qvel`.")] = None
+    free_joint: Annotated[str | None, doc("Name of the free joint.")] = None
+
+
+class RobotEntry(ArticulationInfo, kw_only=True, omit_defaults=True):
+    """One entry of `entities` where a server lists robots there; those without `prefix` are none."""
+
+    prefix: Annotated[str, doc("Articulation key; empty for what is no robot.")] = ""
+    actor_id: Annotated[str, doc("Stable id; empty when unset.")] = ""
+
+
+class InstanceInfo(Struct, kw_only=True):
+    """Which of several servers this is."""
+
+    instance_id: Annotated[str, doc("Configured id, else `live` or `instance_<index>`.")] = ""
+    index: Annotated[int, doc("Index among the servers of a machine; -1 for none.")] = -1
+    pid: Annotated[int, doc("Process id.")] = 0
+    host: Annotated[str, doc("Host name.")] = ""
+    step_port: Annotated[int, doc("RPC port.")] = 0
+    state_port: Annotated[int, doc("Port of the state stream; 0 when not told.")] = 0
+    cam_base_port: Annotated[int, doc("First port of the cameras.")] = 0
+    manager_present: Annotated[bool, doc("True while a play session runs.")] = False
+    busy: Annotated[bool, doc("Whether somebody holds the driver lease.")] = False
+    urlab_version: Annotated[str, doc("Server version.")] = ""
+    capabilities: Annotated[list[str], doc("What it can do besides; a missing one proves nothing.")] = field(
+        default_factory=list[str]
+    )
+
+
+class ShmRpcInfo(Struct, kw_only=True):
+    """Where requests go in shared memory."""
+
+    session: Annotated[str, doc("Name of the regions' session.")]
+    req_path: Annotated[str, doc("File of the requests.")]
+    rep_path: Annotated[str, doc("File of the replies.")]
+    req_event: Annotated[str, doc("Event of the requests, Windows only.")] = ""
+    rep_event: Annotated[str, doc("Event of the replies, Windows only.")] = ""
+    req_stride: Annotated[int, doc("Bytes per slot of the requests.")] = 0
+    rep_stride: Annotated[int, doc("Bytes per slot of the replies.")] = 0
+    n_buffers: Annotated[int, doc("Slots of each.")] = 2
+    header_size: Annotated[int, doc("Bytes before the first slot.")] = 64
 
 
 class HelloOk(Reply, tag="hello_ok", kw_only=True, omit_defaults=True):
@@ -247,7 +372,9 @@ class HelloOk(Reply, tag="hello_ok", kw_only=True, omit_defaults=True):
     mujoco_version_int: Annotated[int, doc("`mj_version()` of the server.")]
     mujoco_version: Annotated[str, doc("`mj_versionString()` of the server.")]
     manager_present: Annotated[bool, doc("True while a play session runs.")]
+    instance: Annotated[InstanceInfo | None, doc("Which server this is; from the beta on, during play.")] = None
     shm_session_dir: Annotated[str | None, doc("Directory of the shared state region.")] = None
+    shm_rpc: Annotated[ShmRpcInfo | None, doc("Where requests go in shared memory; the alpha does not tell.")] = None
     mjb: Annotated[bytes | None, doc("The compiled model in MuJoCo's binary format.")] = None
     mjb_base64: Annotated[
         msgspec.Raw,
@@ -256,14 +383,30 @@ class HelloOk(Reply, tag="hello_ok", kw_only=True, omit_defaults=True):
     mjb_size: Annotated[int | None, doc("Length of `mjb` in bytes.")] = None
     mjcf_compiled: Annotated[str | None, doc("The model as MJCF, with `include_assets`.")] = None
     vfs_assets: Annotated[dict[str, bytes] | None, doc("Asset bytes by bare file name, with `include_assets`.")] = None
-    articulations: Annotated[list[ArticulationInfo], doc("Empty without a play session.")]
-    entities: Annotated[dict[str, EntityInfo] | None, doc("Plain entities by name.")] = None
+    articulations: Annotated[list[ArticulationInfo], doc("Empty without a play session.")] = field(
+        default_factory=_empty_list
+    )
+    entities: Annotated[
+        dict[str, EntityInfo] | list[RobotEntry] | None,
+        doc("Plain entities by name. Servers after the beta list the robots here instead."),
+    ] = None
     global_cameras: Annotated[dict[str, CameraInfo] | None, doc("Scene-level cameras.")] = None
+
+    def __post_init__(self) -> None:
+        """Bring a handshake of any generation into one shape."""
+        if isinstance(self.entities, list):
+            self.articulations = [*self.articulations, *(entry for entry in self.entities if entry.prefix)]
+
+    @property
+    def plain_entities(self) -> dict[str, EntityInfo]:
+        """The plain entities by name; none where the server does not list them."""
+        return self.entities if isinstance(self.entities, dict) else {}
 
 
 class Hello(Request[HelloOk], tag="hello", kw_only=True, omit_defaults=True):
     """Open a session; the previous one becomes invalid at once."""
 
+    client_version: Annotated[str | None, doc("Who asks, for the server's log; without effect.")] = None
     observations: Annotated[str | None, doc("Observation level of the session; absent keeps the server's.")] = None
     encoding: Annotated[str | None, doc("`json` for readable replies, else msgpack.")] = None
     include_assets: Annotated[bool, doc("Ship the model as MJCF with its assets, too.")] = False
@@ -287,3 +430,40 @@ class MetaOk(Reply, tag="meta_ok", kw_only=True):
 
 class Meta(Request[MetaOk], tag="meta", kw_only=True):
     """List the ops this server offers; needs no session."""
+
+
+OPS: Final = (
+    Op(request=Hello, method="discover", needs=Needs.NOTHING, effect=Effect.READ, timeout=30.0),
+    Op(request=Meta, needs=Needs.NOTHING, effect=Effect.READ),
+    Op(
+        request=Step,
+        needs=Needs.MANAGER,
+        # Above the server's own limit of 5 s, or its step_timeout would arrive too late.
+        timeout=6.5,
+        hot=True,
+        errors=("not_ready", "not_control_owner", "step_timeout", "shutting_down"),
+        declares=(
+            "op:string",
+            "time:float",
+            "step:int",
+            "per_articulation:object",
+            "sim_time:object?",
+            "wall_time:object?",
+        ),
+    ),
+    Op(
+        request=Reset,
+        needs=Needs.MANAGER,
+        errors=("not_ready", "unknown_keyframe"),
+        declares=("op:string", "time:float", "step:int"),
+    ),
+    Op(
+        request=Forward,
+        ns="runtime",
+        needs=Needs.MANAGER,
+        # Computes what follows from the state, which it leaves as it is: the same the second time.
+        effect=Effect.READ,
+        errors=("not_ready",),
+        declares=("op:string", "time:float", "step:int", "per_articulation:object"),
+    ),
+)

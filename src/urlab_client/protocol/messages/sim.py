@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Final
 
-from urlab_client.protocol.base import Reply, Request, doc
+from urlab_client.protocol.base import EDITOR_TIMEOUT_S, Effect, Op, Reply, Request, doc
+from urlab_client.protocol.enums import PIEState
 from urlab_client.protocol.messages.session import HelloOk
 
-__all__ = ["BeginPie", "BeginPieOk", "PieStatus", "PieStatusOk", "StopPie", "StopPieOk"]
+__all__ = ["OPS", "BeginPie", "BeginPieOk", "PieStatus", "PieStatusOk", "StopPie", "StopPieOk"]
 
 
 class BeginPieOk(Reply, tag="begin_pie_ok", kw_only=True, omit_defaults=True):
     """How the start ended."""
 
-    state: Annotated[str, doc("`ready`, `compile_failed` or `timeout`.")]
+    state: Annotated[PIEState, doc("`ready`, `compile_failed` or `timeout`.")]
     compile_error: Annotated[str, doc("MuJoCo's message when the model was rejected.")]
     handshake_payload: Annotated[HelloOk | None, doc("The handshake of the new play world, when ready.")] = None
 
@@ -36,10 +37,25 @@ class StopPie(Request[StopPieOk], tag="stop_pie", kw_only=True):
 class PieStatusOk(Reply, tag="pie_status_ok", kw_only=True, omit_defaults=True):
     """Where Play-In-Editor stands."""
 
-    state: Annotated[str, doc("`off`, `compiling`, `compile_failed` or `ready`.")]
+    state: Annotated[PIEState, doc("`off`, `compiling`, `compile_failed` or `ready`.")]
     compile_error: Annotated[str, doc("MuJoCo's message after a failed compile, else empty.")]
     sim_time: Annotated[float | None, doc("`mjData.time`, seconds, when data exist.")] = None
 
 
 class PieStatus(Request[PieStatusOk], tag="pie_status", kw_only=True):
     """Read the state of Play-In-Editor."""
+
+
+OPS: Final = (
+    # The server may take 10 s to reach its game thread, on top of the request's own timeout_s.
+    Op(
+        request=BeginPie,
+        ns="sim",
+        method="start",
+        timeout=45.0,
+        errors=("shutting_down", "load_level_failed"),
+        declares=("op:string", "state:string", "compile_error:string", "handshake_payload:object?"),
+    ),
+    Op(request=StopPie, ns="sim", method="stop", timeout=EDITOR_TIMEOUT_S, errors=("timeout",)),
+    Op(request=PieStatus, ns="sim", method="status", effect=Effect.READ, timeout=EDITOR_TIMEOUT_S),
+)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 from msgspec import Struct
@@ -83,8 +83,22 @@ class StateSnapshot(StreamItem, tag_field="op", tag="state_full", kw_only=True, 
     step: Annotated[int, doc("Step counter of the session; constant in live mode.")]
     sim_time: Annotated[Clock, doc("`time` as two integers.")]
     wall_time: Annotated[Clock, doc("UTC of the server when the snapshot was built.")]
-    per_articulation: Annotated[dict[str, ArticulationState], doc("State by articulation key.")]
+    per_articulation: Annotated[dict[str, ArticulationState], doc("State by articulation key.")] = {}
     entities: Annotated[dict[str, EntityState], doc("Plain entities by name; the plugin sends none.")] = {}
+    user: Annotated[dict[str, Any], doc("User channels that the scene declares, by name; from the beta on.")] = {}
+    arts: Annotated[
+        dict[str, ArticulationState] | None, doc("What the beta sends as `per_articulation`, which then is the same.")
+    ] = None
+    scene: Annotated[
+        dict[str, EntityState] | None, doc("What the beta sends as `entities`, which then is the same.")
+    ] = None
+
+    def __post_init__(self) -> None:
+        """Bring a snapshot of either generation into one shape."""
+        if self.arts is not None:
+            self.per_articulation = self.arts
+        if self.scene is not None:
+            self.entities = self.scene
 
     @classmethod
     def decode(cls, payload: BytesLike, where: object = "") -> StateSnapshot:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Final
 
 from urlab_client.protocol.base import (
+    EDITOR_TIMEOUT_S,
     ActorTarget,
+    Effect,
     EulerDeg,
     Location,
+    Op,
     Quat,
     QuatXYZW,
     Reply,
@@ -16,8 +19,10 @@ from urlab_client.protocol.base import (
     Vec3,
     doc,
 )
+from urlab_client.protocol.types import CameraPose
 
 __all__ = [
+    "OPS",
     "FrameActor",
     "FrameActorOk",
     "GetCamera",
@@ -111,3 +116,54 @@ class UntrackOk(Reply, tag="untrack_ok", kw_only=True):
 
 class Untrack(Request[UntrackOk], tag="untrack", kw_only=True):
     """Stop following; returns whether a track was active."""
+
+
+OPS: Final = (
+    Op(
+        request=SetCamera,
+        ns="viewport",
+        timeout=EDITOR_TIMEOUT_S,
+        errors=("missing_field", "no_viewport"),
+        generated=True,
+        returns=CameraPose,
+        positional=1,
+    ),
+    Op(
+        request=GetCamera,
+        ns="viewport",
+        effect=Effect.READ,
+        timeout=EDITOR_TIMEOUT_S,
+        errors=("no_viewport",),
+        generated=True,
+        returns=CameraPose,
+    ),
+    Op(
+        request=FrameActor,
+        ns="viewport",
+        timeout=EDITOR_TIMEOUT_S,
+        errors=("missing_field", "unknown_actor", "no_bounds", "no_viewport"),
+        generated=True,
+        returns=CameraPose,
+        positional=1,
+    ),
+    Op(
+        request=SetViewportMode,
+        ns="viewport",
+        method="set_mode",
+        timeout=EDITOR_TIMEOUT_S,
+        errors=("missing_field", "invalid_mode", "no_viewport", "unsupported"),
+        generated=True,
+        returns="mode",
+        positional=1,
+    ),
+    Op(
+        request=TrackActor,
+        ns="viewport",
+        timeout=EDITOR_TIMEOUT_S,
+        errors=("missing_field", "unknown_actor", "no_viewport"),
+        generated=True,
+        returns="tracked_actor_path",
+        positional=1,
+    ),
+    Op(request=Untrack, ns="viewport", timeout=EDITOR_TIMEOUT_S, generated=True, returns="was_tracking"),
+)

@@ -27,10 +27,10 @@ from urlab_client.protocol.messages.debug import (
 )
 from urlab_client.protocol.rotation import IDENTITY, euler_to_quat, rotate, swap_frame
 from urlab_client.server.core import ServerCore
-from urlab_client.server.dispatch import handles
+from urlab_client.server.editor.markers import Arrow, Box, DebugLine, Primitive, Sphere, Text
 from urlab_client.server.handlers.viewport import need_point, need_rotator
-from urlab_client.server.markers import Arrow, Box, Line, Primitive, Sphere, Text
-from urlab_client.server.requests import usable
+from urlab_client.server.rpc.dispatch import handles
+from urlab_client.server.rpc.requests import usable
 
 YELLOW: Final[Vec3] = (1.0, 1.0, 0.0)
 """In place of a colour that is none."""
@@ -61,7 +61,7 @@ def draw_marker(server: ServerCore, request: DrawMarker) -> DrawMarkerOk:
 
 @handles(DrawLine)
 def draw_line(server: ServerCore, request: DrawLine) -> DrawLineOk:
-    line = Line(
+    line = DebugLine(
         start=need_point(request, request.from_, "from"),
         end=need_point(request, request.to, "to"),
         color=_color(request.color),

@@ -9,8 +9,8 @@ from typing import cast
 from urlab_client.protocol.messages.runtime import SetSimOptions, SetSimOptionsOk
 from urlab_client.protocol.types import SimOptions
 from urlab_client.server.core import ServerCore
-from urlab_client.server.dispatch import handles
-from urlab_client.server.requests import need
+from urlab_client.server.rpc.dispatch import handles
+from urlab_client.server.rpc.requests import need
 
 
 @handles(SetSimOptions)

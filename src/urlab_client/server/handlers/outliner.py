@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+import msgspec
+
 from urlab_client.protocol.messages.outliner import (
     ActorRow,
     AddQuickConvert,
@@ -22,11 +24,10 @@ from urlab_client.protocol.messages.outliner import (
     SelectActor,
     SelectActorOk,
 )
-from urlab_client.protocol.types import BlueprintInfo
-from urlab_client.server.actors import QuickConvert as QuickConvertSettings
+from urlab_client.server.assets.actors import ActorKind, ConversionSettings
 from urlab_client.server.core import ServerCore
-from urlab_client.server.dispatch import handles
-from urlab_client.server.requests import need
+from urlab_client.server.rpc.dispatch import handles
+from urlab_client.server.rpc.requests import need
 
 
 @handles(ListActors)
@@ -34,31 +35,25 @@ def list_actors(server: ServerCore, request: ListActors) -> ListActorsOk:
     del request
     rows = [
         ActorRow(
-            name=row.name,
-            label=row.label,
-            actor_class=row.class_name,
-            actor_id=row.actor_id,
-            location=row.location,
-            rotation_quat=row.rotation_quat,
-            is_articulation=row.is_articulation,
-            is_static_mesh_actor=row.is_static_mesh_actor,
-            is_light=row.is_light,
-            has_quick_convert=row.quick_convert is not None,
-            quick_convert=None if row.quick_convert is None else _settings(row.quick_convert),
+            name=actor.name,
+            label=actor.label,
+            actor_class=actor.class_name,
+            actor_id=actor.actor_id,
+            location=actor.location,
+            rotation_quat=actor.rotation,
+            is_articulation=actor.kind is ActorKind.ARTICULATION,
+            is_static_mesh_actor=actor.kind is ActorKind.STATIC_MESH,
+            is_light=actor.kind is ActorKind.LIGHT,
+            has_quick_convert=actor.quick_convert is not None,
+            quick_convert=None if actor.quick_convert is None else _settings(actor.quick_convert),
         )
-        for row in server.world.list_actors()
+        for actor in server.world.list_actors()
     ]
     return ListActorsOk(actors=rows, in_pie=server.world.pie_running)
 
 
-def _settings(settings: QuickConvertSettings) -> QuickConvert:
-    return QuickConvert(
-        static=settings.static,
-        complex_mesh=settings.complex_mesh,
-        coacd_threshold=settings.coacd_threshold,
-        driven_by_unreal=settings.driven_by_unreal,
-        friction=settings.friction,
-    )
+def _settings(settings: ConversionSettings) -> QuickConvert:
+    return QuickConvert(**msgspec.structs.asdict(settings))
 
 
 @handles(FindActors)
@@ -71,15 +66,15 @@ def find_actors(server: ServerCore, request: FindActors) -> FindActorsOk:
     )
     rows = [
         ActorRow(
-            name=row.name,
-            label=row.label,
-            actor_class=row.class_name,
-            actor_id=row.actor_id,
-            location=row.location,
-            rotation_quat=row.rotation_quat,
-            tags=list(row.tags),
+            name=actor.name,
+            label=actor.label,
+            actor_class=actor.class_name,
+            actor_id=actor.actor_id,
+            location=actor.location,
+            rotation_quat=actor.rotation,
+            tags=list(actor.tags),
         )
-        for row in found
+        for actor in found
     ]
     return FindActorsOk(actors=rows, in_pie=in_pie)
 
@@ -87,17 +82,7 @@ def find_actors(server: ServerCore, request: FindActors) -> FindActorsOk:
 @handles(ListBlueprints)
 def list_blueprints(server: ServerCore, request: ListBlueprints) -> ListBlueprintsOk:
     del request
-    return ListBlueprintsOk(
-        blueprints=[
-            BlueprintInfo(
-                class_path=row.class_path,
-                short_name=row.short_name,
-                package_path=row.package_path,
-                parent_class=row.parent_class,
-            )
-            for row in server.world.list_blueprints()
-        ]
-    )
+    return ListBlueprintsOk(blueprints=server.world.list_blueprints())
 
 
 @handles(GetActorBounds)
@@ -105,13 +90,7 @@ def get_actor_bounds(server: ServerCore, request: GetActorBounds) -> GetActorBou
     bounds = server.world.get_actor_bounds(
         need(request, request.target, "target"), components_only=request.components_only
     )
-    return GetActorBoundsOk(
-        actor_name=bounds.actor_name,
-        min=bounds.min,
-        max=bounds.max,
-        center=bounds.center,
-        extents=bounds.extents,
-    )
+    return GetActorBoundsOk(**msgspec.structs.asdict(bounds))
 
 
 @handles(SelectActor)

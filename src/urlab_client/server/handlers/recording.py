@@ -29,15 +29,15 @@ from urlab_client.protocol.messages.recording import (
     ReplayStop,
     ReplayStopOk,
 )
-from urlab_client.server.content import write_atomic
-from urlab_client.server.controllers import float32
+from urlab_client.server.assets.content import write_atomic
 from urlab_client.server.core import ServerCore
-from urlab_client.server.dispatch import handles
-from urlab_client.server.play import Running
-from urlab_client.server.recording import LIVE_SESSION, duration, encode_json
+from urlab_client.server.physics.controllers import float32
+from urlab_client.server.physics.play import Running
+from urlab_client.server.physics.recording import LIVE_SESSION, duration, encode_json
+from urlab_client.server.physics.replay import Player, ReplaySessions, replay_folder
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.replay import Player, ReplaySessions, replay_folder
-from urlab_client.server.requests import need
+from urlab_client.server.rpc.dispatch import handles
+from urlab_client.server.rpc.requests import need
 
 UNLIMITED_S: Final = 3.4028234663852886e38
 """The largest float32."""

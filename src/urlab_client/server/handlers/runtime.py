@@ -39,12 +39,12 @@ from urlab_client.protocol.messages.runtime import (
     SetTwistOk,
 )
 from urlab_client.protocol.types import Contact, KeyframeInfo
-from urlab_client.server.controllers import ArticulationControl
 from urlab_client.server.core import ServerCore
-from urlab_client.server.dispatch import handles
-from urlab_client.server.engine import Engine, parse_control_source, parse_mode
+from urlab_client.server.physics.controllers import ArticulationControl
+from urlab_client.server.physics.engine import Engine, parse_control_source, parse_mode
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.requests import need
+from urlab_client.server.rpc.dispatch import handles
+from urlab_client.server.rpc.requests import need
 
 MAX_CONTACTS: Final = 64
 

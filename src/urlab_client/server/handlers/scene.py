@@ -39,11 +39,10 @@ from urlab_client.protocol.messages.scene import (
     SpawnLightOk,
     UrlabBlock,
 )
-from urlab_client.protocol.types import ActorHierarchyNode
+from urlab_client.server.assets.actors import Actor
 from urlab_client.server.core import ServerCore
-from urlab_client.server.dispatch import handles
-from urlab_client.server.requests import need, usable
-from urlab_client.server.world import ActorRow, HierarchyNode
+from urlab_client.server.rpc.dispatch import handles
+from urlab_client.server.rpc.requests import need, usable
 
 
 @handles(ImportXml)
@@ -102,7 +101,7 @@ def ensure_manager(server: ServerCore, request: EnsureManager) -> EnsureManagerO
 
 @handles(SpawnActor)
 def spawn_actor(server: ServerCore, request: SpawnActor) -> SpawnActorOk:
-    placed = server.world.spawn_actor(
+    actor, rotation_quat, was_existing = server.world.spawn_actor(
         need(request, request.blueprint, "blueprint"),
         request.actor_id,
         location=request.location,
@@ -111,13 +110,13 @@ def spawn_actor(server: ServerCore, request: SpawnActor) -> SpawnActorOk:
         scale=request.scale,
     )
     return SpawnActorOk(
-        actor_id=placed.actor_id,
-        actor_name=placed.actor_name,
-        actor_path=placed.actor_path,
-        blueprint_class_path=placed.blueprint_class_path,
-        location=placed.location,
-        rotation_quat=placed.rotation_quat,
-        was_existing=placed.was_existing,
+        actor_id=actor.actor_id,
+        actor_name=actor.name,
+        actor_path=server.world.actor_path(actor),
+        blueprint_class_path=actor.class_path,
+        location=actor.location,
+        rotation_quat=rotation_quat,
+        was_existing=was_existing,
         requires_pie_restart=server.world.pie_running,
     )
 
@@ -137,16 +136,16 @@ def spawn_grid(server: ServerCore, request: SpawnGrid) -> SpawnGridOk:
     )
     return SpawnGridOk(
         count=len(cells),
-        blueprint_class_path=cells[0].blueprint_class_path,
+        blueprint_class_path=cells[0].actor.class_path,
         actors=[
             GridCell(
-                actor_id=cell.actor_id,
-                actor_name=cell.actor_name,
-                actor_path=cell.actor_path,
-                was_existing=cell.was_existing,
-                location=cell.location,
+                actor_id=actor.actor_id,
+                actor_name=actor.name,
+                actor_path=server.world.actor_path(actor),
+                was_existing=was_existing,
+                location=actor.location,
             )
-            for cell in cells
+            for actor, _, was_existing in cells
         ],
         requires_pie_restart=server.world.pie_running,
     )
@@ -154,7 +153,7 @@ def spawn_grid(server: ServerCore, request: SpawnGrid) -> SpawnGridOk:
 
 @handles(SpawnLight)
 def spawn_light(server: ServerCore, request: SpawnLight) -> SpawnLightOk:
-    placed = server.world.spawn_light(
+    actor = server.world.spawn_light(
         request.kind,
         request.actor_id,
         location=request.location,
@@ -162,15 +161,17 @@ def spawn_light(server: ServerCore, request: SpawnLight) -> SpawnLightOk:
         intensity=request.intensity,
         color=request.color,
     )
+    light = actor.light
+    assert light is not None  # noqa: S101 - it was just made with one
     return SpawnLightOk(
-        actor_id=placed.actor_id,
-        actor_name=placed.actor_name,
-        actor_path=placed.actor_path,
-        kind=placed.kind,
-        intensity=placed.intensity,
-        color=placed.color,
-        location=placed.location,
-        rotation_euler=placed.rotation_euler,
+        actor_id=actor.actor_id,
+        actor_name=actor.name,
+        actor_path=server.world.actor_path(actor),
+        kind=light.kind,
+        intensity=request.intensity,
+        color=light.color,
+        location=request.location,
+        rotation_euler=request.rotation_euler,
         requires_pie_restart=server.world.pie_running,
     )
 
@@ -200,59 +201,50 @@ def set_actor_transform(server: ServerCore, request: SetActorTransform) -> SetAc
 
 @handles(DuplicateActor)
 def duplicate_actor(server: ServerCore, request: DuplicateActor) -> DuplicateActorOk:
-    copy = server.world.duplicate_actor(
+    copy, _, _ = server.world.duplicate_actor(
         need(request, request.target, "target"),
         need(request, request.new_actor_id, "new_actor_id"),
         location=request.location,
     )
     return DuplicateActorOk(
-        actor_id=copy.actor_id,
-        actor_name=copy.actor_name,
-        actor_path=copy.actor_path,
-        blueprint_class_path=copy.blueprint_class_path,
+        actor_id=request.new_actor_id,
+        actor_name=copy.name,
+        actor_path=server.world.actor_path(copy),
+        blueprint_class_path=copy.class_path,
     )
 
 
 @handles(ActorHierarchy)
 def actor_hierarchy(server: ServerCore, request: ActorHierarchy) -> ActorHierarchyOk:
-    return ActorHierarchyOk(root=_node(server.world.actor_hierarchy(need(request, request.target, "target"))))
-
-
-def _node(node: HierarchyNode) -> ActorHierarchyNode:
-    return ActorHierarchyNode(
-        name=node.name,
-        actor_class=node.class_name,
-        location=node.location,
-        children=[_node(child) for child in node.children],
-    )
+    return ActorHierarchyOk(root=server.world.actor_hierarchy(need(request, request.target, "target")))
 
 
 @handles(Snapshot)
 def snapshot(server: ServerCore, request: Snapshot) -> SnapshotOk:
     del request
     world = server.world
-    return SnapshotOk(
-        actors=[_row(row) for row in world.snapshot()], in_pie=world.pie_running, level_path=world.shown_level()
-    )
+    rows = [_row(actor, compiled=world.pie_running) for actor in world.snapshot()]
+    return SnapshotOk(actors=rows, in_pie=world.pie_running, level_path=world.shown_level())
 
 
-def _row(row: ActorRow) -> SnapshotRow:
-    names = row.names
+def _row(actor: Actor, *, compiled: bool) -> SnapshotRow:
+    """Describe an actor; in play the names of its elements are the compiled ones, except those of cameras."""
+    blueprint, prefix = actor.blueprint, actor.prefix if compiled else ""
     return SnapshotRow(
-        name=row.name,
-        label=row.label,
-        actor_class=row.class_name,
-        actor_id=row.actor_id,
-        location=row.location,
-        rotation_quat=row.rotation_quat,
-        tags=list(row.tags),
+        name=actor.name,
+        label=actor.label,
+        actor_class=actor.class_name,
+        actor_id=actor.actor_id,
+        location=actor.location,
+        rotation_quat=actor.rotation,
+        tags=list(actor.tags),
         urlab=None
-        if names is None
+        if blueprint is None
         else UrlabBlock(
             mj_class="articulation",
-            joints=list(names.joints),
-            actuators=list(names.actuators),
-            sensors=list(names.sensors),
-            cameras=list(names.cameras),
+            joints=[f"{prefix}{name}" for name in blueprint.joints],
+            actuators=[f"{prefix}{name}" for name in blueprint.actuators],
+            sensors=[f"{prefix}{name}" for name in blueprint.sensors],
+            cameras=list(blueprint.cameras),
         ),
     )

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import base64
 import logging
-from typing import Final
 
 import msgspec
 import mujoco
@@ -31,20 +30,16 @@ from urlab_client.protocol.messages.session import (
     Step,
     StepOk,
 )
-from urlab_client.protocol.registry import OPS
-from urlab_client.server.controllers import ArticulationControl, float32
+from urlab_client.server.compile.scene import EntityIndex
 from urlab_client.server.core import ServerCore
-from urlab_client.server.dispatch import handles
-from urlab_client.server.observe import sim_clock, wall_clock
-from urlab_client.server.play import Running
+from urlab_client.server.physics.controllers import ArticulationControl, float32
+from urlab_client.server.physics.observe import sim_clock, wall_clock
+from urlab_client.server.physics.play import Running
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.rendering import Exposure
-from urlab_client.server.scene import EntityIndex
+from urlab_client.server.render.camera_renderer import Exposure
+from urlab_client.server.rpc.dispatch import handles
 
 logger = logging.getLogger("urlab_client.server")
-
-URLAB_VERSION: Final = "urlab/0.1"
-"""The version the plugin of this protocol reports; clients compare with it."""
 
 
 @handles(Hello)
@@ -62,7 +57,7 @@ def handshake(server: ServerCore, session_id: str, *, include_assets: bool = Fal
     """Describe the server as `hello` and the start of play do, without any effect on the session."""
     reply = HelloOk(
         session_id=session_id,
-        urlab_version=URLAB_VERSION,
+        urlab_version=server.dialect.urlab_version,
         mujoco_version_int=mujoco.mj_version(),
         mujoco_version=mujoco.mj_versionString(),
         manager_present=server.play.manager_present,
@@ -136,7 +131,7 @@ def _add_assets(reply: HelloOk, running: Running) -> None:
     try:
         reply.mjcf_compiled = running.scene.mjcf()
         reply.vfs_assets = running.scene.assets()
-    except (ValueError, mujoco.FatalError) as error:
+    except (OSError, ValueError, mujoco.FatalError) as error:
         logger.warning("the scene cannot be written as MJCF, so the handshake goes without: %s", error)
 
 
@@ -144,7 +139,7 @@ def _add_assets(reply: HelloOk, running: Running) -> None:
 def meta(server: ServerCore, request: Meta) -> MetaOk:
     # Also the ops that this server answers with `unsupported`: the catalogue says what the protocol is, and a client
     # that reads it must not conclude that it talks to another version of the plugin.
-    del server, request
+    del request
     return MetaOk(
         ops=[
             OpInfo(
@@ -154,7 +149,7 @@ def meta(server: ServerCore, request: Meta) -> MetaOk:
                 required_fields=list(op.declared_required) or None,
                 reply_fields=list(op.declared_reply) or None,
             )
-            for op in OPS.values()
+            for op in server.dialect.ops.values()
             if op.name not in ("hello", "meta")
         ]
     )

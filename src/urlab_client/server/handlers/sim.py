@@ -7,8 +7,8 @@ from __future__ import annotations
 from urlab_client.protocol.enums import PIEState
 from urlab_client.protocol.messages.sim import BeginPie, BeginPieOk, PieStatus, PieStatusOk, StopPie, StopPieOk
 from urlab_client.server.core import ServerCore
-from urlab_client.server.dispatch import handles
 from urlab_client.server.handlers.session import handshake
+from urlab_client.server.rpc.dispatch import handles
 
 
 @handles(BeginPie)

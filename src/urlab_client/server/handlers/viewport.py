@@ -24,14 +24,14 @@ from urlab_client.protocol.messages.viewport import (
     UntrackOk,
 )
 from urlab_client.protocol.rotation import xyzw
-from urlab_client.server.actors import Actor
-from urlab_client.server.controllers import float32
+from urlab_client.server.assets.actors import Actor
+from urlab_client.server.compile.scene import CompileFailed, actor_bounds
 from urlab_client.server.core import ServerCore
-from urlab_client.server.dispatch import handles
+from urlab_client.server.editor.viewport import DEFAULT_OFFSET, Track, ViewMode, ViewportCamera, rotator
+from urlab_client.server.physics.controllers import float32
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.requests import need
-from urlab_client.server.scene import CompileFailed, actor_bounds
-from urlab_client.server.viewport import DEFAULT_OFFSET, CameraView, Track, ViewMode, rotator
+from urlab_client.server.rpc.dispatch import handles
+from urlab_client.server.rpc.requests import need
 
 
 @handles(SetCamera)
@@ -122,7 +122,7 @@ def need_rotator(request: Request[Any], quat: Quat | None, euler: Vec3 | None) -
         raise Refusal("missing_field", f"{request.__struct_config__.tag}: the rotation is unusable: {error}") from None
 
 
-def look(server: ServerCore) -> CameraView:
+def look(server: ServerCore) -> ViewportCamera:
     """Return the camera where it is now; what it follows may have moved."""
     actor = _tracked(server)
     if actor is not None:

@@ -17,7 +17,7 @@ from urlab_client.protocol.types import (
 )
 from urlab_client.sync._portal import Facade
 
-__all__ = ["DebugOps", "OutlinerOps", "ReplayOps", "RuntimeOps", "SceneOps", "ViewportOps"]
+__all__ = ["DebugOps", "FarmOps", "OutlinerOps", "ReplayOps", "RuntimeOps", "SceneOps", "ViewportOps"]
 
 
 class RuntimeOps(Facade, twin=aio.RuntimeOps):
@@ -37,7 +37,7 @@ class RuntimeOps(Facade, twin=aio.RuntimeOps):
             NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
             MissingField: A required field is absent, empty or malformed.
         """
-        return self._portal.call(self._aio.set_paused(paused, timeout=timeout))
+        return self._portal.call(self._aio.set_paused, paused, timeout=timeout)
 
     def set_sim_speed(self, percent: float, *, timeout: Timeout = DEFAULT) -> float:
         """Set the pacing of live mode and return the value in force.
@@ -50,7 +50,7 @@ class RuntimeOps(Facade, twin=aio.RuntimeOps):
             NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
             MissingField: A required field is absent, empty or malformed.
         """
-        return self._portal.call(self._aio.set_sim_speed(percent, timeout=timeout))
+        return self._portal.call(self._aio.set_sim_speed, percent, timeout=timeout)
 
     def set_control_source(self, source: str, *, articulation: str | None = None, timeout: Timeout = DEFAULT) -> None:
         """Choose whose set-points drive the actuators: those of this protocol or those of the editor's panel.
@@ -65,8 +65,9 @@ class RuntimeOps(Facade, twin=aio.RuntimeOps):
             MissingField: A required field is absent, empty or malformed.
             BadValue: A value outside the op's list of choices.
             UnknownArticulation: No articulation has this key or actor id.
+            NotControlOwner: Another client controls the robot, or nobody does; nothing was written.
         """
-        self._portal.call(self._aio.set_control_source(source, articulation=articulation, timeout=timeout))
+        self._portal.call(self._aio.set_control_source, source, articulation=articulation, timeout=timeout)
 
     def set_twist(
         self,
@@ -88,9 +89,10 @@ class RuntimeOps(Facade, twin=aio.RuntimeOps):
             NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
             MissingField: A required field is absent, empty or malformed.
             UnknownArticulation: No articulation has this key or actor id.
+            NotControlOwner: Another client controls the robot, or nobody does; nothing was written.
             NoTwistController: The articulation has no twist controller.
         """
-        self._portal.call(self._aio.set_twist(articulation, linear=linear, angular=angular, timeout=timeout))
+        self._portal.call(self._aio.set_twist, articulation, linear=linear, angular=angular, timeout=timeout)
 
     def set_mocap_pose(
         self, body: str, *, pos: Vector | None = None, quat: Vector | None = None, timeout: Timeout = DEFAULT
@@ -109,7 +111,7 @@ class RuntimeOps(Facade, twin=aio.RuntimeOps):
             UnknownBody: The compiled model has no body of that name.
             NotMocapBody: The body is not flagged `mocap="true"`.
         """
-        return self._portal.call(self._aio.set_mocap_pose(body, pos=pos, quat=quat, timeout=timeout))
+        return self._portal.call(self._aio.set_mocap_pose, body, pos=pos, quat=quat, timeout=timeout)
 
     def read_mocap_pose(self, body: str, *, timeout: Timeout = DEFAULT) -> MocapPose:
         """Read the pose of a mocap body.
@@ -124,7 +126,7 @@ class RuntimeOps(Facade, twin=aio.RuntimeOps):
             UnknownBody: The compiled model has no body of that name.
             NotMocapBody: The body is not flagged `mocap="true"`.
         """
-        return self._portal.call(self._aio.read_mocap_pose(body, timeout=timeout))
+        return self._portal.call(self._aio.read_mocap_pose, body, timeout=timeout)
 
     def list_keyframes(self, *, timeout: Timeout = DEFAULT) -> list[KeyframeInfo]:
         """List the compiled keyframes.
@@ -135,7 +137,7 @@ class RuntimeOps(Facade, twin=aio.RuntimeOps):
         Raises:
             NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
         """
-        return self._portal.call(self._aio.list_keyframes(timeout=timeout))
+        return self._portal.call(self._aio.list_keyframes, timeout=timeout)
 
 
 class ReplayOps(Facade, twin=aio.ReplayOps):
@@ -153,7 +155,7 @@ class ReplayOps(Facade, twin=aio.ReplayOps):
         Raises:
             NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
         """
-        return self._portal.call(self._aio.list_sessions(timeout=timeout))
+        return self._portal.call(self._aio.list_sessions, timeout=timeout)
 
 
 class SceneOps(Facade, twin=aio.SceneOps):
@@ -176,7 +178,7 @@ class SceneOps(Facade, twin=aio.SceneOps):
             MissingField: A required field is absent, empty or malformed.
             CreateLevelFailed: The level exists already, a play session runs, or it could not be saved.
         """
-        self._portal.call(self._aio.create_level(name, force_overwrite=force_overwrite, timeout=timeout))
+        self._portal.call(self._aio.create_level, name, force_overwrite=force_overwrite, timeout=timeout)
 
     def load_level(self, name_or_path: str, *, timeout: Timeout = DEFAULT) -> None:
         """Open an existing level; unsaved edits of the open one are lost.
@@ -189,7 +191,7 @@ class SceneOps(Facade, twin=aio.SceneOps):
             MissingField: A required field is absent, empty or malformed.
             LoadLevelFailed: The level does not exist, cannot be read, or a play session runs.
         """
-        self._portal.call(self._aio.load_level(name_or_path, timeout=timeout))
+        self._portal.call(self._aio.load_level, name_or_path, timeout=timeout)
 
     def save_level(self, *, timeout: Timeout = DEFAULT) -> None:
         """Save the open level.
@@ -200,7 +202,7 @@ class SceneOps(Facade, twin=aio.SceneOps):
         Raises:
             SaveLevelFailed: The level has no path yet, a play session runs, or it could not be written.
         """
-        self._portal.call(self._aio.save_level(timeout=timeout))
+        self._portal.call(self._aio.save_level, timeout=timeout)
 
     def current_level(self, *, timeout: Timeout = DEFAULT) -> str:
         """Return the package path of the open level; during play still the edited one.
@@ -212,7 +214,7 @@ class SceneOps(Facade, twin=aio.SceneOps):
             NotInEditor: The op needs the editor.
             NoWorld: Neither a play world nor an editor world exists.
         """
-        return self._portal.call(self._aio.current_level(timeout=timeout))
+        return self._portal.call(self._aio.current_level, timeout=timeout)
 
     def ensure_manager(self, *, timeout: Timeout = DEFAULT) -> bool:
         """Make sure the level holds one manager actor, without which play never becomes ready.
@@ -227,21 +229,7 @@ class SceneOps(Facade, twin=aio.SceneOps):
             NoWorld: Neither a play world nor an editor world exists.
             SpawnFailed: The class cannot be spawned, or the actor id belongs to an actor of another class.
         """
-        return self._portal.call(self._aio.ensure_manager(timeout=timeout))
-
-    def destroy_actor(self, target: str, *, by_name: bool = False, timeout: Timeout = DEFAULT) -> None:
-        """Remove an actor from the edited level.
-
-        Args:
-            target: Actor id, or the engine's actor name with `by_name`.
-            by_name: Look `target` up by the engine's actor name instead of the actor id.
-            timeout: Seconds to wait; None waits without limit.
-
-        Raises:
-            MissingField: A required field is absent, empty or malformed.
-            DestroyFailed: No actor matches.
-        """
-        self._portal.call(self._aio.destroy_actor(target, by_name=by_name, timeout=timeout))
+        return self._portal.call(self._aio.ensure_manager, timeout=timeout)
 
     def destroy_asset(self, asset_path: str, *, timeout: Timeout = DEFAULT) -> bool:
         """Delete an asset by object path and return whether it existed.
@@ -254,7 +242,7 @@ class SceneOps(Facade, twin=aio.SceneOps):
             MissingField: A required field is absent, empty or malformed.
             DestroyAssetFailed: The asset exists but cannot be deleted.
         """
-        return self._portal.call(self._aio.destroy_asset(asset_path, timeout=timeout))
+        return self._portal.call(self._aio.destroy_asset, asset_path, timeout=timeout)
 
     def set_actor_transform(
         self,
@@ -281,14 +269,13 @@ class SceneOps(Facade, twin=aio.SceneOps):
             SetActorTransformFailed: No actor matches, or the rotation is not one.
         """
         self._portal.call(
-            self._aio.set_actor_transform(
-                target,
-                by_name=by_name,
-                location=location,
-                rotation_quat=rotation_quat,
-                rotation_euler=rotation_euler,
-                timeout=timeout,
-            )
+            self._aio.set_actor_transform,
+            target,
+            by_name=by_name,
+            location=location,
+            rotation_quat=rotation_quat,
+            rotation_euler=rotation_euler,
+            timeout=timeout,
         )
 
     def actor_hierarchy(self, target: str, *, by_name: bool = False, timeout: Timeout = DEFAULT) -> ActorHierarchyNode:
@@ -303,7 +290,7 @@ class SceneOps(Facade, twin=aio.SceneOps):
             MissingField: A required field is absent, empty or malformed.
             ActorHierarchyFailed: No actor matches.
         """
-        return self._portal.call(self._aio.actor_hierarchy(target, by_name=by_name, timeout=timeout))
+        return self._portal.call(self._aio.actor_hierarchy, target, by_name=by_name, timeout=timeout)
 
 
 class OutlinerOps(Facade, twin=aio.OutlinerOps):
@@ -321,7 +308,7 @@ class OutlinerOps(Facade, twin=aio.OutlinerOps):
         Raises:
             ListBlueprintsFailed: The content could not be searched.
         """
-        return self._portal.call(self._aio.list_blueprints(timeout=timeout))
+        return self._portal.call(self._aio.list_blueprints, timeout=timeout)
 
     def get_actor_bounds(
         self, target: str, *, by_name: bool = False, components_only: bool = False, timeout: Timeout = DEFAULT
@@ -339,7 +326,7 @@ class OutlinerOps(Facade, twin=aio.OutlinerOps):
             GetActorBoundsFailed: No actor matches.
         """
         return self._portal.call(
-            self._aio.get_actor_bounds(target, by_name=by_name, components_only=components_only, timeout=timeout)
+            self._aio.get_actor_bounds, target, by_name=by_name, components_only=components_only, timeout=timeout
         )
 
     def select_actor(self, target: str, *, by_name: bool = False, timeout: Timeout = DEFAULT) -> None:
@@ -354,7 +341,7 @@ class OutlinerOps(Facade, twin=aio.OutlinerOps):
             MissingField: A required field is absent, empty or malformed.
             SelectFailed: No actor matches.
         """
-        self._portal.call(self._aio.select_actor(target, by_name=by_name, timeout=timeout))
+        self._portal.call(self._aio.select_actor, target, by_name=by_name, timeout=timeout)
 
     def add_quick_convert(
         self,
@@ -385,16 +372,15 @@ class OutlinerOps(Facade, twin=aio.OutlinerOps):
             AddQuickConvertFailed: No actor matches, or it has no mesh to convert.
         """
         self._portal.call(
-            self._aio.add_quick_convert(
-                target,
-                by_name=by_name,
-                static=static,
-                complex_mesh=complex_mesh,
-                coacd_threshold=coacd_threshold,
-                driven_by_unreal=driven_by_unreal,
-                friction=friction,
-                timeout=timeout,
-            )
+            self._aio.add_quick_convert,
+            target,
+            by_name=by_name,
+            static=static,
+            complex_mesh=complex_mesh,
+            coacd_threshold=coacd_threshold,
+            driven_by_unreal=driven_by_unreal,
+            friction=friction,
+            timeout=timeout,
         )
 
     def remove_quick_convert(self, target: str, *, by_name: bool = False, timeout: Timeout = DEFAULT) -> None:
@@ -409,7 +395,7 @@ class OutlinerOps(Facade, twin=aio.OutlinerOps):
             MissingField: A required field is absent, empty or malformed.
             RemoveQuickConvertFailed: No actor matches, or it is not converted.
         """
-        self._portal.call(self._aio.remove_quick_convert(target, by_name=by_name, timeout=timeout))
+        self._portal.call(self._aio.remove_quick_convert, target, by_name=by_name, timeout=timeout)
 
 
 class DebugOps(Facade, twin=aio.DebugOps):
@@ -442,7 +428,7 @@ class DebugOps(Facade, twin=aio.DebugOps):
             MissingField: A required field is absent, empty or malformed.
             NoWorld: Neither a play world nor an editor world exists.
         """
-        self._portal.call(self._aio.draw_marker(location, color, ttl=ttl, label=label, tag=tag, timeout=timeout))
+        self._portal.call(self._aio.draw_marker, location, color, ttl=ttl, label=label, tag=tag, timeout=timeout)
 
     def draw_line(
         self,
@@ -470,7 +456,7 @@ class DebugOps(Facade, twin=aio.DebugOps):
             MissingField: A required field is absent, empty or malformed.
             NoWorld: Neither a play world nor an editor world exists.
         """
-        self._portal.call(self._aio.draw_line(from_, to, color, ttl=ttl, thickness=thickness, tag=tag, timeout=timeout))
+        self._portal.call(self._aio.draw_line, from_, to, color, ttl=ttl, thickness=thickness, tag=tag, timeout=timeout)
 
     def draw_box(
         self,
@@ -499,9 +485,14 @@ class DebugOps(Facade, twin=aio.DebugOps):
             NoWorld: Neither a play world nor an editor world exists.
         """
         self._portal.call(
-            self._aio.draw_box(
-                center, half_extents, color, rotation_quat=rotation_quat, ttl=ttl, tag=tag, timeout=timeout
-            )
+            self._aio.draw_box,
+            center,
+            half_extents,
+            color,
+            rotation_quat=rotation_quat,
+            ttl=ttl,
+            tag=tag,
+            timeout=timeout,
         )
 
     def draw_arrow(
@@ -533,9 +524,15 @@ class DebugOps(Facade, twin=aio.DebugOps):
             NoWorld: Neither a play world nor an editor world exists.
         """
         self._portal.call(
-            self._aio.draw_arrow(
-                from_, to, color, ttl=ttl, thickness=thickness, arrow_size=arrow_size, tag=tag, timeout=timeout
-            )
+            self._aio.draw_arrow,
+            from_,
+            to,
+            color,
+            ttl=ttl,
+            thickness=thickness,
+            arrow_size=arrow_size,
+            tag=tag,
+            timeout=timeout,
         )
 
     def draw_axes(
@@ -565,15 +562,14 @@ class DebugOps(Facade, twin=aio.DebugOps):
             NoWorld: Neither a play world nor an editor world exists.
         """
         self._portal.call(
-            self._aio.draw_axes(
-                location,
-                rotation_quat=rotation_quat,
-                rotation_euler=rotation_euler,
-                scale=scale,
-                ttl=ttl,
-                tag=tag,
-                timeout=timeout,
-            )
+            self._aio.draw_axes,
+            location,
+            rotation_quat=rotation_quat,
+            rotation_euler=rotation_euler,
+            scale=scale,
+            ttl=ttl,
+            tag=tag,
+            timeout=timeout,
         )
 
     def clear_markers(self, *, tag: str | None = None, timeout: Timeout = DEFAULT) -> None:
@@ -586,7 +582,7 @@ class DebugOps(Facade, twin=aio.DebugOps):
         Raises:
             NoWorld: Neither a play world nor an editor world exists.
         """
-        self._portal.call(self._aio.clear_markers(tag=tag, timeout=timeout))
+        self._portal.call(self._aio.clear_markers, tag=tag, timeout=timeout)
 
     def set_overlay_text(self, text: str, *, anchor: str = "top_left", timeout: Timeout = DEFAULT) -> None:
         """Show a line of text on the screen for 10 s; empty text clears it.
@@ -600,7 +596,7 @@ class DebugOps(Facade, twin=aio.DebugOps):
             MissingField: A required field is absent, empty or malformed.
             NoEngine: There is no engine object to draw with.
         """
-        self._portal.call(self._aio.set_overlay_text(text, anchor=anchor, timeout=timeout))
+        self._portal.call(self._aio.set_overlay_text, text, anchor=anchor, timeout=timeout)
 
 
 class ViewportOps(Facade, twin=aio.ViewportOps):
@@ -632,9 +628,12 @@ class ViewportOps(Facade, twin=aio.ViewportOps):
             NoViewport: The editor has no perspective viewport.
         """
         return self._portal.call(
-            self._aio.set_camera(
-                location, rotation_quat=rotation_quat, rotation_euler=rotation_euler, fov=fov, timeout=timeout
-            )
+            self._aio.set_camera,
+            location,
+            rotation_quat=rotation_quat,
+            rotation_euler=rotation_euler,
+            fov=fov,
+            timeout=timeout,
         )
 
     def get_camera(self, *, timeout: Timeout = DEFAULT) -> CameraPose:
@@ -646,7 +645,7 @@ class ViewportOps(Facade, twin=aio.ViewportOps):
         Raises:
             NoViewport: The editor has no perspective viewport.
         """
-        return self._portal.call(self._aio.get_camera(timeout=timeout))
+        return self._portal.call(self._aio.get_camera, timeout=timeout)
 
     def frame_actor(self, target: str, *, by_name: bool = False, timeout: Timeout = DEFAULT) -> CameraPose:
         """Move the camera so that an actor fills the view; the view direction stays.
@@ -662,7 +661,7 @@ class ViewportOps(Facade, twin=aio.ViewportOps):
             NoBounds: The actor has no valid bounds.
             NoViewport: The editor has no perspective viewport.
         """
-        return self._portal.call(self._aio.frame_actor(target, by_name=by_name, timeout=timeout))
+        return self._portal.call(self._aio.frame_actor, target, by_name=by_name, timeout=timeout)
 
     def set_mode(self, mode: str, *, timeout: Timeout = DEFAULT) -> str:
         """Switch the viewport's view mode and return it.
@@ -677,7 +676,7 @@ class ViewportOps(Facade, twin=aio.ViewportOps):
             NoViewport: The editor has no perspective viewport.
             Unsupported: Only a server without Unreal answers this: it cannot do what was asked.
         """
-        return self._portal.call(self._aio.set_mode(mode, timeout=timeout))
+        return self._portal.call(self._aio.set_mode, mode, timeout=timeout)
 
     def track_actor(
         self,
@@ -703,7 +702,7 @@ class ViewportOps(Facade, twin=aio.ViewportOps):
             NoViewport: The editor has no perspective viewport.
         """
         return self._portal.call(
-            self._aio.track_actor(target, by_name=by_name, offset=offset, smoothing=smoothing, timeout=timeout)
+            self._aio.track_actor, target, by_name=by_name, offset=offset, smoothing=smoothing, timeout=timeout
         )
 
     def untrack(self, *, timeout: Timeout = DEFAULT) -> bool:
@@ -712,4 +711,41 @@ class ViewportOps(Facade, twin=aio.ViewportOps):
         Args:
             timeout: Seconds to wait; None waits without limit.
         """
-        return self._portal.call(self._aio.untrack(timeout=timeout))
+        return self._portal.call(self._aio.untrack, timeout=timeout)
+
+
+class FarmOps(Facade, twin=aio.FarmOps):
+    """Generated part of `client.farm`."""
+
+    __slots__ = ()
+    _aio: aio.FarmOps
+
+    def acquire_lease(self, owner: str = "", *, ttl_s: float = 60.0, timeout: Timeout = DEFAULT) -> str:
+        """Take the server's one driver lease and return its id.
+
+            The server enforces nothing by it: it tells other clients that the server is in use. Every request keeps it
+            alive.
+
+        Args:
+            owner: Who takes it, for people.
+            ttl_s: Seconds without a request after which it ends; 0 or less ends it at once.
+            timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
+            LeaseBusy: Somebody holds the server's driver lease.
+        """
+        return self._portal.call(self._aio.acquire_lease, owner, ttl_s=ttl_s, timeout=timeout)
+
+    def release_lease(self, lease_id: str, *, timeout: Timeout = DEFAULT) -> None:
+        """Give the driver lease back.
+
+        Args:
+            lease_id: What `acquire_lease` returned.
+            timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
+            BadRequest: The frame is neither a msgpack map nor a JSON object.
+        """
+        self._portal.call(self._aio.release_lease, lease_id, timeout=timeout)

@@ -24,7 +24,7 @@ class OutlinerNamespace(OutlinerOps, twin=aio.OutlinerNamespace):
         Raises:
             ListActorsFailed: There is no world to list.
         """
-        return self._portal.call(self._aio.list_actors(timeout=timeout))
+        return self._portal.call(self._aio.list_actors, timeout=timeout)
 
     def find_actors(
         self,
@@ -51,7 +51,10 @@ class OutlinerNamespace(OutlinerOps, twin=aio.OutlinerNamespace):
             FindActorsFailed: There is no world to search.
         """
         return self._portal.call(
-            self._aio.find_actors(
-                class_filter=class_filter, tag=tag, name_prefix=name_prefix, in_pie=in_pie, timeout=timeout
-            )
+            self._aio.find_actors,
+            class_filter=class_filter,
+            tag=tag,
+            name_prefix=name_prefix,
+            in_pie=in_pie,
+            timeout=timeout,
         )

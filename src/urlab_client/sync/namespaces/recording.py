@@ -54,7 +54,7 @@ class RecordingNamespace(Facade, twin=aio.RecordingNamespace):
         Raises:
             RecordingAlreadyActive: A recording runs.
         """
-        return self._portal.call(self._aio.start(name, max_duration_s, timeout=timeout))
+        return self._portal.call(self._aio.start, name, max_duration_s, timeout=timeout)
 
     def stop(self, *, timeout: Timeout = DEFAULT) -> RecordingSummary:
         """Stop recording.
@@ -62,7 +62,7 @@ class RecordingNamespace(Facade, twin=aio.RecordingNamespace):
         Raises:
             RecordingNotActive: No recording runs.
         """
-        return self._portal.call(self._aio.stop(timeout=timeout))
+        return self._portal.call(self._aio.stop, timeout=timeout)
 
     def save(self, path: str | Path | None = None, *, timeout: Timeout = DEFAULT) -> Path:
         """Write the active session to a JSON file on the server's machine and return its absolute path.
@@ -74,11 +74,11 @@ class RecordingNamespace(Facade, twin=aio.RecordingNamespace):
         Raises:
             PathNotWritable: The file cannot be written, or there is nothing to save.
         """
-        return self._portal.call(self._aio.save(path, timeout=timeout))
+        return self._portal.call(self._aio.save, path, timeout=timeout)
 
     def clear(self, *, timeout: Timeout = DEFAULT) -> None:
         """Forget the recorded frames."""
-        self._portal.call(self._aio.clear(timeout=timeout))
+        self._portal.call(self._aio.clear, timeout=timeout)
 
 
 class ReplayNamespace(ReplayOps, twin=aio.ReplayNamespace):
@@ -98,7 +98,7 @@ class ReplayNamespace(ReplayOps, twin=aio.ReplayNamespace):
         Raises:
             PathNotReadable: The recording is missing or is not one.
         """
-        return self._portal.call(self._aio.load(path, timeout=timeout))
+        return self._portal.call(self._aio.load, path, timeout=timeout)
 
     def set_active(self, name: str, *, timeout: Timeout = DEFAULT) -> None:
         """Make a loaded session the active one.
@@ -106,7 +106,7 @@ class ReplayNamespace(ReplayOps, twin=aio.ReplayNamespace):
         Raises:
             ReplaySessionNotFound: No session has this name.
         """
-        self._portal.call(self._aio.set_active(name, timeout=timeout))
+        self._portal.call(self._aio.set_active, name, timeout=timeout)
 
     def start(self, *, timeout: Timeout = DEFAULT) -> ReplayStatus:
         """Play the active session.
@@ -114,11 +114,11 @@ class ReplayNamespace(ReplayOps, twin=aio.ReplayNamespace):
         Raises:
             ReplayRequiresStepped: The step mode is live.
         """
-        return self._portal.call(self._aio.start(timeout=timeout))
+        return self._portal.call(self._aio.start, timeout=timeout)
 
     def stop(self, *, timeout: Timeout = DEFAULT) -> None:
         """Stop playing."""
-        self._portal.call(self._aio.stop(timeout=timeout))
+        self._portal.call(self._aio.stop, timeout=timeout)
 
     def play(self, path_or_name: str | Path, *, loop: bool = False, timeout: Timeout = DEFAULT) -> ReplaySession:
         """Play a loaded session by name, or load a recording and play it.
@@ -132,4 +132,4 @@ class ReplayNamespace(ReplayOps, twin=aio.ReplayNamespace):
             PathNotReadable: It is neither a session nor a recording.
             ReplayRequiresStepped: The step mode is live.
         """
-        return self._portal.call(self._aio.play(path_or_name, loop=loop, timeout=timeout))
+        return self._portal.call(self._aio.play, path_or_name, loop=loop, timeout=timeout)

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from urlab_client.aio.deadline import DEFAULT, Timeout
@@ -38,7 +39,7 @@ class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
             UnknownArticulation: No articulation has this key or actor id.
             DimMismatch: The number of values does not fit.
         """
-        self._portal.call(self._aio.set_qpos(target, qpos, by_name=by_name, timeout=timeout))
+        self._portal.call(self._aio.set_qpos, target, qpos, by_name=by_name, timeout=timeout)
 
     def get_contacts(
         self,
@@ -64,9 +65,13 @@ class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
             timeout: Seconds to wait; None waits without limit.
         """
         return self._portal.call(
-            self._aio.get_contacts(
-                body1=body1, body2=body2, geom1=geom1, geom2=geom2, max_contacts=max_contacts, timeout=timeout
-            )
+            self._aio.get_contacts,
+            body1=body1,
+            body2=body2,
+            geom1=geom1,
+            geom2=geom2,
+            max_contacts=max_contacts,
+            timeout=timeout,
         )
 
     def set_sim_options(self, *, timeout: Timeout = DEFAULT, **opts: Any) -> SimOptions:
@@ -80,7 +85,30 @@ class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
             TypeError: An unknown option, or one of the wrong type; nothing was sent.
             BadValue: Unknown integrator, cone or solver.
         """
-        return self._portal.call(self._aio.set_sim_options(timeout=timeout, **opts))
+        return self._portal.call(self._aio.set_sim_options, timeout=timeout, **opts)
+
+    def set_user_channels(
+        self,
+        arts: Mapping[str, Mapping[str, Any]] | None = None,
+        *,
+        scene: Mapping[str, Any] | None = None,
+        timeout: Timeout = DEFAULT,
+    ) -> dict[str, str]:
+        """Write values of channels that the level declares for its robots or the scene; they come back with the state.
+
+        Args:
+            arts: Articulation to channel to a bool, number, text, list of numbers, or map of `pos` and `quat`.
+            scene: Channel of the scene to value.
+            timeout: Seconds to wait; None waits without limit.
+
+        Returns:
+            Why a value was not taken, by `<articulation>/<channel>` or `scene/<channel>`; empty when all were.
+
+        Raises:
+            KeyError: Unknown articulation; nothing was sent.
+            UnknownOp: The server has no such channels.
+        """
+        return self._portal.call(self._aio.set_user_channels, arts, scene=scene, timeout=timeout)
 
     def set_mode(self, mode: StepMode | str, *, timeout: Timeout = DEFAULT) -> StepMode:
         """Switch the step mode and return the one in force. Any mode but live un-pauses physics.
@@ -93,7 +121,7 @@ class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
             ValueError: Unknown mode; nothing was sent.
             ModeLocked: The project pins another mode.
         """
-        return self._portal.call(self._aio.set_mode(mode, timeout=timeout))
+        return self._portal.call(self._aio.set_mode, mode, timeout=timeout)
 
     def forward(self, *, timeout: Timeout = DEFAULT) -> ForwardOk:
         """Run `mj_forward` on the server and take over the state: kinematics and dynamics, no integration.
@@ -101,4 +129,4 @@ class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
         Returns:
             The state; time and step counter are unchanged.
         """
-        return self._portal.call(self._aio.forward(timeout=timeout))
+        return self._portal.call(self._aio.forward, timeout=timeout)

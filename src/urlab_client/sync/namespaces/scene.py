@@ -38,7 +38,7 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
         Raises:
             ImportFailed: The file is missing or was rejected, or the old blueprint could not be removed.
         """
-        return self._portal.call(self._aio.import_xml(xml_path, force_reimport=force_reimport, timeout=timeout))
+        return self._portal.call(self._aio.import_xml, xml_path, force_reimport=force_reimport, timeout=timeout)
 
     def spawn_actor(
         self,
@@ -66,15 +66,14 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
             SpawnFailed: The class cannot be spawned, or the id belongs to an actor of another class.
         """
         return self._portal.call(
-            self._aio.spawn_actor(
-                blueprint,
-                actor_id,
-                location=location,
-                rotation_quat=rotation_quat,
-                rotation_euler=rotation_euler,
-                scale=scale,
-                timeout=timeout,
-            )
+            self._aio.spawn_actor,
+            blueprint,
+            actor_id,
+            location=location,
+            rotation_quat=rotation_quat,
+            rotation_euler=rotation_euler,
+            scale=scale,
+            timeout=timeout,
         )
 
     def spawn_light(
@@ -103,16 +102,28 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
             SpawnFailed: Unknown kind.
         """
         return self._portal.call(
-            self._aio.spawn_light(
-                kind,
-                actor_id,
-                location=location,
-                rotation_euler=rotation_euler,
-                intensity=intensity,
-                color=color,
-                timeout=timeout,
-            )
+            self._aio.spawn_light,
+            kind,
+            actor_id,
+            location=location,
+            rotation_euler=rotation_euler,
+            intensity=intensity,
+            color=color,
+            timeout=timeout,
         )
+
+    def destroy_actor(self, target: str, *, by_name: bool = False, timeout: Timeout = DEFAULT) -> None:
+        """Remove an actor from the edited level.
+
+        Args:
+            target: Actor id, or the engine's actor name with `by_name`.
+            by_name: Look `target` up by the engine's actor name instead of the actor id.
+            timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            DestroyFailed: No actor matches.
+        """
+        self._portal.call(self._aio.destroy_actor, target, by_name=by_name, timeout=timeout)
 
     def snapshot(self, *, timeout: Timeout = DEFAULT) -> SceneSnapshot:
         """Describe every visible actor, with articulation metadata; the play world when it runs.
@@ -120,7 +131,7 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
         Raises:
             SnapshotFailed: There is no world to describe.
         """
-        return self._portal.call(self._aio.snapshot(timeout=timeout))
+        return self._portal.call(self._aio.snapshot, timeout=timeout)
 
     def duplicate_actor(
         self,
@@ -146,7 +157,7 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
             DuplicateFailed: No actor matches, or the new id belongs to an actor of another class.
         """
         return self._portal.call(
-            self._aio.duplicate_actor(target, new_actor_id, by_name=by_name, location=location, timeout=timeout)
+            self._aio.duplicate_actor, target, new_actor_id, by_name=by_name, location=location, timeout=timeout
         )
 
     def spawn_grid(
@@ -185,18 +196,17 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
             SpawnFailed: A cell could not be placed; the plugin keeps the cells placed before it.
         """
         return self._portal.call(
-            self._aio.spawn_grid(
-                blueprint,
-                base_actor_id,
-                count_x,
-                count_y,
-                spacing=spacing,
-                origin=origin,
-                rotation_quat=rotation_quat,
-                rotation_euler=rotation_euler,
-                scale=scale,
-                timeout=timeout,
-            )
+            self._aio.spawn_grid,
+            blueprint,
+            base_actor_id,
+            count_x,
+            count_y,
+            spacing=spacing,
+            origin=origin,
+            rotation_quat=rotation_quat,
+            rotation_euler=rotation_euler,
+            scale=scale,
+            timeout=timeout,
         )
 
     def apply_scene(
@@ -219,4 +229,4 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
             ValueError: Two assets share an actor id; nothing was done.
             URLabRPCError: From the op that failed; what was placed before it stays.
         """
-        return self._portal.call(self._aio.apply_scene(level_name, assets, save=save, timeout=timeout))
+        return self._portal.call(self._aio.apply_scene, level_name, assets, save=save, timeout=timeout)

@@ -45,13 +45,12 @@ class SimNamespace(Facade, twin=aio.SimNamespace):
             URLabPIEError: Play did not become ready; its message carries the compile log.
         """
         return self._portal.call(
-            self._aio.start(
-                level_path,
-                timeout_s=timeout_s,
-                raise_on_failure=raise_on_failure,
-                on_progress=on_progress,
-                timeout=timeout,
-            )
+            self._aio.start,
+            level_path,
+            timeout_s=timeout_s,
+            raise_on_failure=raise_on_failure,
+            on_progress=on_progress,
+            timeout=timeout,
         )
 
     def stop(self, *, timeout: Timeout = DEFAULT) -> None:
@@ -64,8 +63,8 @@ class SimNamespace(Facade, twin=aio.SimNamespace):
             GameThreadTimeout: The editor did not react; often a modal dialog is open.
             URLabTimeoutError: The editor agreed, but play has not ended after ten seconds.
         """
-        self._portal.call(self._aio.stop(timeout=timeout))
+        self._portal.call(self._aio.stop, timeout=timeout)
 
     def status(self, *, timeout: Timeout = DEFAULT) -> PIEStatus:
         """Read the state of play."""
-        return self._portal.call(self._aio.status(timeout=timeout))
+        return self._portal.call(self._aio.status, timeout=timeout)

@@ -1,0 +1,262 @@
+"""What differs between the MuJoCo releases that this package runs on: 3.8 and later. Nothing else asks for that.
+
+Each difference is found out where it shows, by asking MuJoCo for what it has; nothing compares version numbers. What an
+older release lacks is done in another way where there is one, and said where there is none.
+
+The client's import of this module must not import MuJoCo: that takes longer than the rest of the client.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import tempfile
+import zipfile
+from collections.abc import Generator, Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import mujoco
+
+__all__ = [
+    "MODEL_FILE",
+    "actuator_count",
+    "actuator_kind",
+    "check_copy",
+    "control_counts",
+    "control_starts",
+    "copy_options",
+    "export_model",
+    "force_counts",
+    "force_starts",
+    "merge_assets",
+    "mujoco_version",
+    "reset_controls",
+    "set_threads",
+    "thread_limit",
+    "write_model",
+]
+
+Indices = NDArray[np.int32]
+
+MODEL_FILE = "model.xml"
+_ARCHIVE = "model.mjz"  # whose stem names the model in it
+
+
+# Actuators have had several controls and forces each since 3.11; before, `nu` counted both them and their controls.
+
+
+def actuator_count(model: mujoco.MjModel) -> int:
+    """Return how many actuators there are."""
+    return int(getattr(model, "nactuator", model.nu))
+
+
+def control_starts(model: mujoco.MjModel) -> Indices:
+    """Return where each actuator's controls begin in `ctrl`, shape (actuators,)."""
+    return _per_actuator(model, "actuator_ctrladr")
+
+
+def control_counts(model: mujoco.MjModel) -> Indices:
+    """Return how many controls each actuator has, shape (actuators,)."""
+    return _per_actuator(model, "actuator_ctrlnum")
+
+
+def force_starts(model: mujoco.MjModel) -> Indices:
+    """Return where each actuator's forces begin in `actuator_force`, shape (actuators,)."""
+    return _per_actuator(model, "actuator_outadr")
+
+
+def force_counts(model: mujoco.MjModel) -> Indices:
+    """Return how many forces each actuator has, shape (actuators,)."""
+    return _per_actuator(model, "actuator_outnum")
+
+
+def _per_actuator(model: mujoco.MjModel, field: str) -> Indices:
+    one_each = np.arange(model.nu, dtype=np.int32)
+    return getattr(model, field, one_each if field.endswith("adr") else np.ones_like(one_each))
+
+
+def reset_controls(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Set controls to what asks for nothing: zero, but for inputs that are a quaternion, which came with 3.11."""
+    import mujoco  # noqa: PLC0415
+
+    if hasattr(mujoco, "mj_resetCtrl"):
+        mujoco.mj_resetCtrl(model, data)
+    else:
+        data.ctrl[:] = 0.0
+
+
+def actuator_kind(actuator: Any) -> str:
+    """Return the MJCF element that an actuator of an `MjSpec` was written as: `motor`, `position`, `general`, ….
+
+    Until 3.15 MuJoCo forgets that: there a `general` counts as the shortcut with the same kinds of gain and bias.
+    """
+    if hasattr(actuator, "type"):
+        return _constant(actuator.type).lower()
+    dynamics, gain, bias = (_constant(value) for value in (actuator.dyntype, actuator.gaintype, actuator.biastype))
+    if dynamics in ("MUSCLE", "DCMOTOR"):
+        return dynamics.lower()
+    if bias == "AFFINE":
+        servo = "position" if actuator.biasprm[1] else "velocity"
+        return {"INTEGRATOR": "intvelocity", "FILTER": "cylinder"}.get(dynamics, servo)
+    if gain == "AFFINE":
+        return "damper"
+    return "adhesion" if _constant(actuator.trntype) == "BODY" else "motor"
+
+
+def _constant(value: Any) -> str:
+    """Return the last part of an enumeration member: `FIXED` for `mjGAIN_FIXED`."""
+    return str(value.name).partition("_")[2]
+
+
+def thread_limit(processors: int) -> int:
+    """Return how many threads one simulation can have: none before 3.10, whose bindings have no thread pool."""
+    import mujoco  # noqa: PLC0415
+
+    return processors if hasattr(mujoco, "mju_threadpool") else 0
+
+
+def set_threads(data: mujoco.MjData, threads: int) -> None:
+    """Let one simulation use so many threads, at most `thread_limit`."""
+    import mujoco  # noqa: PLC0415
+
+    if hasattr(mujoco, "mju_threadpool"):
+        mujoco.mju_threadpool(data, threads)
+
+
+def write_model(spec: mujoco.MjSpec, folder: Path) -> None:
+    """Write a spec and every file it needs to a folder, as `model.xml` and what is beside it.
+
+    The numbers are those it was read with, before 3.16 those it was compiled to, rounded to six digits.
+
+    Raises:
+        mujoco.FatalError: It must be compiled first: before 3.16 always.
+        ValueError: One of its files is not where this MuJoCo looks; see `check_copy`.
+        OSError: There is no room.
+    """
+    compiler: Any = spec.compiler
+    if _writes_archives(spec):
+        compiler.savecompiled = False
+        # Beside the folder: a confined process can write nowhere else.
+        with _archive(spec, folder.with_name(_ARCHIVE)) as content:
+            content.extractall(folder)
+        return
+    spec.to_xml()  # says whether it can be written, before anything is changed
+    text, files = _written_by_hand(spec)
+    folder.mkdir(parents=True)
+    for name, data in files.items():
+        (folder / name).write_bytes(data)
+    (folder / MODEL_FILE).write_text(text, "utf-8")
+
+
+def export_model(spec: mujoco.MjSpec) -> tuple[str, dict[str, bytes]]:
+    """Return a compiled spec as MJCF, and the content of the files that it names, by their names there."""
+    if not _writes_archives(spec):
+        return _written_by_hand(spec.copy())
+    with tempfile.TemporaryDirectory() as folder, _archive(spec, Path(folder, _ARCHIVE)) as content:
+        files = {name: content.read(name) for name in content.namelist() if not name.endswith("/")}
+    return files.pop(MODEL_FILE).decode(), files
+
+
+def _writes_archives(spec: mujoco.MjSpec) -> bool:
+    """Whether MuJoCo writes a spec with its files: before 3.16 it names those in folders of their own wrongly."""
+    return hasattr(spec.compiler, "savecompiled")
+
+
+@contextlib.contextmanager
+def _archive(spec: mujoco.MjSpec, path: Path) -> Generator[zipfile.ZipFile]:
+    spec.encode(str(path))
+    try:
+        content = zipfile.ZipFile(path)
+    except zipfile.BadZipFile:  # MuJoCo does not notice when it cannot write all of it
+        raise OSError(errno.ENOSPC, "MuJoCo could not write all of it; is the disk full?", str(path)) from None
+    with content:
+        yield content
+    path.unlink()
+
+
+def _written_by_hand(spec: mujoco.MjSpec) -> tuple[str, dict[str, bytes]]:
+    """Give a spec's files names that no other file has, and return what the archive would hold."""
+    files: dict[str, bytes] = {}
+    compilers: list[Any] = [spec.compiler]  # and those of attached models
+
+    def renamed(file: str, directory: str) -> str:
+        data = spec.assets.get(file)
+        if data is None:
+            try:
+                data = Path(spec.modelfiledir, directory, file).read_bytes()
+            except OSError:
+                raise _unwritable() from None
+        digest = hashlib.sha256(data).hexdigest()[:16]
+        name = Path(file).name
+        name = name if name.startswith(digest) else f"{digest}-{name}"
+        files[name] = data
+        return name
+
+    for asset in (*spec.meshes, *spec.hfields, *spec.skins):
+        if asset.file:
+            asset.file = renamed(asset.file, asset.compiler.meshdir)
+            compilers.append(asset.compiler)
+    for texture in spec.textures:
+        directory = texture.compiler.texturedir
+        if texture.file:
+            texture.file = renamed(texture.file, directory)
+        texture.cubefiles = [renamed(file, directory) if file else "" for file in texture.cubefiles]
+        compilers.append(texture.compiler)
+    for compiler in compilers:
+        compiler.meshdir = compiler.texturedir = ""
+    spec.assets = {**spec.assets, **files}
+    return spec.to_xml(), files
+
+
+def check_copy(original: mujoco.MjModel, copy: mujoco.MjModel) -> None:
+    """Refuse what `write_model` writes wrongly: before 3.16 an attached model with files in a folder of its own.
+
+    Raises:
+        ValueError: It has other meshes, textures or height fields than the model it was made from.
+    """
+    for name in ("mesh_vert", "tex_data", "hfield_data", "skin_vert"):
+        ours, theirs = getattr(copy, name), getattr(original, name)
+        if ours.shape != theirs.shape or not np.allclose(ours, theirs, atol=1e-4):
+            raise _unwritable()
+
+
+def _unwritable() -> ValueError:
+    return ValueError(
+        f"MuJoCo {mujoco_version()} cannot write a model whose attached parts have files in folders of their own. "
+        "Put the files beside the model, or use MuJoCo 3.16 or later."
+    )
+
+
+def mujoco_version() -> str:
+    """Return the release in use."""
+    import mujoco  # noqa: PLC0415
+
+    return mujoco.mj_versionString()
+
+
+def copy_options(options: mujoco.MjOption, model: mujoco.MjModel) -> None:
+    """Give a model all options of another one; before 3.10 they are copied one by one."""
+    for name in dir(options):
+        value = getattr(options, name)
+        if not name.startswith("_") and not callable(value):
+            setattr(model.opt, name, value)
+
+
+def merge_assets(spec: mujoco.MjSpec, folders: Iterable[Path]) -> None:
+    """Let instances of one robot share its meshes and textures; before 3.17 each has its own, at the cost of memory.
+
+    Args:
+        spec: What the robots were attached to.
+        folders: What `write_model` wrote of them.
+    """
+    if hasattr(spec, "dedup_assets"):
+        spec.dedup_assets()
+    if not _writes_archives(spec):
+        files = [file for folder in folders for file in folder.iterdir() if file.name != MODEL_FILE]
+        spec.assets = {file.name: file.read_bytes() for file in files}

@@ -1,0 +1,1 @@
+"""What arrives without being asked for: published states, pictures and events, on their way to streams."""

@@ -1,0 +1,1 @@
+"""The client's copy of the model: loading it, its elements by name, and each articulation's mirrored state."""

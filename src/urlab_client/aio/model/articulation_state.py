@@ -1,0 +1,311 @@
+"""State of entities and articulations as last received, and what waits to be sent.
+
+The client writes records, the wrappers that users hold read them: a wrapper goes on working when `discover()` binds
+its record to a new model.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from urlab_client.aio.model.layout import ArticulationLayout
+from urlab_client.aio.model.mirror import Mirror
+from urlab_client.protocol.base import Floats
+from urlab_client.protocol.enums import ControlMode
+from urlab_client.protocol.errors import ProtocolError
+from urlab_client.protocol.messages.session import (
+    ArticulationCommand,
+    ArticulationInfo,
+    ArticulationState,
+    BodyPose,
+    ControllerInfo,
+    EntityInfo,
+    EntityState,
+    TwistState,
+)
+
+__all__ = ["Carried", "MirroredArticulation", "MirroredEntity", "Wrenches", "give_back"]
+
+Wrenches = dict[str, list[float]]
+"""(fx, fy, fz, tx, ty, tz) by body."""
+
+
+class MirroredEntity:
+    """State of one dynamic body.
+
+    Attributes:
+        mirror: The client's local model and data.
+        name: Key in `client.entities`.
+        body_id: Global MuJoCo id of the (root) body; -1 if unknown.
+        free_joint: Compiled name of the free joint, or None.
+        has_free_base: True when the (root) body has a free joint.
+        qpos_offset: Start of the free joint in `mjData.qpos`, or None.
+        qvel_offset: Start of the free joint in `mjData.qvel`, or None.
+        pose: Newest state of a plain entity.
+        wrenches: What the next step is to carry.
+    """
+
+    def __init__(self, mirror: Mirror, name: str) -> None:
+        self.mirror = mirror
+        self.name = name
+        self.body_id = -1
+        self.free_joint: str | None = None
+        self.has_free_base = False
+        self.qpos_offset: int | None = None
+        self.qvel_offset: int | None = None
+        self.pose: EntityState | None = None
+        self.wrenches: Wrenches = {}
+
+    def bind_entity(self, info: EntityInfo) -> None:
+        """Take over what a handshake says."""
+        self.body_id = info.id
+        self.has_free_base = info.has_free_base
+        self.free_joint = info.free_joint
+        self.qpos_offset = info.qpos_offset
+        self.qvel_offset = info.qvel_offset
+        self.pose = None
+
+    def check_pose(self, state: EntityState, op: str) -> None:
+        """Refuse a state whose arrays have other lengths than a pose and a velocity.
+
+        Raises:
+            ProtocolError: An array has the wrong length.
+        """
+        for what, array, expected in (("qpos", state.qpos, 7), ("qvel", state.qvel, 6)):
+            if array is not None and len(array) != expected:
+                raise ProtocolError(
+                    f"{op}: {what} of entity {self.name!r} has {len(array)} values, not {expected}.", op=op
+                )
+
+    def absorb_pose(self, state: EntityState, *, into_mirror: bool) -> None:
+        """Take over a checked state, here and where asked for in the mirror. Call under the mirror's lock."""
+        self.pose = state
+        data = self.mirror.data
+        if not into_mirror or data is None or self.qpos_offset is None or self.qvel_offset is None:
+            return
+        if state.qpos is not None and state.qvel is not None:
+            data.qpos[self.qpos_offset : self.qpos_offset + 7] = state.qpos
+            data.qvel[self.qvel_offset : self.qvel_offset + 6] = state.qvel
+
+    def root_qpos(self) -> Floats | None:
+        """Free-joint position, shape (7,), or None without a free base."""
+        data = self.mirror.data
+        if data is not None and self.qpos_offset is not None:
+            return data.qpos[self.qpos_offset : self.qpos_offset + 7].copy()
+        return None if self.pose is None else self.pose.qpos
+
+    def root_qvel(self) -> Floats | None:
+        """Free-joint velocity, shape (6,), or None without a free base."""
+        data = self.mirror.data
+        if data is not None and self.qvel_offset is not None:
+            return data.qvel[self.qvel_offset : self.qvel_offset + 6].copy()
+        return None if self.pose is None else self.pose.qvel
+
+    def wrench_command(self, wrenches: Wrenches) -> ArticulationCommand:
+        """Return what makes a direct step carry the wrenches alone."""
+        return ArticulationCommand(xfrc_applied=wrenches)
+
+    def apply_wrench(self, body: str, wrench: list[float]) -> None:
+        """Buffer a wrench for the next step, in place of an earlier one on the same body. From any thread."""
+        with self.mirror.lock:
+            self.wrenches[body] = wrench
+
+    def take_wrenches(self) -> Wrenches:
+        """Return the wrenches for the step that is being built, and leave the buffer empty."""
+        with self.mirror.lock:
+            taken, self.wrenches = self.wrenches, {}
+        return taken
+
+
+class MirroredArticulation(MirroredEntity):
+    """State of one articulation.
+
+    Arrays that come from a reply are replaced, never written: whoever holds one may keep it.
+
+    Attributes:
+        layout: Where its values live in the compiled model.
+        info: The handshake's description.
+        controller: The handshake's controller block, kept current.
+        control_mode: Whether the controller is in force.
+        ctrl: Set-points that the next step sends, shape (n_ctrl,); written in place by users.
+        qpos: Joint positions.
+        qvel: Joint velocities.
+        applied: `mjData.ctrl` as the server applied it.
+        act: First activation per actuator.
+        force: Actuator forces, at level `full`.
+        sensors: Readings by short name.
+        bodies: Poses by short name, at level `full`.
+        twist: Commanded twist.
+        actions: Bit field of pressed action keys.
+    """
+
+    info: ArticulationInfo
+    layout: ArticulationLayout
+
+    def __init__(self, mirror: Mirror, info: ArticulationInfo, layout: ArticulationLayout) -> None:
+        super().__init__(mirror, info.prefix)
+        self.controller: ControllerInfo | None = None
+        self.control_mode = ControlMode.RAW
+        self.ctrl: Floats = np.zeros(0)
+        self._written_ctrl: Floats = np.zeros(0)
+        self.bind(info, layout)
+
+    def bind(self, info: ArticulationInfo, layout: ArticulationLayout) -> None:
+        """Take over what a handshake says; set-points and control mode are kept when they still fit."""
+        n_ctrl = len(info.actuator_types) if self.mirror.model is None else len(layout.ctrl_adr)
+        self.info, self.layout = info, layout
+        self._sensor_names = [*layout.sensor_dims]
+        self._sensor_dims = [*layout.sensor_dims.values()]
+        if len(self.ctrl) != n_ctrl:
+            self.ctrl = np.zeros(n_ctrl)
+            self._written_ctrl = np.zeros(n_ctrl)
+        self._bind_controller(info.controller)
+        self._bind_root()
+        data = self.mirror.data
+        self.qpos: Floats = np.zeros(0) if data is None else data.qpos[layout.qpos_adr]
+        self.qvel: Floats = np.zeros(0) if data is None else data.qvel[layout.qvel_adr]
+        self.applied: Floats = np.zeros(n_ctrl)
+        self.act: Floats = np.zeros(n_ctrl)
+        self.force: Floats | None = None
+        self.sensors: dict[str, list[float]] = {}
+        self.bodies: dict[str, BodyPose] | None = None
+        self.twist: TwistState | None = None
+        self.actions = 0
+
+    def _bind_controller(self, info: ControllerInfo | None) -> None:
+        before = self.controller
+        if before is not None and info is not None and before.kind == info.kind:
+            # In place, so that views a user holds stay current.
+            for kept, fresh in ((before.params, info.params), (before.schema, info.schema)):
+                kept.clear()
+                kept.update(fresh)
+            return
+        self.controller = info
+        self.control_mode = ControlMode.RAW if info is None else ControlMode.UE_CONTROLLER
+
+    def _bind_root(self) -> None:
+        model, layout = self.mirror.model, self.layout
+        self.body_id = layout.root_body
+        self.has_free_base = layout.free_joint >= 0
+        self.free_joint = self.qpos_offset = self.qvel_offset = None
+        if model is not None and self.has_free_base:
+            name = next(name for name, i in layout.joints.items() if i == layout.free_joint)
+            self.free_joint = f"{self.name}_{name}"
+            self.qpos_offset = int(model.jnt_qposadr[layout.free_joint])
+            self.qvel_offset = int(model.jnt_dofadr[layout.free_joint])
+
+    def root_qpos(self) -> Floats | None:
+        """See `MirroredEntity.root_qpos`; the free joint is the articulation's first."""
+        return self.qpos[:7].copy() if self.has_free_base else None
+
+    def root_qvel(self) -> Floats | None:
+        """See `MirroredEntity.root_qvel`."""
+        return self.qvel[:6].copy() if self.has_free_base else None
+
+    def check(self, state: ArticulationState, op: str) -> None:
+        """Refuse a state whose arrays do not fit the model, before anything of the reply is taken over.
+
+        Raises:
+            ProtocolError: An array has the wrong length.
+        """
+        if self.mirror.model is None:
+            return
+        layout = self.layout
+        n_ctrl = len(layout.ctrl_adr)
+        self._fits(op, "qpos", state.qpos, len(layout.qpos_adr))
+        self._fits(op, "qvel", state.qvel, len(layout.qvel_adr))
+        self._fits(op, "ctrl", state.ctrl, n_ctrl)
+        self._fits(op, "act", state.act, n_ctrl)
+        self._fits(op, "actuator_force", state.actuator_force, layout.n_out)
+        sensors = state.sensors
+        # Every reply has these: two comparisons of lists, and a look at each sensor only where they differ.
+        if sensors and ([*sensors] != self._sensor_names or [*map(len, sensors.values())] != self._sensor_dims):
+            for name, reading in sensors.items():
+                self._fits(op, f"sensor {name!r}", reading, layout.sensor_dims.get(name, len(reading)))
+
+    def check_written(self, qpos: Floats) -> None:
+        """Refuse positions that `set_qpos` cannot have written.
+
+        Raises:
+            ProtocolError: They are neither all of the articulation's positions nor those of its free base.
+        """
+        if self.mirror.model is not None and not (self.has_free_base and len(qpos) == 7):
+            self._fits("set_qpos", "qpos", qpos, len(self.layout.qpos_adr))
+
+    def _fits(self, op: str, what: str, array: Floats | list[float] | None, expected: int) -> None:
+        if array is not None and len(array) != expected:
+            raise ProtocolError(
+                f"{op}: {what} of articulation {self.name!r} has {len(array)} values, its model has {expected}.",
+                op=op,
+                hint="The model changed on the server: call discover().",
+            )
+
+    def absorb(self, state: ArticulationState) -> None:
+        """Take over a checked state. Call under the mirror's lock."""
+        self.qpos, self.qvel = state.qpos, state.qvel
+        self.force, self.bodies = state.actuator_force, state.bodies
+        if state.ctrl is not None:
+            self.applied = state.ctrl
+        if state.act is not None:
+            self.act = state.act
+        if state.sensors is not None:
+            self.sensors = state.sensors
+        if state.twist is not None:
+            self.twist = state.twist
+        if state.actions is not None:
+            self.actions = state.actions
+
+    def write_mirror(self, state: ArticulationState) -> None:
+        """Write a checked state into the mirror's data. Call under the mirror's lock."""
+        data, layout = self.mirror.data, self.layout
+        if data is None:
+            return
+        data.qpos[layout.qpos_adr] = state.qpos
+        data.qvel[layout.qvel_adr] = state.qvel
+        if state.ctrl is not None:
+            data.ctrl[layout.ctrl_adr] = state.ctrl
+        if state.act is not None and len(layout.act_adr):
+            data.act[layout.act_adr] = state.act[layout.act_from]
+
+    def write_set_points(self) -> None:
+        """Write set-points that changed since the last time into the mirror's `ctrl`, for a puppet step.
+
+        Those that did not change are left alone: in puppet mode `client.data.ctrl` is the user's to write.
+        """
+        data = self.mirror.data
+        if data is not None and not np.array_equal(self.ctrl, self._written_ctrl):
+            data.ctrl[self.layout.ctrl_adr] = self.ctrl
+            self._written_ctrl = self.ctrl.copy()
+
+    def live_command(self) -> ArticulationCommand:
+        """Return what a live step tells the articulation: the server ignores anything but `ctrl`."""
+        return ArticulationCommand(ctrl=self.ctrl.tolist())
+
+    def direct_command(self, wrenches: Wrenches | None) -> ArticulationCommand:
+        """Return what a direct step that carries these wrenches tells the articulation."""
+        bypass = self.controller is not None and self.control_mode is ControlMode.RAW
+        return ArticulationCommand(
+            ctrl=self.ctrl.tolist(),
+            control_mode=str(ControlMode.RAW) if bypass else None,
+            xfrc_applied=wrenches,
+        )
+
+    def body_pose(self, name: str, body_id: int) -> tuple[Floats, Floats] | None:
+        """World position and orientation (w, x, y, z): as received at level `full`, else from the mirror, or None."""
+        with self.mirror.lock:
+            if self.bodies is not None and name in self.bodies:
+                received = self.bodies[name]
+                return np.array(received.xpos), np.array(received.xquat)
+            pair = self.mirror.derived()
+            return None if pair is None else (pair[1].xpos[body_id].copy(), pair[1].xquat[body_id].copy())
+
+
+Carried = dict[MirroredEntity, Wrenches]
+"""The wrenches that a step carries, by what they were applied to."""
+
+
+def give_back(carried: Carried) -> None:
+    """Buffer wrenches again whose step was not executed, where nothing newer was applied."""
+    for record, wrenches in carried.items():
+        with record.mirror.lock:
+            record.wrenches = {**wrenches, **record.wrenches}

@@ -1,0 +1,140 @@
+"""Compiling the model of a server that is not trusted, in a child process with limits.
+
+For the mirror. MuJoCo's compiler takes all the memory and time that a model asks for, cannot be broken off, reads the
+files that the model names, and is written in C++: so it runs where it may fail.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from urlab_client._children import APART
+from urlab_client._confined import limit_process
+from urlab_client._landlock import confine_files
+from urlab_client._mjcf_files import NamedFiles, named_files
+
+__all__ = ["compile_confined"]
+
+log = logging.getLogger("urlab_client.mirror")
+
+_MEMORY_BYTES: Final = 2 * 2**30
+_CPU_S: Final = 30
+_WALL_S: Final = 60
+_MAX_COMBINATIONS: Final = 100_000
+_DONE: Final = b"+"
+_REFUSED: Final = b"-"
+
+
+class _CompileJob(msgspec.Struct):
+    """What the child reads from its standard input."""
+
+    xml: str
+    assets: Mapping[str, bytes]
+    memory_bytes: int
+    cpu_s: int
+
+
+def compile_confined(xml: str, assets: Mapping[str, bytes]) -> bytes:
+    """Return an MJCF as a binary model; blocking, in bounded time.
+
+    Args:
+        xml: The model.
+        assets: Its files, by name. It may name no others that exist.
+
+    Raises:
+        ValueError: What is wrong with it, or which limit it exceeds.
+    """
+    order = msgspec.msgpack.encode(_CompileJob(xml, assets, _MEMORY_BYTES, _CPU_S))
+    try:
+        with tempfile.TemporaryDirectory(prefix="urlab-", ignore_cleanup_errors=True) as folder:
+            command = [sys.executable, "-m", __name__, folder]
+            done = subprocess.run(  # noqa: S603
+                command, input=order, capture_output=True, timeout=_WALL_S, check=False, **APART
+            )
+    except subprocess.TimeoutExpired:
+        raise ValueError(f"compiling it took more than {_WALL_S} s") from None
+    except OSError as error:
+        raise ValueError(f"no process can be started to compile it: {error}") from error
+    if done.returncode == 0 and done.stdout.startswith(_DONE):
+        return done.stdout[1:]
+    if done.returncode == 0 and done.stdout.startswith(_REFUSED):
+        raise ValueError(done.stdout[1:].decode(errors="replace"))
+    log.debug("the compiling process ended with %d: %s", done.returncode, done.stderr.decode(errors="replace"))
+    if sys.platform != "win32" and done.returncode == -signal.SIGXCPU:
+        raise ValueError(f"compiling it took more than {_CPU_S} s of processor time")
+    raise ValueError(f"MuJoCo failed on it, or compiling it needs more than {_MEMORY_BYTES >> 20} MiB")
+
+
+# The child.
+
+
+def _main(folder: str) -> None:
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what libraries print is no answer
+    order = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=_CompileJob)
+    try:
+        answer = _DONE + _compile(order, folder)
+    except MemoryError:
+        answer = _REFUSED + b"compiling it needs more than %d MiB" % (order.memory_bytes >> 20)
+    except Exception as error:  # noqa: BLE001 - whatever it was, the client must hear of it
+        answer = _REFUSED + " ".join(str(error).split()).encode()
+    answers.write(answer)
+    answers.flush()
+
+
+def _compile(order: _CompileJob, folder: str) -> bytes:
+    import mujoco  # noqa: PLC0415
+    import numpy as np  # noqa: PLC0415
+
+    os.chdir(folder)  # where there is nothing to find, and MuJoCo's log goes with it
+    limit_process(order.memory_bytes, order.cpu_s)
+    confine_files(readable=(), writable=(Path(folder),))
+    _refuse_local_files(order.xml, order.assets)
+    compiled = mujoco.MjModel.from_xml_string(order.xml, dict(order.assets))
+    mujoco.mj_forward(compiled, mujoco.MjData(compiled))  # which the client does first, and could go on for ever
+    buffer = np.zeros(mujoco.mj_sizeModel(compiled), dtype=np.uint8)
+    mujoco.mj_saveModel(compiled, None, buffer)
+    return buffer.tobytes()
+
+
+def _refuse_local_files(xml: str, assets: Mapping[str, bytes]) -> None:
+    """Refuse a model that names what is on this machine: MuJoCo looks there, too."""
+    named = _named_by_all(xml, assets)
+    names = named.documents | named.data
+    names |= {_last_part(name) for name in names}
+    if len(names) * (len(named.folders) + 1) > _MAX_COMBINATIONS:
+        raise ValueError("it names too many files")
+    for path in {os.path.join(folder, name) for folder in ("", *named.folders) for name in names}:
+        if os.path.lexists(path) and not os.path.isdir(path):
+            raise ValueError(f"it names {path}, a file of this machine")
+
+
+def _named_by_all(xml: str, assets: Mapping[str, bytes]) -> NamedFiles:
+    """Return what the model names, and what those of its files name that MuJoCo may take for documents."""
+    named = named_files(xml.encode())
+    unread = dict(assets)
+    while found := [name for name in unread if _last_part(name) in set(map(_last_part, named.documents))]:
+        for name in found:
+            try:
+                named |= named_files(unread.pop(name))
+            except ValueError as error:
+                raise ValueError(f"it names {name}; {error}") from None
+    return named
+
+
+def _last_part(name: str) -> str:
+    return name.rpartition("/")[2]
+
+
+if __name__ == "__main__":
+    _main(sys.argv[1])

@@ -1,0 +1,316 @@
+"""Handles on the parts of an articulation: plain local objects, the same in both flavours of the client."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+
+from urlab_client._mujoco import control_counts, control_starts, force_counts
+from urlab_client.aio.model.articulation_state import MirroredArticulation
+from urlab_client.aio.model.layout import QPOS_WIDTH, QVEL_WIDTH
+from urlab_client.protocol.base import Floats
+from urlab_client.protocol.enums import ActuatorType, known
+from urlab_client.protocol.names import NameMap
+
+if TYPE_CHECKING:
+    import mujoco
+
+__all__ = ["Actuator", "ArticulationElements", "Body", "Joint", "Sensor", "make_elements"]
+
+_JOINT_TRANSMISSIONS = (0, 1)  # mjTRN_JOINT, mjTRN_JOINTINPARENT
+
+
+class Actuator:
+    """One actuator of an articulation.
+
+    Attributes:
+        name: Short name, without the articulation's prefix.
+        id: Global MuJoCo actuator id.
+        type: Authored kind; a plain string when the server names one this client does not know; None if unknown.
+        joint: Short name of the driven joint, or None for other transmissions.
+        ctrlrange: (low, high) of the control, or None if unlimited.
+        forcerange: (low, high) of the force, or None if unlimited.
+        kp: `gainprm[0]`, or None without a local model.
+        kv: `gainprm[1]`, or None without a local model.
+        ctrl_local: Slice of the articulation's `ctrl_array` that holds its inputs; length 1 for ordinary actuators.
+    """
+
+    __slots__ = (
+        "_first_out",
+        "_record",
+        "ctrl_local",
+        "ctrlrange",
+        "forcerange",
+        "id",
+        "joint",
+        "kp",
+        "kv",
+        "name",
+        "type",
+    )
+
+    def __init__(
+        self,
+        record: MirroredArticulation,
+        *,
+        name: str,
+        id: int,  # noqa: A002
+        type: ActuatorType | str | None,  # noqa: A002
+        ctrl_local: slice,
+        first_out: int,
+        joint: str | None = None,
+        ctrlrange: tuple[float, float] | None = None,
+        forcerange: tuple[float, float] | None = None,
+        kp: float | None = None,
+        kv: float | None = None,
+    ) -> None:
+        self._record = record
+        self.name = name
+        self.id = id
+        self.type = type
+        self.ctrl_local = ctrl_local
+        self._first_out = first_out
+        self.joint = joint
+        self.ctrlrange = ctrlrange
+        self.forcerange = forcerange
+        self.kp = kp
+        self.kv = kv
+
+    @property
+    def force(self) -> float | None:
+        """Force in N or N m from the last reply: the first output, of an actuator that has several.
+
+        None below observation level `full`, and when it cannot be told without a local model which output is whose.
+        """
+        force = self._record.force
+        if force is None or (self.id < 0 and len(force) != len(self._record.ctrl)):
+            return None
+        return float(force[self._first_out])
+
+    @property
+    def value(self) -> float:
+        """The set-point (its first input), as the next step will send it."""
+        return float(self._record.ctrl[self.ctrl_local.start])
+
+    def set_control(self, v: float | Sequence[float]) -> None:
+        """Set the set-point that the next step sends; a sequence for actuators with several inputs."""
+        self._record.ctrl[self.ctrl_local] = v
+
+    def __repr__(self) -> str:
+        return f"<Actuator {self.name!r} id={self.id}>"
+
+
+class Joint:
+    """One joint of an articulation.
+
+    Attributes:
+        name: Short name, without the articulation's prefix.
+        id: Global MuJoCo joint id.
+        jnt_type: 0 free, 1 ball, 2 slide, 3 hinge.
+        qpos_offset: Start in `client.data.qpos`.
+        qpos_local_offset: Start in the articulation's `qpos_array`.
+        qvel_offset: Start in `client.data.qvel`.
+        qvel_local_offset: Start in the articulation's `qvel_array`.
+        range: (low, high) in radians or metres, or None if unlimited.
+    """
+
+    __slots__ = (
+        "id",
+        "jnt_type",
+        "name",
+        "qpos_local_offset",
+        "qpos_offset",
+        "qvel_local_offset",
+        "qvel_offset",
+        "range",
+    )
+
+    def __init__(
+        self,
+        *,
+        name: str,
+        id: int,  # noqa: A002
+        jnt_type: int,
+        qpos_offset: int,
+        qpos_local_offset: int,
+        qvel_offset: int,
+        qvel_local_offset: int,
+        range: tuple[float, float] | None,  # noqa: A002
+    ) -> None:
+        self.name = name
+        self.id = id
+        self.jnt_type = jnt_type
+        self.qpos_offset = qpos_offset
+        self.qpos_local_offset = qpos_local_offset
+        self.qvel_offset = qvel_offset
+        self.qvel_local_offset = qvel_local_offset
+        self.range = range
+
+    def __repr__(self) -> str:
+        return f"<Joint {self.name!r} id={self.id}>"
+
+
+class Sensor:
+    """One sensor of an articulation.
+
+    Attributes:
+        name: Short name, without the articulation's prefix.
+        id: Global MuJoCo sensor id; -1 without a local model.
+        dim: Length of its reading.
+    """
+
+    __slots__ = ("_record", "dim", "id", "name")
+
+    def __init__(self, record: MirroredArticulation, *, name: str, id: int, dim: int) -> None:  # noqa: A002
+        self._record = record
+        self.name = name
+        self.id = id
+        self.dim = dim
+
+    @property
+    def latest(self) -> Floats | None:
+        """Reading of the last reply, shape (dim,), in the sensor's own units and frame; a fresh array; or None."""
+        reading = self._record.sensors.get(self.name)
+        return None if reading is None else np.asarray(reading, dtype=np.float64)
+
+    def __repr__(self) -> str:
+        return f"<Sensor {self.name!r} id={self.id} dim={self.dim}>"
+
+
+class Body:
+    """One body of an articulation.
+
+    Attributes:
+        name: Short name, without the articulation's prefix.
+        id: Global MuJoCo body id.
+    """
+
+    __slots__ = ("_record", "id", "name")
+
+    def __init__(self, record: MirroredArticulation, *, name: str, id: int) -> None:  # noqa: A002
+        self._record = record
+        self.name = name
+        self.id = id
+
+    @property
+    def xpos(self) -> Floats | None:
+        """World position, shape (3,), metres; a fresh array; None without a local model below level `full`."""
+        pose = self._record.body_pose(self.name, self.id)
+        return None if pose is None else pose[0]
+
+    @property
+    def xquat(self) -> Floats | None:
+        """World orientation (w, x, y, z), shape (4,); a fresh array; None without a local model below level `full`."""
+        pose = self._record.body_pose(self.name, self.id)
+        return None if pose is None else pose[1]
+
+    def __repr__(self) -> str:
+        return f"<Body {self.name!r} id={self.id}>"
+
+
+@dataclass(frozen=True, slots=True)
+class ArticulationElements:
+    """All handles of one articulation, made from one model."""
+
+    joints: NameMap[Joint]
+    actuators: NameMap[Actuator]
+    sensors: NameMap[Sensor]
+    bodies: NameMap[Body]
+
+
+def make_elements(record: MirroredArticulation) -> ArticulationElements:
+    """Make the handles of an articulation; without a local model only its actuators are known, by name and type."""
+    model, layout, original = record.mirror.model, record.layout, record.info.original_names
+    prefix = record.name
+    return ArticulationElements(
+        joints=_named(prefix, "joint", _joints(record, model), original.joints),
+        actuators=_named(prefix, "actuator", _actuators(record, model), original.actuators),
+        sensors=_named(prefix, "sensor", _sensors(record, model), original.sensors),
+        bodies=_named(
+            prefix, "body", [Body(record, name=name, id=i) for name, i in layout.bodies.items()], original.bodies
+        ),
+    )
+
+
+H = TypeVar("H", Actuator, Joint, Sensor, Body)
+
+
+def _named(prefix: str, kind: str, items: Sequence[H], original: Mapping[str, str]) -> NameMap[H]:
+    by_name = {item.name: item for item in items}
+    aliases = {f"{prefix}_{name}": [name] for name in by_name}
+    for live, authored in original.items():
+        if live in by_name:
+            aliases.setdefault(authored, []).append(live)
+    return NameMap(by_name, aliases, kind=f"{kind} of {prefix}")
+
+
+def _joints(record: MirroredArticulation, model: mujoco.MjModel | None) -> list[Joint]:
+    if model is None:
+        return []
+    joints: list[Joint] = []
+    qpos_local = qvel_local = 0
+    for name, i in record.layout.joints.items():
+        kind = int(model.jnt_type[i])
+        joints.append(
+            Joint(
+                name=name,
+                id=i,
+                jnt_type=kind,
+                qpos_offset=int(model.jnt_qposadr[i]),
+                qpos_local_offset=qpos_local,
+                qvel_offset=int(model.jnt_dofadr[i]),
+                qvel_local_offset=qvel_local,
+                range=_interval(model.jnt_range[i]) if model.jnt_limited[i] else None,
+            )
+        )
+        qpos_local += int(QPOS_WIDTH[kind])
+        qvel_local += int(QVEL_WIDTH[kind])
+    return joints
+
+
+def _actuators(record: MirroredArticulation, model: mujoco.MjModel | None) -> list[Actuator]:
+    types = record.info.actuator_types
+    if model is None:
+        return [
+            Actuator(record, name=name, id=-1, type=known(ActuatorType, kind), ctrl_local=slice(i, i + 1), first_out=i)
+            for i, (name, kind) in enumerate(types.items())
+        ]
+    joint_of = {joint_id: name for name, joint_id in record.layout.joints.items()}
+    actuators: list[Actuator] = []
+    start = first_out = 0
+    controls, starts, forces = control_counts(model), control_starts(model), force_counts(model)
+    for name, i in record.layout.actuators.items():
+        kind = types.get(name)
+        driven = int(model.actuator_trnid[i][0]) if model.actuator_trntype[i] in _JOINT_TRANSMISSIONS else -1
+        width, first = int(controls[i]), int(starts[i])
+        actuators.append(
+            Actuator(
+                record,
+                name=name,
+                id=i,
+                type=None if kind is None else known(ActuatorType, kind),
+                ctrl_local=slice(start, start + width),
+                first_out=first_out,
+                joint=joint_of.get(driven),
+                ctrlrange=_interval(model.actuator_ctrlrange[first]) if model.actuator_ctrllimited[first] else None,
+                forcerange=_interval(model.actuator_forcerange[i]) if model.actuator_forcelimited[i] else None,
+                kp=float(model.actuator_gainprm[i][0]),
+                kv=float(model.actuator_gainprm[i][1]),
+            )
+        )
+        start += width
+        first_out += int(forces[i])
+    return actuators
+
+
+def _sensors(record: MirroredArticulation, model: mujoco.MjModel | None) -> list[Sensor]:
+    if model is None:
+        return []
+    return [Sensor(record, name=name, id=i, dim=int(model.sensor_dim[i])) for name, i in record.layout.sensors.items()]
+
+
+def _interval(bounds: Floats) -> tuple[float, float]:
+    return float(bounds[0]), float(bounds[1])

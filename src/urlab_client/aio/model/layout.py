@@ -1,0 +1,118 @@
+"""Where the values of one articulation or entity live: in the compiled model and in the wire's positional arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from urlab_client._mujoco import control_counts, control_starts, force_counts
+from urlab_client.aio.model.mirror import model_names
+from urlab_client.protocol.names import split_prefix
+
+if TYPE_CHECKING:
+    import mujoco
+
+__all__ = ["FREE", "QPOS_WIDTH", "QVEL_WIDTH", "ArticulationLayout", "articulation_layouts"]
+
+FREE = 0  # mjJNT_FREE
+QPOS_WIDTH = np.array([7, 4, 1, 1])  # by mjtJoint: free, ball, slide, hinge
+QVEL_WIDTH = np.array([6, 3, 1, 1])
+
+Ints = NDArray[np.intp]
+_EMPTY: Ints = np.zeros(0, dtype=np.intp)
+
+
+@dataclass(frozen=True, slots=True)
+class ArticulationLayout:
+    """Elements of one articulation, in ascending id, and the addresses that gather and scatter its values.
+
+    Attributes:
+        joints: Short joint name to id; likewise `actuators`, `sensors` and `bodies`.
+        qpos_adr: Addresses of all its coordinates in `mjData.qpos`, in the order of the wire's `qpos`.
+        qvel_adr: Addresses of all its velocities in `mjData.qvel`.
+        sensor_dims: Length of each sensor's reading, by short name.
+        ctrl_adr: Addresses of all its controls in `mjData.ctrl`; an actuator may have several.
+        n_out: Number of all its actuators' outputs; an actuator may have several.
+        act_from: Positions in the wire's `act` that have an activation, `act_adr` their addresses in `mjData.act`.
+        root_body: Id of its root body, -1 without a model.
+        free_joint: Id of the root's free joint, -1 if it has none. It is the first of `joints`.
+    """
+
+    joints: dict[str, int] = field(default_factory=dict[str, int])
+    actuators: dict[str, int] = field(default_factory=dict[str, int])
+    sensors: dict[str, int] = field(default_factory=dict[str, int])
+    bodies: dict[str, int] = field(default_factory=dict[str, int])
+    sensor_dims: dict[str, int] = field(default_factory=dict[str, int])
+    qpos_adr: Ints = field(default_factory=_EMPTY.copy)
+    qvel_adr: Ints = field(default_factory=_EMPTY.copy)
+    ctrl_adr: Ints = field(default_factory=_EMPTY.copy)
+    act_from: Ints = field(default_factory=_EMPTY.copy)
+    act_adr: Ints = field(default_factory=_EMPTY.copy)
+    n_out: int = 0
+    root_body: int = -1
+    free_joint: int = -1
+
+
+def articulation_layouts(model: mujoco.MjModel, keys: list[str]) -> dict[str, ArticulationLayout]:
+    """Return the layout of each articulation; an element belongs to the longest key that prefixes its name."""
+    bodies = _by_owner(model, "body", keys)
+    joints = _by_owner(model, "joint", keys)
+    actuators = _by_owner(model, "actuator", keys)
+    sensors = _by_owner(model, "sensor", keys)
+    return {key: _layout(model, bodies[key], joints[key], actuators[key], sensors[key]) for key in keys}
+
+
+def _by_owner(model: mujoco.MjModel, kind: str, keys: list[str]) -> dict[str, dict[str, int]]:
+    found: dict[str, dict[str, int]] = {key: {} for key in keys}
+    names = model_names(model, kind)
+    for i, (owner, short) in enumerate(split_prefix(names, keys)):
+        if owner is not None:
+            found[owner][short] = i
+    return found
+
+
+def _layout(
+    model: mujoco.MjModel,
+    bodies: dict[str, int],
+    joints: dict[str, int],
+    actuators: dict[str, int],
+    sensors: dict[str, int],
+) -> ArticulationLayout:
+    joint_ids = np.fromiter(joints.values(), dtype=np.intp)
+    kinds = model.jnt_type[joint_ids]
+    actuator_ids = np.fromiter(actuators.values(), dtype=np.intp)
+    counts = control_counts(model)[actuator_ids]
+    ctrl_adr = _ranges(control_starts(model)[actuator_ids], counts)
+    act_adr = np.repeat(model.actuator_actadr[actuator_ids], counts).astype(np.intp)
+    act_from = np.flatnonzero(act_adr >= 0)
+    root = min(bodies.values(), default=-1)
+    free = -1
+    if root >= 0 and model.body_jntnum[root] > 0:
+        first = int(model.body_jntadr[root])
+        # A free joint whose name is not the articulation's has its positions elsewhere on the wire.
+        free = first if model.jnt_type[first] == FREE and first == next(iter(joints.values()), -1) else -1
+    return ArticulationLayout(
+        joints=joints,
+        actuators=actuators,
+        sensors=sensors,
+        bodies=bodies,
+        sensor_dims={name: int(model.sensor_dim[i]) for name, i in sensors.items()},
+        qpos_adr=_ranges(model.jnt_qposadr[joint_ids], QPOS_WIDTH[kinds]),
+        qvel_adr=_ranges(model.jnt_dofadr[joint_ids], QVEL_WIDTH[kinds]),
+        ctrl_adr=ctrl_adr,
+        act_from=act_from,
+        act_adr=act_adr[act_from],
+        n_out=int(force_counts(model)[actuator_ids].sum()),
+        root_body=root,
+        free_joint=free,
+    )
+
+
+def _ranges(starts: NDArray[np.integer[Any]], lengths: NDArray[np.integer[Any]]) -> Ints:
+    """Concatenate the ranges [start, start + length)."""
+    lengths = lengths.astype(np.intp)
+    first = np.repeat(starts.astype(np.intp) - (np.cumsum(lengths) - lengths), lengths)
+    return first + np.arange(lengths.sum(), dtype=np.intp)

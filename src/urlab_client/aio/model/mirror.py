@@ -1,0 +1,262 @@
+"""The local copy of the simulation: the handshake's compiled model and data that follow what the server sends.
+
+For the client's own use. MuJoCo is imported when a model is loaded, not before.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+from functools import cache
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from urlab_client.protocol.base import Floats
+from urlab_client.protocol.errors import ProtocolError, URLabVersionMismatch
+from urlab_client.protocol.messages.session import HelloOk, Perturbation
+from urlab_client.protocol.types import SimOptions
+
+if TYPE_CHECKING:
+    import mujoco
+
+__all__ = ["Loaded", "Mirror", "model_names", "write_options"]
+
+log = logging.getLogger("urlab_client.mirror")
+
+_CHOICES = {
+    "integrator": ("mjtIntegrator", "mjINT_"),
+    "cone": ("mjtCone", "mjCONE_"),
+    "solver": ("mjtSolver", "mjSOL_"),
+}
+_HEADER_BYTES = 20  # five 32-bit integers
+_NOT_IN_MJOPTION = frozenset({"enable_multiccd", "enable_sleep", "num_worker_threads", "max_worker_threads"})
+_NAME_ADDRESSES = {
+    "body": "name_bodyadr",
+    "joint": "name_jntadr",
+    "actuator": "name_actuatoradr",
+    "sensor": "name_sensoradr",
+    "geom": "name_geomadr",
+    "key": "name_keyadr",
+}
+
+
+def model_names(model: mujoco.MjModel, kind: str) -> list[str]:
+    """Return the compiled names of all bodies, joints, actuators, sensors, geoms or keys, in id order."""
+    pool = model.names
+    addresses: list[int] = getattr(model, _NAME_ADDRESSES[kind]).tolist()
+    return [pool[start : pool.index(b"\0", start)].decode() for start in addresses]
+
+
+@cache
+def _mjb_header() -> bytes:
+    """Return the first bytes of any model this MuJoCo saves: magic, number size, layout and version."""
+    import mujoco  # noqa: PLC0415
+
+    empty = mujoco.MjModel.from_xml_string("<mujoco/>")
+    buffer = np.zeros(mujoco.mj_sizeModel(empty), dtype=np.uint8)
+    mujoco.mj_saveModel(empty, None, buffer)
+    return buffer[:_HEADER_BYTES].tobytes()
+
+
+def write_options(opt: mujoco.MjOption, options: SimOptions) -> None:
+    """Write the options that are not None into a model's `mjOption`, all or none.
+
+    The raw masks come first, so that the named switches win, as on the server.
+
+    Raises:
+        ValueError: An integrator, cone or solver is unknown.
+    """
+    import mujoco  # noqa: PLC0415
+
+    values: dict[str, Any] = {}
+    for name in SimOptions.__struct_fields__:
+        value = getattr(options, name)
+        if value is None or name in _NOT_IN_MJOPTION:
+            continue
+        values[name] = _choice(name, value) if name in _CHOICES else value
+    for name, value in values.items():
+        setattr(opt, name, value)
+    if options.enable_sleep is not None:
+        opt.enableflags = _switched(opt.enableflags, int(mujoco.mjtEnableBit.mjENBL_SLEEP), options.enable_sleep)
+    if options.enable_multiccd is not None:
+        bit = int(mujoco.mjtDisableBit.mjDSBL_MULTICCD)
+        opt.disableflags = _switched(opt.disableflags, bit, not options.enable_multiccd)
+
+
+def _choice(name: str, value: str) -> int:
+    """Return the number of an integrator, cone or solver. One without a name on the wire comes as its number."""
+    import mujoco  # noqa: PLC0415
+
+    enum, prefix = _CHOICES[name]
+    members = getattr(mujoco, enum).__members__
+    known = {key.removeprefix(prefix).lower(): int(member) for key, member in members.items()}
+    found = known.get(value.lower(), next((number for number in known.values() if str(number) == value), None))
+    if found is None:
+        raise ValueError(f"{name} is {value!r}; MuJoCo knows {', '.join(known)}")
+    return found
+
+
+def _from_binary(mjb: bytes) -> mujoco.MjModel:
+    import mujoco  # noqa: PLC0415
+
+    return mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": mjb})
+
+
+def _compiled(xml: str, assets: dict[str, bytes], *, trusted: bool) -> mujoco.MjModel:
+    import mujoco  # noqa: PLC0415
+
+    if trusted:
+        return mujoco.MjModel.from_xml_string(xml, assets)
+    from urlab_client.aio.model.compilation import compile_confined  # noqa: PLC0415 - it is run as a program, too
+
+    try:
+        return _from_binary(compile_confined(xml, assets))
+    except ValueError as error:
+        raise ValueError(
+            f"{error}. The server is neither on this machine nor known by its key, so what its model may ask for and "
+            "read is limited: trust_server=True lifts that, local_model=False loads no model"
+        ) from None
+
+
+def _switched(mask: int, bit: int, on: bool) -> int:
+    return mask | bit if on else mask & ~bit
+
+
+class Loaded(NamedTuple):
+    """A model that was loaded, and whether it was compiled here from XML."""
+
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    approximate: bool
+
+
+class Mirror:
+    """Local model and data, guarded by a reentrant lock.
+
+    Attributes:
+        lock: Held while data change; hold it to read several values that belong together from another thread.
+        model: The compiled model, or None without one.
+        data: State that mirrors the server's, or None without a model.
+        approximate: True when the model was compiled here from XML because the server runs another MuJoCo build
+            or is not trusted with binary models.
+    """
+
+    def __init__(self) -> None:
+        self.lock = threading.RLock()
+        self.model: mujoco.MjModel | None = None
+        self.data: mujoco.MjData | None = None
+        self.approximate = False
+        self._stale = False
+        self._dragged: int | None = None
+
+    @staticmethod
+    def check_version(hello: HelloOk) -> URLabVersionMismatch | None:
+        """Return the error to raise when the server's compiled model cannot be loaded by this MuJoCo.
+
+        Development builds share version numbers while their models differ, so the model's own header counts as well.
+        """
+        import mujoco  # noqa: PLC0415
+
+        client = mujoco.mj_versionString()
+        same = hello.mujoco_version == client and hello.mujoco_version_int == mujoco.mj_version()
+        if same and hello.mjb is not None:
+            same = hello.mjb[:_HEADER_BYTES] == _mjb_header()
+        return None if same else URLabVersionMismatch(hello.mujoco_version, client)
+
+    @classmethod
+    def load(cls, hello: HelloOk, *, trusted: bool) -> Loaded | None:
+        """Load the handshake's model, None if there is none. Blocking, and without effect here: run it in a thread.
+
+        Args:
+            hello: The handshake.
+            trusted: Whether the server may have its XML compiled in this process.
+
+        Raises:
+            ProtocolError: The bytes are not a model this MuJoCo can load.
+        """
+        import mujoco  # noqa: PLC0415
+
+        mismatch = cls.check_version(hello)
+        try:
+            binary = mismatch is None and hello.mjb is not None
+            if binary and hello.mjb is not None:
+                model = _from_binary(hello.mjb)
+            elif hello.mjcf_compiled is not None:
+                model = _compiled(hello.mjcf_compiled, hello.vfs_assets or {}, trusted=trusted)
+            else:
+                return None
+        except (ValueError, mujoco.FatalError) as error:
+            raise ProtocolError(f"hello: the server's model cannot be loaded: {error}", op="hello") from error
+        if not 0 < model.opt.timestep < math.inf:
+            raise ProtocolError(f"hello: the timestep of the server's model is {model.opt.timestep}.", op="hello")
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        return Loaded(model, data, not binary)
+
+    def use(self, loaded: Loaded | None) -> None:
+        """Mirror into a model from now on, or into none. Call under the lock."""
+        if loaded is None:
+            self.model = self.data = None
+            self.approximate = False
+        else:
+            self.model, self.data, self.approximate = loaded.model, loaded.data, loaded.approximate
+        self._stale = False
+        self._dragged = None
+
+    def reset(self, keyframe: str | None) -> None:
+        """Reset the data as the server does: replies carry the articulations' state, but not all of it. Under the lock.
+
+        Args:
+            keyframe: Compiled keyframe name, or None.
+        """
+        if self.model is None or self.data is None:
+            return
+        import mujoco  # noqa: PLC0415
+
+        key = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_KEY, keyframe) if keyframe else -1
+        if key >= 0:
+            mujoco.mj_resetDataKeyframe(self.model, self.data, key)
+        else:
+            mujoco.mj_resetData(self.model, self.data)
+
+    def perturb(self, perturbation: Perturbation | None) -> None:
+        """Take over a mouse drag for the next local step, and let go of the one before. Call under the lock."""
+        if self.data is None:
+            return
+        if self._dragged is not None:
+            self.data.xfrc_applied[self._dragged] = 0.0
+        self._dragged = None
+        if perturbation is not None:
+            self._dragged = perturbation.body_id
+            self.data.xfrc_applied[self._dragged] = perturbation.xfrc
+
+    def mark_stale(self) -> None:
+        """Note that positions or velocities changed, so that derived quantities must be computed before use."""
+        self._stale = True
+
+    def derived(self) -> tuple[mujoco.MjModel, mujoco.MjData] | None:
+        """Return model and data with body poses and velocities computed for the present state. Call under the lock."""
+        if self.model is None or self.data is None:
+            return None
+        if self._stale:
+            import mujoco  # noqa: PLC0415
+
+            mujoco.mj_kinematics(self.model, self.data)
+            mujoco.mj_comPos(self.model, self.data)
+            mujoco.mj_comVel(self.model, self.data)
+            self._stale = False
+        return self.model, self.data
+
+    def body_velocity(self, body_id: int) -> Floats | None:
+        """Return (angular, linear) velocity of a body's frame origin, shape (6,), rad/s and m/s, world axes."""
+        with self.lock:
+            pair = self.derived()
+            if pair is None:
+                return None
+            import mujoco  # noqa: PLC0415
+
+            velocity = np.zeros(6)
+            mujoco.mj_objectVelocity(*pair, mujoco.mjtObj.mjOBJ_XBODY, body_id, velocity, 0)
+            return velocity

@@ -1,0 +1,9 @@
+"""`client.farm`: sharing servers among clients."""
+
+from urlab_client.aio.namespaces._ops import FarmOps
+
+__all__ = ["FarmNamespace"]
+
+
+class FarmNamespace(FarmOps):
+    """Sharing servers among clients; servers of the alpha have none of it."""

@@ -1,0 +1,1 @@
+"""What the client knows of the simulation and the connection, and what is unknown after a lost reply."""

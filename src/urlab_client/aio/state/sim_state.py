@@ -1,0 +1,616 @@
+"""What the client knows of the simulation: the handshake, the local model, and the state of the last reply.
+
+The client and its namespaces share one `SimState`; users see it through the attributes of `URLabClient`.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import re
+import time
+import warnings
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from typing import NamedTuple, Protocol
+
+import anyio.to_thread
+import numpy as np
+
+from urlab_client.aio.articulation import URLabArticulation, URLabEntity
+from urlab_client.aio.cameras import URLabCameraView
+from urlab_client.aio.live.live_state import LatestPicture, LiveState
+from urlab_client.aio.live.publishers import Publishers
+from urlab_client.aio.model.articulation_state import Carried, MirroredArticulation, MirroredEntity
+from urlab_client.aio.model.mirror import Mirror, write_options
+from urlab_client.aio.session import Session, Turn
+from urlab_client.aio.state.handshake import Examined, examine
+from urlab_client.aio.state.recovery import PendingOutcomes, leaves_open
+from urlab_client.protocol.base import Floats
+from urlab_client.protocol.enums import CameraMode, CameraTiming, StepMode
+from urlab_client.protocol.errors import (
+    ModeLocked,
+    NoActiveManager,
+    NoSession,
+    ProtocolError,
+    SessionTakenOver,
+    URLabError,
+    URLabRPCError,
+)
+from urlab_client.protocol.messages.runtime import SetMode, SetPaused
+from urlab_client.protocol.messages.session import (
+    NOT_SENT,
+    ArticulationState,
+    CameraFrame,
+    CameraInfo,
+    EntityState,
+    Hello,
+    HelloOk,
+    Perturbation,
+    StateReply,
+    StepOk,
+)
+from urlab_client.protocol.messages.streams import PlayEnded, PlayStarted, SessionLost, SessionOpened, StateSnapshot
+from urlab_client.protocol.names import NameMap
+from urlab_client.protocol.rows import Pixels, decode_camera
+from urlab_client.protocol.sim_options import check_sim_options
+from urlab_client.protocol.types import SimOptions
+
+__all__ = ["SimState", "StateObserver"]
+
+log = logging.getLogger("urlab_client.client")
+
+# By the server's clock. More than this means that the clock was set, not that a message was overtaken.
+_OVERTAKEN_S = 1.0
+
+# Unreal's actor names: class, then a number or a generated id.
+_ENGINE_NAME = re.compile(r"(?P<stem>.+)_C_(?:\d+|UAID_\w+)")
+
+
+class _Checked(NamedTuple):
+    """A state that fits, and what each part of it is about."""
+
+    reply: StateReply | StateSnapshot
+    articulations: list[tuple[MirroredArticulation, ArticulationState]]
+    entities: list[tuple[MirroredEntity, EntityState]]
+    pictures: list[tuple[URLabCameraView, Pixels]]
+
+
+class StateObserver(Protocol):
+    """Looks on while the client works. Called on the event loop, so it must be quick; it must not raise."""
+
+    def on_state(self, reply: StateReply | StateSnapshot) -> None:
+        """Take note of a state that was taken over. Its arrays are replaced by later ones, never written."""
+        ...
+
+    def wanted_pictures(self, asked: bool | dict[str, str | None], n_steps: int) -> bool | dict[str, str | None]:
+        """Return the pictures that the next step is to bring: what its caller asked for, and more."""
+        ...
+
+
+class SimState:
+    """Everything that `discover()` and the replies after it say.
+
+    Attributes:
+        session: The RPC session.
+        publishers: What the server publishes.
+        mirror: Local model and data.
+        wanted_mode: Step mode the user asked for.
+        mode_assumed: Whether nothing the server said shows yet that `mode` is in force.
+        promoted_from: Mode to go back to on close, after a promotion of our own.
+        level: Observation level of the session.
+        sent_level: Observation level the server has, which an earlier step may have changed.
+        hello: The last handshake, without the model's bytes.
+        articulations: Articulations by key.
+        entities: Every dynamic body by name, articulations included.
+        global_cameras: Scene-level cameras.
+        step_count: Steps since the last handshake or reset.
+        sim_time: Simulation time of the last reply, seconds.
+        on_adopted: Told of each handshake taken over, and of the end of play.
+        pending: Requests whose replies were lost.
+        stopping: Whether this client is ending play, so that its end is no news.
+        observers: Told of each state taken over, such as recorders.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        publishers: Publishers,
+        *,
+        wanted_mode: StepMode,
+        local_model: bool,
+        check_version: bool,
+        promote: bool,
+        trusted: bool,
+        live_pictures: bool,
+    ) -> None:
+        self.session = session
+        self.publishers = publishers
+        self.mirror = Mirror()
+        self.wanted_mode = wanted_mode
+        self._mode = StepMode.LIVE
+        self.mode_assumed = False
+        self._live = LiveState(publishers.state(), self._absorb_live, self.mirror.lock)
+        self.promoted_from: StepMode | None = None
+        self.level = "standard"
+        self.sent_level = "standard"
+        self.hello: HelloOk | None = None
+        self.articulations: NameMap[URLabArticulation] = NameMap(kind="articulation")
+        self.articulations_by_id: dict[str, URLabArticulation] = {}
+        self.entities: NameMap[URLabEntity] = NameMap(kind="entity")
+        self.global_cameras: NameMap[URLabCameraView] = NameMap(kind="camera")
+        self.step_count = 0
+        self.sim_time = 0.0
+        self.sim_time_sec = self.sim_time_nsec = 0
+        self.wall_time_sec = self.wall_time_nsec = 0
+        self.recv_wall_time_ns = 0
+        self._local_model = local_model
+        self._check_version = check_version
+        session.on_opened = self._note_session
+        session.on_refusal = self._note_refusal
+        self._promote = promote
+        self._trusted = trusted
+        self._live_pictures = live_pictures
+        self.pending = PendingOutcomes()
+        self.on_adopted: Callable[[], None] | None = None
+        self.stopping = False
+        self.observers: list[StateObserver] = []
+        self._records: dict[str, MirroredArticulation] = {}
+        self._entity_records: dict[str, MirroredEntity] = {}
+
+    @property
+    def mode(self) -> StepMode:
+        """Step mode in force, as far as this client knows. In live mode, and no other, state is received by itself."""
+        return self._mode
+
+    @mode.setter
+    def mode(self, mode: StepMode) -> None:
+        self.mode_assumed = False
+        self._mode = mode
+        live = mode is StepMode.LIVE and self.hello is not None and self.hello.manager_present
+        receivers: list[LiveState | LatestPicture] = [self._live]
+        if self._live_pictures:
+            receivers.extend(view.pictures for view in self._views())
+        for receiver in receivers:
+            if live:
+                receiver.start()
+            else:
+                receiver.stop()
+
+    def assume_mode(self, mode: StepMode) -> None:
+        """Go by a step mode until a reply shows which one is in force: no op tells it without changing it."""
+        self.mode = mode
+        self.mode_assumed = True
+
+    @property
+    def live(self) -> bool:
+        """Whether state is received by itself."""
+        return self._live.running
+
+    @property
+    def live_received(self) -> int:
+        """Snapshots that arrived by themselves."""
+        return self._live.stats.received
+
+    @property
+    def records(self) -> Mapping[str, MirroredArticulation]:
+        """Records of the articulations, by key."""
+        return self._records
+
+    @property
+    def entity_records(self) -> Mapping[str, MirroredEntity]:
+        """Records of the plain entities, by name."""
+        return self._entity_records
+
+    @property
+    def local_time(self) -> float:
+        """Simulation time of the local data, or without them of the last reply, seconds."""
+        return self.sim_time if self.mirror.data is None else self.mirror.data.time
+
+    def take_wrenches(self) -> Carried:
+        """Take what the step that is being built carries out of its buffers."""
+        records: list[MirroredEntity] = [*self._records.values(), *self._entity_records.values()]
+        return {record: record.take_wrenches() for record in records if record.wrenches}
+
+    def require_handshake(self, op: str) -> None:
+        """Refuse an op that goes by what a handshake said, when that is not known.
+
+        Raises:
+            NoSession: The handshake of the session, or of a new play, was given up.
+        """
+        if self.hello is None and self.session.greeted:
+            raise NoSession("discover() did not finish. Nothing was sent.", op=op)
+        if self.pending.play:
+            raise NoSession(
+                "sim.start() was broken off, so it is not known what plays now. Nothing was sent.",
+                op=op,
+                hint="Call sim.start(), discover() or resync().",
+            )
+
+    async def open(self, turn: Turn, observations: str) -> HelloOk:
+        """Open a session and take over what the server says."""
+        hello = await self.session.hello(turn, Hello(observations=observations))
+        self.level = self.sent_level = observations
+        if self._local_model and hello.mjb is not None:
+            mismatch = self.mirror.check_version(hello)
+            if mismatch is not None:
+                if self._check_version:
+                    raise mismatch
+                warnings.warn(
+                    f"{mismatch.args[0]} The local model is compiled here from XML and only approximates the server's.",
+                    stacklevel=2,
+                )
+                request = Hello(observations=observations, include_assets=True)
+                hello = await self.session.hello(turn, request)
+                self.sent_level = observations
+        await self.adopt(turn, hello)
+        return hello
+
+    def _note_session(self, hello: HelloOk) -> None:
+        """Note that a session was opened, maybe by a handshake that its caller had given up."""
+        self.pending.clear()  # what belonged to the session before is refused now
+        self.step_count = 0
+        self.sent_level = ""
+        self.publishers.events.publish(
+            SessionOpened(
+                session_id=hello.session_id, urlab_version=hello.urlab_version, mujoco_version=hello.mujoco_version
+            )
+        )
+
+    async def _without_binary(self, turn: Turn, hello: HelloOk) -> HelloOk:
+        """Return the handshake with a model in XML alone: MuJoCo's binary loader is no match for a hostile model.
+
+        Raises:
+            URLabError: The server has none.
+        """
+        if hello.mjcf_compiled is None:
+            log.info("the server is not trusted with binary models: the local model is compiled here from XML")
+            hello = await self.session.hello(turn, Hello(observations=self.level, include_assets=True))
+            self.sent_level = self.level
+        if hello.manager_present and hello.mjcf_compiled is None:
+            raise URLabError(
+                "The server offers its model only in MuJoCo's binary format, which is loaded from servers on this "
+                "machine and from servers known by their key.",
+                op="hello",
+                hint="Pass server_key=…, or trust_server=True if you trust all between here and there, or "
+                "local_model=False.",
+            )
+        hello.mjb = None
+        return hello
+
+    async def adopt(self, turn: Turn, hello: HelloOk) -> None:
+        """Take over a handshake: load its model, bind the wrappers, bring the server into the wanted step mode."""
+        hello.mjb_base64 = NOT_SENT  # it keeps the whole reply in memory
+        await self.session.transport.follow(hello)
+        loaded = None
+        if self._local_model:
+            if hello.mjb is not None and not self._trusted:
+                hello = await self._without_binary(turn, hello)
+            load = partial(self.mirror.load, hello, trusted=self._trusted)
+            loaded = await turn.aside(anyio.to_thread.run_sync(load, abandon_on_cancel=True))
+        examined = examine(hello, None if loaded is None else loaded.model)
+        self.publishers.check_open()
+        # From here on nothing waits until all is taken over: cancelled or not, model and wrappers belong together.
+        # The model's bytes, several times its size, are not needed any more.
+        hello.mjb = hello.mjcf_compiled = hello.vfs_assets = None
+        played = self.hello is not None and self.hello.manager_present
+        with self.mirror.lock:
+            if self._local_model:
+                self.mirror.use(loaded)
+            self.hello = hello
+            self._bind_articulations(hello, examined)
+            self._bind_entities(examined)
+            cameras = hello.global_cameras or {}
+            self.global_cameras = NameMap(
+                {n: self._global_camera(n, info) for n, info in cameras.items()}, kind="camera"
+            )
+            self.step_count = 0
+        self.pending.play = False
+        self._views()  # binds the cameras to what the handshake says of them
+        self.publishers.refresh()
+        if hello.manager_present and not played:
+            self.publishers.events.publish(PlayStarted(articulations=list(self.articulations)))
+        if self.on_adopted is not None:
+            self.on_adopted()
+        if not hello.manager_present:
+            self.mode = StepMode.LIVE
+        elif self._promote and self.wanted_mode is not StepMode.AUTO:
+            await self._promote_to(turn, self.wanted_mode)
+        else:
+            self.assume_mode(StepMode.LIVE if self.wanted_mode is StepMode.AUTO else self.wanted_mode)
+        log.info(
+            "session with %s, MuJoCo %s: %d articulations, mode %s",
+            hello.urlab_version, hello.mujoco_version, len(self.articulations), self.mode,
+        )  # fmt: skip
+
+    async def _promote_to(self, turn: Turn, mode: StepMode) -> None:
+        self.pending.mode = mode  # until the server has agreed, whatever comes between
+        try:
+            previous = await self.ask_mode(turn, mode)
+        except ModeLocked as locked:
+            if locked.pinned is not None:
+                raise
+            self.assume_mode(mode)  # which mode it is pinned to shows in the reply to the first step
+            return
+        except BaseException as error:
+            if leaves_open(error) and self.promoted_from is None:
+                self.promoted_from = StepMode.LIVE  # what play begins in; the reply would have told
+            raise
+        if previous is not self.mode:
+            self.promoted_from = previous
+
+    async def ask_mode(self, turn: Turn, mode: StepMode) -> StepMode:
+        """Bring the server into a step mode, take over the one in force, and return the one before.
+
+        Raises:
+            ModeLocked: The project pins another one, which has been taken over if its name is known.
+        """
+        try:
+            with self.pending.about_mode(mode):
+                reply = await turn.call(SetMode(mode=mode))
+        except ModeLocked as locked:
+            if locked.pinned is not None:
+                self.mode = locked.pinned
+            if locked.pinned is not mode:
+                raise
+            if mode is StepMode.DIRECT:
+                # Play starts paused, and no change of mode can resume it where the mode is pinned.
+                await turn.call(SetPaused(paused=False))
+            return mode
+        self.mode = reply.current_mode
+        return reply.previous_mode
+
+    def _global_camera(self, name: str, info: CameraInfo) -> URLabCameraView:
+        view = self.global_cameras.get(name)
+        if view is None:
+            return URLabCameraView(name, info, self.publishers)
+        view.info = info
+        return view
+
+    def _views(self) -> list[URLabCameraView]:
+        own = [view for art in self.articulations.values() for view in art.cameras.values()]
+        return [*own, *self.global_cameras.values()]
+
+    def _bind_articulations(self, hello: HelloOk, examined: Examined) -> None:
+        wrappers: dict[str, URLabArticulation] = {}
+        aliases: dict[str, list[str]] = {}
+        for info in hello.articulations:
+            key = info.prefix
+            layout = examined.layouts[key]
+            record = self._records.get(key)
+            if record is None:
+                record = self._records[key] = MirroredArticulation(self.mirror, info, layout)
+            else:
+                record.bind(info, layout)
+            wrappers[key] = self.articulations.get(key) or URLabArticulation(record, self.session, self.publishers)
+            found = _ENGINE_NAME.fullmatch(key)
+            for alias in {info.actor_id, found["stem"] if found else ""} - {""}:
+                aliases.setdefault(alias, []).append(key)
+        self._records = {key: self._records[key] for key in wrappers}
+        self.articulations = NameMap(wrappers, aliases, kind="articulation")
+        self.articulations_by_id = {art.actor_id: art for art in wrappers.values() if art.actor_id}
+
+    def _bind_entities(self, examined: Examined) -> None:
+        plain: dict[str, URLabEntity] = {}
+        records: dict[str, MirroredEntity] = {}
+        for name, info in examined.entities.items():
+            record = self._entity_records.get(name) or MirroredEntity(self.mirror, name)
+            record.bind_entity(info)
+            records[name] = record
+            known = self.entities.get(name)
+            plain[name] = known if known is not None and type(known) is URLabEntity else URLabEntity(record)
+        self._entity_records = records
+        self.entities = NameMap({**self.articulations, **plain}, kind="entity")
+
+    def absorb_reset(self, reply: StateReply, keyframe: str | None) -> None:
+        """Take over the state after a reset, whole or not at all; raises as `absorb` does."""
+        received = time.time_ns()
+        checked = self._checked(reply, "reset")
+        with self.mirror.lock:
+            self.mirror.reset(keyframe)
+            for record in self._entity_records.values():
+                record.pose = None
+            self._take_over(checked, received, into_mirror=True)
+
+    def matches(self, snapshot: StateSnapshot) -> bool:
+        """Whether a published state is of the world that the handshake described, as far as that can be seen."""
+        if not self.session.confirmed or snapshot.per_articulation.keys() != self._records.keys():
+            return False
+        try:
+            self._checked(snapshot, "state/full")
+        except ProtocolError:
+            return False
+        return True
+
+    def _absorb_live(self, snapshot: StateSnapshot) -> None:
+        age = self.wall_time_sec - snapshot.wall_time.sec + (self.wall_time_nsec - snapshot.wall_time.nsec) / 1e9
+        if 0 < age < _OVERTAKEN_S:
+            return  # sent before the last reply, arrived after it
+        if not self.session.confirmed:
+            return  # the connection was lost: this may be another server's
+        if snapshot.per_articulation.keys() != self._records.keys():
+            raise ProtocolError(
+                f"state/full: it holds {_listed(snapshot.per_articulation)}, the handshake {_listed(self._records)}.",
+                hint="The world changed on the server: call discover().",
+            )
+        self.absorb(snapshot, "state/full")
+
+    def absorb(self, reply: StateReply | StateSnapshot, op: str, *, into_mirror: bool = True) -> None:
+        """Take over the state in a reply, whole or not at all.
+
+        Args:
+            reply: The reply.
+            op: Op that it answers, for messages.
+            into_mirror: Also write it into the local data; not in puppet mode, whose state comes from there.
+
+        Raises:
+            ProtocolError: Something in it does not fit the model or the cameras; nothing was taken over.
+        """
+        received = time.time_ns()
+        self._take_over(self._checked(reply, op), received, into_mirror=into_mirror)
+
+    def _checked(self, reply: StateReply | StateSnapshot, op: str) -> _Checked:
+        """Compare a state with the model and the cameras, and return it with what each part of it is about.
+
+        Raises:
+            ProtocolError: Something in it does not fit.
+        """
+        if not math.isfinite(reply.time):
+            raise ProtocolError(f"{op}: the simulation time is {reply.time}.", op=op)
+        articulations = [(self._records[key], s) for key, s in reply.per_articulation.items() if key in self._records]
+        for record, state in articulations:
+            record.check(state, op)
+        entities: list[tuple[MirroredEntity, EntityState]] = []
+        if isinstance(reply, (StepOk, StateSnapshot)) and reply.entities:
+            known = self._entity_records
+            entities = [(known[name], state) for name, state in reply.entities.items() if name in known]
+            for record, state in entities:
+                record.check_pose(state, op)
+        pictures: list[tuple[URLabCameraView, Pixels]] = []
+        if isinstance(reply, StepOk):
+            self._check_perturbation(reply.perturbation, op)
+            pictures = [(view, _pixels(view, frame)) for view, frame in self._frames(reply.cameras or {})]
+        return _Checked(reply, articulations, entities, pictures)
+
+    def _take_over(self, checked: _Checked, received: int, *, into_mirror: bool) -> None:
+        reply = checked.reply
+        with self.mirror.lock:
+            for record, state in checked.articulations:
+                record.absorb(state)
+                if into_mirror:
+                    record.write_mirror(state)
+            for record, state in checked.entities:
+                record.absorb_pose(state, into_mirror=into_mirror)
+            for view, pixels in checked.pictures:
+                view.pictures.deliver(pixels, reply.time)
+            if into_mirror and self.mirror.data is not None:
+                self.mirror.data.time = reply.time
+            self.mirror.mark_stale()
+            self._absorb_clocks(reply, received)
+        for observer in self.observers:
+            observer.on_state(reply)
+
+    def _check_perturbation(self, drag: Perturbation | None, op: str) -> None:
+        model = self.mirror.model
+        if drag is None or model is None:
+            return
+        if not (0 < drag.body_id < model.nbody and len(drag.xfrc) == 6 and np.isfinite(drag.xfrc).all()):
+            raise ProtocolError(
+                f"{op}: a perturbation of body {drag.body_id} by {drag.xfrc.tolist()}: "
+                f"bodies are 1 to {model.nbody - 1}, a wrench is six numbers.",
+                op=op,
+            )
+
+    def _absorb_clocks(self, reply: StateReply | StateSnapshot, received: int) -> None:
+        self.step_count = reply.step
+        self.sim_time = reply.time
+        self.recv_wall_time_ns = received
+        if reply.sim_time is not None:
+            self.sim_time_sec, self.sim_time_nsec = reply.sim_time.sec, reply.sim_time.nsec
+        if reply.wall_time is not None:
+            self.wall_time_sec, self.wall_time_nsec = reply.wall_time.sec, reply.wall_time.nsec
+
+    def mirror_qpos(self, key: str, qpos: Floats) -> None:
+        """Take over the leading joint positions of an articulation that `set_qpos` wrote.
+
+        Raises:
+            ProtocolError: They are neither all of its positions nor those of its free base.
+        """
+        record = self._records.get(key)
+        if record is None:
+            return
+        record.check_written(qpos)
+        with self.mirror.lock:
+            record.qpos = np.concatenate([qpos, record.qpos[len(qpos) :]])
+            if self.mirror.data is not None:
+                self.mirror.data.qpos[record.layout.qpos_adr[: len(qpos)]] = qpos
+            self.mirror.mark_stale()
+
+    def mirror_options(self, options: SimOptions) -> None:
+        """Take over the options that `set_sim_options` echoed, all or none.
+
+        Raises:
+            ProtocolError: One of them cannot be right.
+        """
+        try:
+            check_sim_options(options)
+            if self.mirror.model is not None:
+                with self.mirror.lock:
+                    write_options(self.mirror.model.opt, options)
+        except ValueError as error:
+            raise ProtocolError(f"set_sim_options: the server says that {error}.", op="set_sim_options") from None
+
+    def _note_refusal(self, refusal: URLabRPCError) -> None:
+        if isinstance(refusal, NoActiveManager):
+            self.on_play_ended("stopped by somebody else")
+        elif isinstance(refusal, SessionTakenOver):
+            self.publishers.events.publish(SessionLost(session_id=self.session.session_id, reason=refusal.message))
+
+    def on_play_ended(self, reason: str = "") -> None:
+        """Note that the play session is gone: the server is back in live mode, without articulations."""
+        played = self.hello is not None and self.hello.manager_present
+        if self.hello is not None:
+            self.hello.manager_present = False
+        self.publishers.release_regions()
+        self.mode = StepMode.LIVE
+        self.promoted_from = None
+        if played:
+            self.publishers.events.publish(PlayEnded(reason=reason))
+            if self.on_adopted is not None:
+                self.on_adopted()
+
+    def note_missing_frames(self, asked: bool | Mapping[str, str | None], reply: StepOk) -> None:
+        """Mark the cameras whose frame was asked for and did not come: the server just leaves them out."""
+        if isinstance(asked, bool):
+            views = [view for art in self.articulations.values() for view in art.cameras.values()] if asked else []
+        else:
+            views = [view for view in map(self.camera, asked) if view is not None]
+        came = {id(self.camera(name)) for name in reply.cameras or {}}
+        for view in views:
+            if view.delivered and id(view) not in came:
+                log.warning("camera %s delivered no frame; its latest_frame is older than the state", view.name)
+            view.delivered = id(view) in came
+
+    def wanted_pictures(self, include: bool | Mapping[str, str | CameraTiming]) -> bool | dict[str, str | None]:
+        """Return `include_cameras` as it travels.
+
+        Raises:
+            KeyError: There is no such camera.
+        """
+        if isinstance(include, bool):
+            return include
+        for name in include:
+            if self.camera(name) is None:
+                known = [f"{art.prefix}/{camera}" for art in self.articulations.values() for camera in art.cameras]
+                raise KeyError(f"no camera {name!r}; there are: {', '.join(known) or 'none'}")
+        return {name: str(CameraTiming(timing)) for name, timing in include.items()}
+
+    def _frames(self, cameras: Mapping[str, CameraFrame]) -> list[tuple[URLabCameraView, CameraFrame]]:
+        found: list[tuple[URLabCameraView, CameraFrame]] = []
+        for name, frame in cameras.items():
+            view = self.camera(name)
+            if view is None:
+                raise ProtocolError(f"step: a frame of camera {name!r}, which the handshake does not list.", op="step")
+            found.append((view, frame))
+        return found
+
+    def camera(self, name: str) -> URLabCameraView | None:
+        """Return the camera that the wire calls `<articulation>/<camera>` or just `<camera>`, or None."""
+        prefix, slash, short = name.rpartition("/")
+        if slash:
+            art = self.articulations.get(prefix)
+            return None if art is None else art.cameras.get(short)
+        # As on the server, the articulation listed last wins when several have a camera of that name.
+        owners = [art for art in self.articulations.values() if name in art.cameras]
+        return owners[-1].cameras[name] if owners else self.global_cameras.get(name)
+
+
+def _listed(keys: Iterable[str]) -> str:
+    return ", ".join(keys) or "no articulation"
+
+
+def _pixels(view: URLabCameraView, frame: CameraFrame) -> Pixels:
+    mode = view.mode
+    if isinstance(mode, CameraMode) and frame.dtype != ("float32" if mode is CameraMode.DEPTH else "bgra8"):
+        raise ProtocolError(f"step: a frame of {mode} camera {view.name!r} has dtype {frame.dtype!r}.", op="step")
+    return decode_camera(frame.data, view.mode, frame.width, frame.height, where=view.name).pixels

@@ -1,0 +1,219 @@
+"""How news of a region reaches the event loop: a doorbell where the server has one, else one thread that looks.
+
+Nothing tells of a publication on Linux and macOS: somebody has to look at the counter. The event loop's timers are no
+help, as they round up to a millisecond. So one thread per client looks at all regions that somebody waits for, and
+sleeps between rounds. It ends by itself when nobody waits any more.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import socket
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from urlab_client.aio.transport.readiness import watch_socket
+from urlab_client.protocol import doorbell
+
+__all__ = ["Doorbell", "Poller", "RegionPoll", "ReplyPoll", "StreamPoll"]
+
+log = logging.getLogger("urlab_client.transport")
+
+_LINGER_S = 1.0
+_BLOCK_S = 0.05
+
+# How long to sleep between looks, by the time that was waited already.
+_PACES = ((0.001, 50e-6), (0.05, 200e-6), (2.0, 1e-3))
+_SLOWEST_S = 5e-3
+_FASTEST_STREAM_S = 100e-6
+
+
+class RegionPoll:
+    """Something that the thread looks at.
+
+    Args:
+        probe: Whether there is news. Called from the thread, must not block and must not raise.
+        notify: Called on the event loop when there is; not again before `resume`.
+        block: Sleeps until the server signals, at most so many seconds; None where it has no signal.
+    """
+
+    def __init__(
+        self, probe: Callable[[], bool], notify: Callable[[], None], block: Callable[[float], None] | None = None
+    ) -> None:
+        self.probe = probe
+        self.notify = notify
+        self.block = block
+        self.told = False
+        self._since = time.monotonic()
+
+    def resume(self) -> None:
+        """Look again: what was there has been taken."""
+        self._since = time.monotonic()
+        self.told = False
+
+    def pace(self, now: float) -> float:
+        """Return how long to sleep before the next look, seconds."""
+        waited = now - self._since
+        return next((pace for limit, pace in _PACES if waited < limit), _SLOWEST_S)
+
+
+class ReplyPoll(RegionPoll):
+    """Waits for one reply: often at first, more seldom as it takes longer."""
+
+
+class StreamPoll(RegionPoll):
+    """Waits for one publication after the other: four looks between two of them."""
+
+    def __init__(self, probe: Callable[[], bool], notify: Callable[[], None]) -> None:
+        super().__init__(probe, notify)
+        self._interval = 4 * _SLOWEST_S
+
+    def resume(self) -> None:
+        """Look again: what was there has been taken."""
+        self._interval += (time.monotonic() - self._since - self._interval) / 8
+        super().resume()
+
+    def pace(self, now: float) -> float:
+        """Return how long to sleep before the next look, seconds."""
+        interval = max(self._interval, now - self._since)  # a stream that has stopped is not worth the effort
+        return min(max(interval / 4, _FASTEST_STREAM_S), _SLOWEST_S)
+
+
+class Poller:
+    """The thread that looks. Used from one event loop.
+
+    Args:
+        loop: The event loop.
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        self._changed = threading.Condition()
+        self._watches: list[RegionPoll] = []
+        self._thread: threading.Thread | None = None
+        self._closed = False
+
+    def add(self, watch: RegionPoll) -> None:
+        """Look at `watch` from now on."""
+        with self._changed:
+            self._watches.append(watch)
+            if self._thread is None and not self._closed:
+                self._thread = threading.Thread(target=self._run, name="urlab-shm", daemon=True)
+                self._thread.start()
+            self._changed.notify()
+
+    def remove(self, watch: RegionPoll) -> None:
+        """Look no longer. When this returns, `probe` is not running and will not be called again. Idempotent."""
+        with self._changed:
+            if watch in self._watches:
+                self._watches.remove(watch)
+
+    def close(self) -> None:
+        """End the thread. Idempotent."""
+        with self._changed:
+            self._closed = True
+            self._watches.clear()
+            self._changed.notify()
+            thread = self._thread
+        if thread is not None:
+            thread.join(2 * _BLOCK_S)
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                if not self._watches:
+                    self._changed.wait(_LINGER_S)
+                if self._closed or not self._watches:
+                    self._thread = None
+                    return
+                pause, block = self._look()
+                if block is None:
+                    self._changed.wait(pause)
+            if block is not None:
+                block(min(pause, _BLOCK_S))
+
+    def _look(self) -> tuple[float, Callable[[float], None] | None]:
+        """Look at everything once; return how long to sleep, and how."""
+        pause, block, now = _SLOWEST_S, None, time.monotonic()
+        for watch in self._watches:
+            pause = min(pause, watch.pace(now))
+            block = block or watch.block
+            if not watch.told and watch.probe():
+                watch.told = True
+                with contextlib.suppress(RuntimeError):  # the loop is closed, and with it everybody who waits
+                    self._loop.call_soon_threadsafe(watch.notify)
+        return pause, block
+
+
+class Doorbell:
+    """The client's end of the doorbell.
+
+    Args:
+        loop: The event loop.
+        path: The socket.
+        on_ring: What to call for each kind of ring.
+        on_lost: Called when the server is gone.
+
+    Raises:
+        OSError: Nobody answers there.
+    """
+
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        path: Path,
+        on_ring: dict[bytes, Callable[[], None]],
+        on_lost: Callable[[], None],
+    ) -> None:
+        self._on_ring = on_ring
+        self._on_lost = on_lost
+        if len(str(path).encode()) > doorbell.MAX_PATH_BYTES:
+            raise OSError(f"{path} is too long for a socket")
+        if not hasattr(socket, "AF_UNIX"):
+            raise OSError("there are no Unix sockets here")
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._socket.setblocking(False)
+        try:
+            self._socket.connect(str(path))
+            self._readiness = watch_socket(loop, self._socket, self._on_readable)
+        except BaseException:
+            self._socket.close()
+            raise
+
+    def ring(self, message: bytes) -> None:
+        """Wake the server."""
+        try:
+            self._socket.send(message)
+        except BlockingIOError:
+            pass  # it has rings waiting
+        except OSError:
+            self._lose()
+
+    def close(self) -> None:
+        """Hang up. Idempotent."""
+        if self._socket.fileno() >= 0:
+            self._readiness.close()
+            self._socket.close()
+
+    def _on_readable(self) -> None:
+        try:
+            rings = self._socket.recv(4096)
+        except BlockingIOError:
+            return
+        except OSError:
+            rings = b""
+        if not rings:
+            self._lose()
+            return
+        for message, act in self._on_ring.items():
+            if message in rings:
+                act()
+
+    def _lose(self) -> None:
+        if self._socket.fileno() >= 0:
+            self.close()
+            self._on_lost()

@@ -1,0 +1,307 @@
+"""What the values of a recording belong to: names, addresses and cameras of one handshake, and poses from its model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import msgspec
+import numpy as np
+from msgspec import Struct
+
+from urlab_client._mujoco import control_counts
+from urlab_client.aio.cameras import URLabCameraView
+from urlab_client.aio.model.layout import FREE, ArticulationLayout
+from urlab_client.aio.model.mirror import model_names
+from urlab_client.aio.state.sim_state import SimState
+from urlab_client.integrations._feed.messages import (
+    CameraCalibration,
+    ContactMessage,
+    FrameTransform,
+    JointState,
+    Quaternion,
+    Time,
+    Vector3,
+)
+from urlab_client.protocol.base import Floats
+from urlab_client.protocol.messages.session import ArticulationState, EntityState
+
+if TYPE_CHECKING:
+    import mujoco
+
+__all__ = [
+    "CameraLayout",
+    "SceneLayout",
+    "SceneMessages",
+    "Simulation",
+    "calibration",
+    "from_metadata",
+    "joint_columns",
+    "to_metadata",
+]
+
+_BALL = 1  # mjJNT_BALL
+# From MuJoCo's camera axes (x right, y up, looking along -z) to an image's (x right, y down, looking along z).
+_OPTICAL = np.array([0.0, 1.0, 0.0, 0.0])
+
+_FREE_QPOS = ("x", "y", "z", "qw", "qx", "qy", "qz")
+_FREE_QVEL = ("vx", "vy", "vz", "wx", "wy", "wz")
+
+
+class SceneLayout(Struct, kw_only=True):
+    """Name of each value of an articulation, in the order of the message's arrays; empty without a local model."""
+
+    qpos: list[str] = []
+    qvel: list[str] = []
+    ctrl: list[str] = []
+    act: list[str] = []
+
+
+@dataclass(frozen=True, slots=True)
+class CameraLayout:
+    """A camera to record.
+
+    Attributes:
+        name: `ARTICULATION/CAMERA`, or the name of a scene-level camera.
+        view: The client's.
+        model_id: Id in the compiled model, -1 if it is not there.
+    """
+
+    name: str
+    view: URLabCameraView
+    model_id: int
+
+
+@dataclass(frozen=True, slots=True)
+class SceneMessages:
+    """What one handshake says, as far as a recording needs it. Immutable: it crosses to the writing thread.
+
+    Attributes:
+        model: The local model, or None.
+        layouts: By articulation key.
+        names: By articulation key.
+        entities: Offset of the free joint in `qpos` and in `qvel`, or None, by name of the plain entity.
+        mocap: Mocap id of the plain entities that have one.
+        cameras: What to record, by the view's identity.
+    """
+
+    model: mujoco.MjModel | None
+    layouts: dict[str, ArticulationLayout]
+    names: dict[str, SceneLayout]
+    entities: dict[str, tuple[int, int] | None]
+    mocap: dict[str, int]
+    cameras: dict[int, CameraLayout]
+
+    @classmethod
+    def of(cls, state: SimState, cameras: list[tuple[str, URLabCameraView]]) -> SceneMessages:
+        """Describe what the client knows."""
+        model = state.mirror.model
+        layouts = {key: record.layout for key, record in state.records.items()}
+        ids = _camera_ids(model)
+        entities: dict[str, tuple[int, int] | None] = {}
+        mocap: dict[str, int] = {}
+        for name, record in state.entity_records.items():
+            offsets = record.qpos_offset, record.qvel_offset
+            entities[name] = None if offsets[0] is None or offsets[1] is None else (offsets[0], offsets[1])
+            if model is not None and record.body_id >= 0 and model.body_mocapid[record.body_id] >= 0:
+                mocap[name] = int(model.body_mocapid[record.body_id])
+        return cls(
+            model=model,
+            layouts=layouts,
+            names={key: _layout(model, layout) for key, layout in layouts.items()},
+            entities=entities,
+            mocap=mocap,
+            cameras={id(view): CameraLayout(name, view, ids.get(name.replace("/", "_"), -1)) for name, view in cameras},
+        )
+
+
+def joint_columns(names: list[str], dof: bool = False) -> list[str]:
+    """Return those of a layout's names that belong to a hinge or slide joint: without a component."""
+    return [name for name in names if name.rpartition(".")[2] not in (_FREE_QVEL if dof else _FREE_QPOS)]
+
+
+class Simulation:
+    """Computes poses and contacts of recorded states. For one thread; the model is only read.
+
+    Args:
+        scene: The scene, with a model.
+    """
+
+    def __init__(self, scene: SceneMessages, model: mujoco.MjModel) -> None:
+        import mujoco  # noqa: PLC0415
+
+        self._scene = scene
+        self._model = model
+        self._data = mujoco.MjData(model)
+        self._bodies = [name or f"body_{i}" for i, name in enumerate(model_names(model, "body"))]
+        joints = model_names(model, "joint")
+        scalar = np.flatnonzero(model.jnt_type > _BALL).tolist()
+        self._joints = [(joints[i], int(model.jnt_qposadr[i]), int(model.jnt_dofadr[i])) for i in scalar if joints[i]]
+
+    def take(
+        self, articulations: Mapping[str, ArticulationState], entities: Mapping[str, EntityState], *, forces: bool
+    ) -> None:
+        """Take over a state and compute what follows from it."""
+        data = self._data
+        for key, state in articulations.items():
+            layout = self._scene.layouts.get(key)
+            if layout is None:
+                continue
+            data.qpos[layout.qpos_adr] = state.qpos
+            data.qvel[layout.qvel_adr] = state.qvel
+            if state.ctrl is not None:
+                data.ctrl[layout.ctrl_adr] = state.ctrl
+            if state.act is not None and len(layout.act_adr):
+                data.act[layout.act_adr] = state.act[layout.act_from]
+        for name, entity in entities.items():
+            offsets = self._scene.entities.get(name)
+            if name in self._scene.mocap:
+                data.mocap_pos[self._scene.mocap[name]] = entity.xpos
+                data.mocap_quat[self._scene.mocap[name]] = entity.xquat
+            elif offsets is not None and entity.qpos is not None and entity.qvel is not None:
+                data.qpos[offsets[0] : offsets[0] + 7] = entity.qpos
+                data.qvel[offsets[1] : offsets[1] + 6] = entity.qvel
+        self._compute(forces)
+
+    def start_from(self, qpos: Floats, qvel: Floats, *, forces: bool) -> None:
+        """Take over whole arrays of joint positions and velocities and compute what follows from them."""
+        self._data.qpos[:], self._data.qvel[:] = qpos, qvel
+        self._compute(forces)
+
+    def _compute(self, forces: bool) -> None:
+        import mujoco  # noqa: PLC0415
+
+        if forces:
+            mujoco.mj_forward(self._model, self._data)
+        else:
+            mujoco.mj_kinematics(self._model, self._data)
+            mujoco.mj_comPos(self._model, self._data)
+            mujoco.mj_camlight(self._model, self._data)
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The model."""
+        return self._model
+
+    @property
+    def data(self) -> mujoco.MjData:
+        """What was computed last."""
+        return self._data
+
+    @property
+    def bodies(self) -> list[str]:
+        """Name of each body, which is that of its frame."""
+        return self._bodies
+
+    def joints(self) -> list[JointState]:
+        """Return all named hinge and slide joints."""
+        qpos, qvel = self._data.qpos.tolist(), self._data.qvel.tolist()
+        return [JointState(name, qpos[q], qvel[v]) for name, q, v in self._joints]
+
+    def transforms(self, time: Time) -> list[FrameTransform]:
+        """Return the poses of all bodies and of the recorded cameras in the world."""
+        positions, rotations = self._data.xpos.tolist(), self._data.xquat.tolist()
+        found = [_transform(time, self._bodies[i], positions[i], rotations[i]) for i in range(1, len(self._bodies))]
+        for camera in self._scene.cameras.values():
+            if camera.model_id >= 0:
+                position, rotation = self._camera_pose(camera.model_id)
+                found.append(_transform(time, camera.name, position.tolist(), rotation.tolist()))
+        return found
+
+    def contacts(self) -> list[ContactMessage]:
+        """Return the contacts of a state that was taken with its forces."""
+        import mujoco  # noqa: PLC0415
+
+        model, data = self._model, self._data
+        found: list[ContactMessage] = []
+        force = np.zeros(6)
+        for i in range(data.ncon):
+            contact = data.contact[i]
+            mujoco.mj_contactForce(model, data, i, force)
+            frame = contact.frame.reshape(3, 3)
+            first, second = (int(geom) for geom in contact.geom)
+            found.append(
+                ContactMessage(
+                    body1=self._owner(first),
+                    body2=self._owner(second),
+                    geom1=model.geom(first).name if first >= 0 else "",
+                    geom2=model.geom(second).name if second >= 0 else "",
+                    position=Vector3(*contact.pos.tolist()),
+                    normal=Vector3(*frame[0].tolist()),
+                    distance=float(contact.dist),
+                    force=Vector3(*(frame.T @ force[:3]).tolist()),
+                )
+            )
+        return found
+
+    def _owner(self, geom: int) -> str:
+        """Return the body of a geom; a flex has none."""
+        return self._bodies[int(self._model.geom_bodyid[geom])] if geom >= 0 else ""
+
+    def _camera_pose(self, camera: int) -> tuple[Floats, Floats]:
+        import mujoco  # noqa: PLC0415
+
+        looking, turned = np.zeros(4), np.zeros(4)
+        mujoco.mju_mat2Quat(looking, self._data.cam_xmat[camera])
+        mujoco.mju_mulQuat(turned, looking, _OPTICAL)
+        return self._data.cam_xpos[camera], turned
+
+
+def calibration(camera: CameraLayout, time: Time) -> CameraCalibration:
+    """Return the pinhole parameters of a camera."""
+    width, height = camera.view.resolution
+    focal = height / 2 / float(np.tan(np.radians(camera.view.fovy) / 2))
+    x, y = width / 2, height / 2
+    return CameraCalibration(
+        timestamp=time,
+        frame_id=camera.name,
+        width=width,
+        height=height,
+        distortion_model="plumb_bob",
+        D=[0.0] * 5,
+        K=[focal, 0.0, x, 0.0, focal, y, 0.0, 0.0, 1.0],
+        R=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        P=[focal, 0.0, x, 0.0, 0.0, focal, y, 0.0, 0.0, 0.0, 1.0, 0.0],
+    )
+
+
+def _transform(time: Time, child: str, position: list[float], rotation: list[float]) -> FrameTransform:
+    w, x, y, z = rotation
+    return FrameTransform(time, "world", child, Vector3(*position), Quaternion(x, y, z, w))
+
+
+def _camera_ids(model: mujoco.MjModel | None) -> dict[str, int]:
+    return {} if model is None else {model.cam(i).name: i for i in range(model.ncam)}
+
+
+def _layout(model: mujoco.MjModel | None, layout: ArticulationLayout) -> SceneLayout:
+    if model is None:
+        return SceneLayout()
+    qpos: list[str] = []
+    qvel: list[str] = []
+    for name, joint in layout.joints.items():
+        kind = int(model.jnt_type[joint])
+        if kind > _BALL:
+            qpos.append(name)
+            qvel.append(name)
+        else:
+            parts = slice(None) if kind == FREE else slice(3, None)
+            qpos += [f"{name}.{part}" for part in _FREE_QPOS[parts]]
+            qvel += [f"{name}.{part}" for part in _FREE_QVEL[parts]]
+    ctrl: list[str] = []
+    counts = control_counts(model)
+    for name, actuator in layout.actuators.items():
+        count = int(counts[actuator])
+        ctrl += [name] if count == 1 else [f"{name}.{i}" for i in range(count)]
+    return SceneLayout(qpos=qpos, qvel=qvel, ctrl=ctrl, act=list(ctrl))
+
+
+def to_metadata(layout: SceneLayout) -> dict[str, str]:
+    """Return a layout as the metadata of a channel."""
+    return {"layout": msgspec.json.encode(layout).decode()}
+
+
+def from_metadata(metadata: dict[str, str]) -> SceneLayout:
+    """Return the layout in the metadata of a channel."""
+    return msgspec.json.decode(metadata.get("layout", "{}"), type=SceneLayout)

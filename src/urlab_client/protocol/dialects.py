@@ -1,0 +1,212 @@
+"""What the generations of the plugin say differently, for a server that speaks one of them. No I/O.
+
+Requests, replies and names have one form inside the server, that of `messages`. A `Dialect` is the table of everything
+in which a generation differs from another; whoever needs a difference asks the table by its name, nobody asks for the
+generation itself. Clients do not choose a dialect: they go by `features`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any, Final
+
+import msgspec
+from msgspec import Struct
+
+from urlab_client.protocol.base import DialectName, Op
+from urlab_client.protocol.messages.session import ForwardOk, ResetOk, StepOk
+from urlab_client.protocol.messages.streams import StateSnapshot
+from urlab_client.protocol.registry import dialect_ops
+
+__all__ = ["ALPHA", "BETA", "DIALECTS", "Dialect", "cleaned_name"]
+
+_NOT_A_NAME: Final = re.compile(r"[^A-Za-z0-9_]")
+
+
+def cleaned_name(name: str) -> str:
+    """Return a name as the beta makes it public: ASCII letters, digits and underscores, not beginning with a digit."""
+    cleaned = _NOT_A_NAME.sub("_", name)
+    return f"_{cleaned}" if cleaned[:1].isdigit() else cleaned
+
+
+class _Shape:
+    """A reply's fields as one dialect sends them: which, in which order, under which names."""
+
+    def __init__(self, reply: type[Struct], *names: str) -> None:
+        info = {found.name: found for found in msgspec.structs.fields(reply)}
+        self._names = names
+        self._struct = msgspec.defstruct(
+            f"{reply.__name__}Shape",
+            [(name, info[name].type, None) for name in names],
+            tag_field="op",
+            tag=str(reply.__struct_config__.tag),
+            kw_only=True,
+            omit_defaults=True,
+        )
+
+    def __call__(self, reply: Any) -> Struct:
+        """Return a reply in this shape."""
+        return self._struct(**{name: self._value(reply, name) for name in self._names})
+
+    @staticmethod
+    def _value(reply: Any, name: str) -> Any:
+        if name == "user":
+            return reply.user or None  # left out when nothing is declared
+        inside = _INSIDE.get(name)
+        return getattr(reply, name) if inside is None else getattr(reply, inside) or {}
+
+
+_INSIDE: Final[Mapping[str, str]] = {"arts": "per_articulation", "scene": "entities"}
+_CLOCKS: Final = ("time", "step", "sim_time", "wall_time")
+
+
+@cache
+def _beta_shapes() -> Mapping[str, _Shape]:
+    """Return the shapes of the beta by the reply's `op`."""
+    return {
+        "step_ok": _Shape(StepOk, *_CLOCKS, "frame_id", "arts", "scene", "cameras", "perturbation"),
+        "reset_ok": _Shape(ResetOk, *_CLOCKS, "arts"),
+        "forward_ok": _Shape(ForwardOk, *_CLOCKS, "arts"),
+        "state_full": _Shape(StateSnapshot, *_CLOCKS, "arts", "scene", "user"),
+    }
+
+
+def _no_shapes() -> Mapping[str, Callable[[Any], Struct]]:
+    return {}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dialect:
+    """How one generation of the plugin differs from the others.
+
+    Attributes:
+        name: Its name.
+        urlab_version: What the handshake says.
+        urlab_version_at_start: What the handshake inside the reply to `begin_pie` says.
+        jobs: Ops that take long answer `op_started`.
+        claims: Writes to a robot are refused unless the writer owns it.
+        cameras_on: Cameras stream from the start of play.
+        camera_headers: Streamed pictures begin with number, time and size.
+        camera_forms: Pictures carry `frame_id` and `sim_time` in replies, live steps bring them, and steps can wait.
+        qualified_cameras: Cameras are called `<robot>/<camera>`, on topics, too, and under no other name.
+        public_names: Robots are called by their actor id where they have one, and `actor_name` tells the object's.
+        original_names: The handshake lists elements that were renamed.
+        frame_ids: Steps are numbered by `frame_id`.
+        steps_published: State is published in every step mode, else in live mode only.
+        rows_published: Single joints, sensors and so on are published.
+        live_commands: A live step applies all of its commands.
+        level_sticks: The observation level of a step holds for later replies, too.
+        options_float32: Options are kept in single precision and keywords in lower case.
+        options_merged: The `<option>` of imported robots reaches the scene.
+        attached_documents: The scene's document attaches those of the robots, which are assets.
+        instance: The handshake says which of several servers this is, and its own shared-memory regions.
+        first_camera_port: Default port of the first camera.
+        key_names: Names of the robots' and entities' states in a reply.
+        shapes: What replies look like, by their `op`, where that is not how `messages` declares them.
+    """
+
+    name: DialectName
+    urlab_version: str
+    urlab_version_at_start: str
+    jobs: bool
+    claims: bool
+    cameras_on: bool
+    camera_headers: bool
+    camera_forms: bool
+    qualified_cameras: bool
+    public_names: bool
+    original_names: bool
+    frame_ids: bool
+    steps_published: bool
+    rows_published: bool
+    live_commands: bool
+    level_sticks: bool
+    options_float32: bool
+    options_merged: bool
+    attached_documents: bool
+    instance: bool
+    first_camera_port: int
+    key_names: tuple[str, str]
+    shapes: Callable[[], Mapping[str, Callable[[Any], Struct]]] = field(default=_no_shapes)
+
+    @property
+    def ops(self) -> Mapping[str, Op]:
+        """The ops it has, by name."""
+        return dialect_ops(self.name)
+
+    def shaped(self, reply: Struct) -> Struct:
+        """Return what to encode for a reply."""
+        shape = self.shapes().get(str(reply.__struct_config__.tag))
+        return reply if shape is None else shape(reply)
+
+    def robot_key(self, actor_id: str, object_name: str) -> str:
+        """Return what a robot is called in requests and replies."""
+        return cleaned_name(actor_id) if self.public_names and actor_id else object_name
+
+    def camera_key(self, robot: str, camera: str) -> str:
+        """Return what a camera is called in requests and replies, from the robot's key and its own name."""
+        return f"{robot}/{cleaned_name(camera)}" if self.qualified_cameras else camera
+
+    def camera_topic(self, robot: str, camera: str) -> str:
+        """Return the topic of a camera's stream, without the space that messages carry behind it."""
+        return self.camera_key(robot, camera) if self.qualified_cameras else f"{robot}/camera/{camera}"
+
+
+ALPHA: Final = Dialect(
+    name="alpha",
+    urlab_version="urlab/0.1",
+    urlab_version_at_start="urlab/0.1",
+    jobs=False,
+    claims=False,
+    cameras_on=True,
+    camera_headers=False,
+    camera_forms=False,
+    qualified_cameras=False,
+    public_names=False,
+    original_names=True,
+    frame_ids=False,
+    steps_published=True,
+    rows_published=True,
+    live_commands=False,
+    level_sticks=True,
+    options_float32=True,
+    options_merged=False,
+    attached_documents=False,
+    instance=False,
+    first_camera_port=5558,
+    key_names=("per_articulation", "entities"),
+)
+"""The plugin's main branch of June 2026."""
+
+BETA: Final = Dialect(
+    name="beta",
+    urlab_version="urlab/0.2",
+    urlab_version_at_start="urlab/0.1",
+    jobs=True,
+    claims=True,
+    cameras_on=False,
+    camera_headers=True,
+    camera_forms=True,
+    qualified_cameras=True,
+    public_names=True,
+    original_names=False,
+    frame_ids=True,
+    steps_published=False,
+    rows_published=False,
+    live_commands=True,
+    level_sticks=False,
+    options_float32=False,
+    options_merged=True,
+    attached_documents=True,
+    instance=True,
+    first_camera_port=5561,
+    key_names=("arts", "scene"),
+    shapes=_beta_shapes,
+)
+"""0.6.0-beta of August 2026 and the main branch of that age."""
+
+DIALECTS: Final[Mapping[DialectName, Dialect]] = {dialect.name: dialect for dialect in (ALPHA, BETA)}
+"""Every dialect by its name."""

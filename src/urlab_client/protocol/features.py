@@ -1,0 +1,145 @@
+"""What a server can do, as far as its answers show. No I/O.
+
+Generations of the plugin took their features one by one, and version strings lie. So nothing compares versions: what
+`meta`, the handshake and the shape of replies say is turned into `Features` here, and everything else asks those.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Literal
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from urlab_client.protocol.messages.control import ClaimControlOk
+from urlab_client.protocol.messages.session import HelloOk, StateReply
+
+__all__ = ["Features"]
+
+
+class Features(Struct, frozen=True, kw_only=True):
+    """What a server can do.
+
+    Attributes:
+        ops: Ops that it lists; None when it was not asked or has no list, in which case it is taken for an alpha.
+        capabilities: What its instance says it can do; a missing word proves nothing.
+        arts: Whether replies name the robots' states `arts`, as the beta does; None before the first reply.
+        reads_owner: Whether it reads `control_owner`; None before the first claim. Else the session is the owner.
+    """
+
+    ops: frozenset[str] | None = None
+    capabilities: frozenset[str] = frozenset()
+    arts: bool | None = None
+    reads_owner: bool | None = None
+
+    # How evidence is taken in. A session that is opened anew keeps what is known: the server is the same until it
+    # says otherwise.
+
+    def with_ops(self, names: Iterable[str] | None) -> Features:
+        """Return what is known after `meta`, or after a server that does not know it (None)."""
+        return replace(self, ops=None if names is None else frozenset(names))
+
+    def with_hello(self, hello: HelloOk) -> Features:
+        """Return what is known after a handshake."""
+        # Before play there is no instance, which says nothing.
+        if hello.instance is None:
+            return self
+        return replace(self, capabilities=frozenset(hello.instance.capabilities))
+
+    def with_reply(self, reply: StateReply) -> Features:
+        """Return what is known after a reply that carries state."""
+        arts = reply.arts is not None
+        return self if arts is self.arts else replace(self, arts=arts)
+
+    def with_claim(self, sent: str, reply: ClaimControlOk) -> Features:
+        """Return what is known after a claim in the name of `sent`."""
+        return replace(self, reads_owner=reply.owner == sent)
+
+    # What the rest of the client asks.
+
+    def offers(self, op: str) -> bool:
+        """Whether the server lists an op; a server without a list may have any."""
+        return self.ops is None or op in self.ops
+
+    def _lists(self, op: str) -> bool:
+        return self.ops is not None and op in self.ops
+
+    @property
+    def claims(self) -> bool:
+        """Robots have an owner, and others' writes are refused."""
+        return self._lists("claim_control")
+
+    @property
+    def jobs(self) -> bool:
+        """Some editor ops answer `op_started`, and `op_status` delivers their replies."""
+        return self._lists("op_status")
+
+    @property
+    def remove_op(self) -> Literal["destroy_actor", "remove_actor"]:
+        """What removing an actor is called."""
+        return "remove_actor" if self._lists("remove_actor") else "destroy_actor"
+
+    @property
+    def camera_switch(self) -> bool:
+        """Cameras stream only after `set_camera_streaming`."""
+        return self._lists("set_camera_streaming")
+
+    @property
+    def camera_delay(self) -> bool:
+        """Cameras can be given a latency."""
+        return self._lists("set_camera_delay")
+
+    @property
+    def uploads(self) -> bool:
+        """Models can be brought over the wire."""
+        return self._lists("upload_model_manifest")
+
+    @property
+    def leases(self) -> bool:
+        """Clients can tell each other who uses the server."""
+        return self._lists("acquire_lease")
+
+    @property
+    def user_channels(self) -> bool:
+        """Levels can declare values of their own that clients write and read."""
+        return self._lists("set_user_channels")
+
+    @property
+    def renders_sync(self) -> bool:
+        """`render: "sync"` makes a step wait for pictures of its own state."""
+        return "render_sync" in self.capabilities
+
+    @property
+    def _beta_state(self) -> bool:
+        # The encoder that says `arts` is the one that publishes in live mode only, and no rows.
+        return self.claims if self.arts is None else self.arts
+
+    @property
+    def live_pictures_in_steps(self) -> bool:
+        """A step in live mode may bring pictures, too, and applies all commands."""
+        return self._beta_state
+
+    @property
+    def publishes_steps(self) -> bool:
+        """State is published outside live mode, too."""
+        return not self._beta_state
+
+    @property
+    def publishes_rows(self) -> bool:
+        """Single joints, sensors and so on are published as rows."""
+        return not self._beta_state
+
+    @property
+    def idles_in_puppet(self) -> bool:
+        """Physics takes steps of its own between the pushes of puppet mode, unless it is paused."""
+        return self._beta_state
+
+    @property
+    def generation(self) -> str:
+        """For people: `alpha`, `june`, `beta`, `3`, or empty before anything is known. Nothing depends on it."""
+        if self.ops is None:
+            return ""
+        if self.claims:
+            return "beta" if self._lists("set_control_source") else "3"
+        return "june" if self.camera_switch else "alpha"

@@ -1,0 +1,143 @@
+"""Ops that bring a model to the server over the wire: what there is, the missing pieces, the import."""
+
+from __future__ import annotations
+
+from typing import Annotated, Final
+
+from msgspec import Struct, field
+
+from urlab_client.protocol.base import Needs, Op, Reply, Request, doc
+
+__all__ = [
+    "MAX_ASSETS",
+    "MAX_BLOB_BYTES",
+    "MAX_CHUNK_BYTES",
+    "MAX_MODEL_BYTES",
+    "OPS",
+    "AssetDigest",
+    "UploadModelChunk",
+    "UploadModelChunkOk",
+    "UploadModelCommit",
+    "UploadModelCommitOk",
+    "UploadModelManifest",
+    "UploadModelManifestOk",
+]
+
+MAX_BLOB_BYTES: Final = 64 << 20
+MAX_MODEL_BYTES: Final = 512 << 20
+MAX_ASSETS: Final = 4096
+MAX_CHUNK_BYTES: Final = 4 << 20
+
+
+class AssetDigest(Struct, kw_only=True):
+    """One file of a model."""
+
+    name: Annotated[str, doc("Bare file name, as the document says it.")]
+    sha256: Annotated[str, doc("64 lower-case hexadecimal digits.")]
+    size: Annotated[int, doc("Bytes.")]
+
+
+class UploadModelManifestOk(Reply, tag="upload_model_manifest_ok", kw_only=True):
+    """An upload that is open, and what the server lacks."""
+
+    upload_id: Annotated[str, doc("Id of the upload.")]
+    need_xml: Annotated[bool, doc("Whether the document must be sent.")]
+    need_assets: Annotated[list[str], doc("Names of the files that must be sent.")]
+    max_asset_bytes: Annotated[int, doc("Largest file.")] = MAX_BLOB_BYTES
+    max_total_bytes: Annotated[int, doc("Largest model.")] = MAX_MODEL_BYTES
+
+
+class UploadModelManifest(Request[UploadModelManifestOk], tag="upload_model_manifest", kw_only=True):
+    """Say what a model consists of."""
+
+    xml_sha256: Annotated[str, doc("Hash of the document: 64 lower-case hexadecimal digits.")]
+    total_bytes: Annotated[int, doc("Bytes of the document and its files.")] = 0
+    assets: Annotated[list[AssetDigest], doc("Its files.")] = field(default_factory=list[AssetDigest])
+    step_mode: Annotated[str | None, doc("Step mode to go into with the commit, during play.")] = None
+
+
+class UploadModelChunkOk(Reply, tag="upload_model_chunk_ok", kw_only=True):
+    """How much of a file is there."""
+
+    name: Annotated[str, doc("Its name; `<xml>` for the document.")]
+    received: Annotated[int, doc("Bytes received.")]
+    complete: Annotated[bool, doc("Whether all are there and their hash is right.")]
+
+
+class UploadModelChunk(Request[UploadModelChunkOk], tag="upload_model_chunk", kw_only=True, omit_defaults=True):
+    """Send a piece of a file."""
+
+    upload_id: Annotated[str, doc("Id of the upload.")]
+    kind: Annotated[str, doc("`xml` or `asset`.")]
+    name: Annotated[str, doc("Name of the asset.")] = ""
+    offset: Annotated[int, doc("Where the piece begins.")] = 0
+    total: Annotated[int, doc("Bytes of the whole file.")] = 0
+    data: Annotated[bytes, doc("The piece.")]
+
+
+class UploadModelCommitOk(Reply, tag="upload_model_commit_ok", kw_only=True, omit_defaults=True):
+    """The blueprint made from the model. Sizes are those of the model that runs, if one does."""
+
+    imported: Annotated[bool, doc("True.")]
+    blueprint_class_path: Annotated[str, doc("Class path for `spawn_actor`.")] = ""
+    blueprint_short_name: Annotated[str, doc("Asset name.")] = ""
+    nq: Annotated[int | None, doc("`mjModel.nq` of the model that runs.")] = None
+    nv: Annotated[int | None, doc("`mjModel.nv`.")] = None
+    nu: Annotated[int | None, doc("`mjModel.nu`.")] = None
+    nbody: Annotated[int | None, doc("`mjModel.nbody`.")] = None
+    ngeom: Annotated[int | None, doc("`mjModel.ngeom`.")] = None
+    mjb: Annotated[bytes | None, doc("The model that runs in MuJoCo's binary format.")] = None
+    warnings: Annotated[list[str] | None, doc("None so far.")] = None
+
+
+class UploadModelCommit(Request[UploadModelCommitOk], tag="upload_model_commit", kw_only=True):
+    """Import a model that is complete."""
+
+    upload_id: Annotated[str, doc("Id of the upload.")]
+
+
+OPS: Final = (
+    Op(
+        request=UploadModelManifest,
+        ns="scene",
+        needs=Needs.NOTHING,
+        errors=("bad_request", "payload_too_large"),
+        dialects=("beta",),
+        declares=(
+            "op:string",
+            "upload_id:string",
+            "need_xml:bool",
+            "need_assets:array",
+            "max_asset_bytes:int",
+            "max_total_bytes:int",
+        ),
+    ),
+    Op(
+        request=UploadModelChunk,
+        ns="scene",
+        needs=Needs.NOTHING,
+        timeout=60.0,
+        errors=("bad_request", "payload_too_large", "unknown_upload", "hash_mismatch"),
+        undeclared=("data",),
+        dialects=("beta",),
+    ),
+    Op(
+        request=UploadModelCommit,
+        ns="scene",
+        needs=Needs.NOTHING,
+        timeout=600.0,
+        errors=("bad_request", "unknown_upload", "import_failed", "shutting_down"),
+        dialects=("beta",),
+        declares=(
+            "op:string",
+            "imported:bool",
+            "nq:int?",
+            "nv:int?",
+            "nu:int?",
+            "nbody:int?",
+            "ngeom:int?",
+            "mjb:object?",
+            "warnings:array",
+        ),
+    ),
+)

@@ -1,0 +1,1 @@
+"""Files that clients name: blueprints, levels and models, and compiling them safely."""

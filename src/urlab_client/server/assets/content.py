@@ -1,0 +1,752 @@
+"""The content root of the simulated server: a folder that stands for `/Game`, with its blueprints and levels.
+
+A blueprint is an MJCF file imported once. The content root keeps a self-contained snapshot of it (one XML plus the
+files it needs), so later edits of the source change nothing until the file is imported again:
+
+    MuJoCoImports/<stem>/blueprint.json         what was imported, from where, when
+    MuJoCoImports/<stem>/<digest>/model.xml     the snapshot, with its meshes and textures beside it
+    Levels/<name>.json                          a level
+
+For `World`, which knows what is placed where. Nothing here places, compiles scenes or talks to clients.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import logging
+import os
+import re
+import shutil
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cached_property
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Final, Literal
+
+import msgspec
+import mujoco
+
+from urlab_client._mujoco import actuator_count, actuator_kind, check_copy, write_model
+from urlab_client.server.assets.bundled_robots import BUNDLED_PREFIX, bundled_models, bundled_root
+from urlab_client.server.limits import Limits
+from urlab_client.server.refusal import Refusal
+from urlab_client.server.system.temporary_folder import sweep, working_in
+
+__all__ = [
+    "PARENT_CLASS",
+    "Blueprint",
+    "Compiled",
+    "ContentRoot",
+    "build_snapshot",
+    "level_package",
+    "mujoco_messages",
+    "one_line",
+    "sanitized",
+    "write_atomic",
+]
+
+logger = logging.getLogger("urlab_client.server")
+
+IMPORTS: Final = "MuJoCoImports"
+PARENT_CLASS: Final = "MjArticulation"
+
+_UNDER_WAY: Final = ".import-"
+"""What the folders begin with that are not finished yet, or are being removed."""
+
+DEFAULT_MODEL_NAMES: Final = frozenset({"", "MuJoCo Model"})
+"""What MuJoCo calls a model whose file gives no name."""
+
+_DEFAULT_LIMITS: Final = Limits()
+_LEVEL_SEGMENT: Final = re.compile(r"\w(?:[\w\- ]*[\w\-])?")
+_MAX_SEGMENT_BYTES: Final = 240
+_RESERVED: Final = {IMPORTS.casefold(): "holds blueprints", "urlab": "holds recordings"}
+_WINDOWS_DEVICES: Final = frozenset(
+    ("CON", "PRN", "AUX", "NUL", *(f"{kind}{number}" for kind in ("COM", "LPT") for number in range(1, 10)))
+)
+
+
+def sanitized(name: str) -> str:
+    """Return `name` with every character other than letters, digits and underscore replaced by an underscore."""
+    return re.sub(r"\W", "_", name)
+
+
+def one_line(error: object) -> str:
+    """Return MuJoCo's message, which may span lines, on one line."""
+    return " ".join(str(error).split())
+
+
+def level_package(name: str) -> str:
+    """Expand a level's name to its package path: `lab`, `/Game/Levels/lab` and `/Game/Levels/lab.lab` are one level.
+
+    Raises:
+        ValueError: The name has a part that cannot be a file name everywhere, or leads out of the content root.
+    """
+    in_game = name[:6].casefold() == "/game/"
+    parts = name[6:].split("/") if in_game else name.split("/")
+    package, _, described = parts[-1].partition(".")
+    if described.casefold() == package.casefold():  # an object path says the name again; the engine ignores case
+        parts[-1] = package
+    for part in parts:
+        if (
+            not _LEVEL_SEGMENT.fullmatch(part)
+            or len(part.encode()) > _MAX_SEGMENT_BYTES
+            or part.upper() in _WINDOWS_DEVICES
+        ):
+            raise ValueError(
+                f"'{name}' is not a level's name: use letters, digits, spaces, '-' and '_', "
+                "or a path of such parts that begins with /Game/"
+            )
+    if in_game and parts[0].casefold() in _RESERVED:
+        raise ValueError(f"'{name}' is not a level's name: /Game/{parts[0]} {_RESERVED[parts[0].casefold()]}")
+    return f"/Game/{'/'.join(parts)}" if in_game else f"/Game/Levels/{'/'.join(parts)}"
+
+
+def write_atomic(path: Path, data: bytes) -> None:
+    """Write `data` to `path` so that a reader, or a crash, sees the old file or the whole new one."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+    _sync_directory(path.parent)
+
+
+def _sync_directory(folder: Path) -> None:
+    """See to it that a new name outlives a power failure, where the system lets a directory be synchronised."""
+    if sys.platform == "win32":
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+class _Record(msgspec.Struct, frozen=True, kw_only=True):
+    """`blueprint.json`."""
+
+    format: Literal["urlab-blueprint"] = "urlab-blueprint"
+    version: Literal[1] = 1
+    stem: str
+    source: str
+    source_digest: str
+    imported_at: datetime
+    digest: str
+    model_name: str
+    joints: tuple[str, ...]
+    actuators: tuple[str, ...]
+    actuator_types: dict[str, str]
+    sensors: tuple[str, ...]
+    cameras: tuple[str, ...]
+    n_bytes: int = 0
+
+
+_RECORD: Final = msgspec.json.Decoder(_Record)
+_DIGEST: Final = re.compile(r"[0-9a-f]{16}")
+
+
+class Compiled(msgspec.Struct, frozen=True, kw_only=True):
+    """What is learnt from compiling a model; see `Blueprint` for the fields it shares.
+
+    Attributes:
+        messages: MuJoCo's warnings.
+        n_bytes: Size of the compiled model.
+        largest_image: Largest width or height of its cameras, pixels.
+    """
+
+    model_name: str
+    joints: tuple[str, ...]
+    actuators: tuple[str, ...]
+    actuator_types: dict[str, str]
+    sensors: tuple[str, ...]
+    cameras: tuple[str, ...]
+    messages: tuple[str, ...]
+    n_bytes: int
+    largest_image: int
+
+
+@dataclass(frozen=True, eq=False)
+class Blueprint:
+    """An imported MJCF.
+
+    Attributes:
+        stem: Sanitised file stem; identity of the blueprint.
+        folder: Folder of the snapshot; holds `model.xml`.
+        source: Absolute path of the imported file, or `bundled:<name>`.
+        source_digest: SHA-256 of the imported file itself, without what it includes.
+        imported_at: UTC.
+        digest: Hash of the snapshot's content.
+        model_name: The MJCF's `model` attribute; empty if it gives none.
+        joints: Joint names in compiled order, without prefix. Every element has a name: see `_name_elements`.
+        actuators: Actuator names in compiled order.
+        actuator_types: Actuator name to MJCF element; `motor` for `<general>`.
+        sensors: Sensor names in compiled order.
+        cameras: Camera names in compiled order.
+        n_bytes: Memory of the compiled model; 0 where an older import did not note it.
+    """
+
+    stem: str
+    folder: Path
+    source: str
+    source_digest: str
+    imported_at: datetime
+    digest: str
+    model_name: str
+    joints: tuple[str, ...]
+    actuators: tuple[str, ...]
+    actuator_types: Mapping[str, str]
+    sensors: tuple[str, ...]
+    cameras: tuple[str, ...]
+    n_bytes: int = 0
+
+    @property
+    def short_name(self) -> str:
+        """Asset name."""
+        return self.stem
+
+    @property
+    def package_path(self) -> str:
+        """For example `/Game/MuJoCoImports/robot`."""
+        return f"/Game/{IMPORTS}/{self.stem}"
+
+    @property
+    def class_name(self) -> str:
+        """For example `robot_C`."""
+        return f"{self.stem}_C"
+
+    @property
+    def class_path(self) -> str:
+        """For example `/Game/MuJoCoImports/robot.robot_C`."""
+        return f"{self.package_path}.{self.class_name}"
+
+    @cached_property
+    def spec(self) -> mujoco.MjSpec:
+        """The parsed snapshot. Copy it before editing or compiling.
+
+        Raises:
+            ValueError: MuJoCo cannot read it; the content root was damaged.
+        """
+        with mujoco_messages():
+            return mujoco.MjSpec.from_file(str(self.folder / "model.xml"))
+
+    @cached_property
+    def element_names(self) -> frozenset[str]:
+        """Names of all elements that get the actor's prefix, of whatever kind."""
+        spec = self.spec
+        kinds = [
+            *(elements for elements, _ in _naming(spec)),
+            *(spec.materials, spec.flexes, spec.numerics, spec.texts, spec.tuples, spec.plugins),
+        ]
+        # A spec does not list its default classes.
+        classes = re.findall(r'<default class="([^"]*)"', (self.folder / "model.xml").read_text("utf-8"))
+        return frozenset((*classes, "main", *(element.name for elements in kinds for element in elements)))
+
+
+class ContentRoot:
+    """The folder that stands for `/Game`, and the folders `import_xml` may read from."""
+
+    def __init__(self, saved_dir: Path, *, model_roots: Sequence[Path] = (), limits: Limits = _DEFAULT_LIMITS) -> None:
+        """Open a content root; what was imported into it earlier is there at once.
+
+        Args:
+            saved_dir: Folder of the content root; made when something is first written.
+            model_roots: Folders below which MJCF files may be imported. The models shipped with this package may
+                always be.
+            limits: For what clients name.
+        """
+        self.limits = limits
+        self.root = saved_dir.resolve()
+        self.model_roots = tuple(root.resolve() for root in model_roots)
+        self._blueprints: dict[str, Blueprint] = {}
+        sweep(self.root / IMPORTS, f"*/{_UNDER_WAY}*", f"{_UNDER_WAY}*")
+        for record in sorted(self.root.glob(f"{IMPORTS}/*/blueprint.json")):
+            try:
+                blueprint = _load(record)
+            except (OSError, ValueError) as error:
+                logger.warning("%s is not usable and left out: %s", record, error)
+            else:
+                self._blueprints[blueprint.stem] = blueprint
+
+    @property
+    def blueprints(self) -> Mapping[str, Blueprint]:
+        """The blueprints by stem."""
+        return MappingProxyType(self._blueprints)
+
+    def find_blueprint(self, path: str) -> Blueprint | None:
+        """Return the blueprint of a class path, or of a package path, as `spawn_actor` takes them.
+
+        A path that does not end in `_C` gets its last part appended, so neither a bare name nor an object path works,
+        as in the plugin.
+        """
+        class_path = path if path[-2:].casefold() == "_c" else f"{path}.{path.rpartition('/')[2]}_C"
+        wanted = class_path.casefold()
+        return next((item for item in self._blueprints.values() if item.class_path.casefold() == wanted), None)
+
+    def import_xml(self, path: str, *, force_reimport: bool = False, trusted: bool = False) -> tuple[Blueprint, bool]:
+        """Import an MJCF file, or return the blueprint of the same file stem.
+
+        Args:
+            path: The file: absolute, or relative to a model root, or the name of a bundled model.
+            force_reimport: Import again even if the stem is known. Actors get the new model at the next play.
+            trusted: The path comes from whoever runs the server, so it may lie anywhere.
+
+        Returns:
+            The blueprint, and whether it was imported now.
+
+        Raises:
+            Refusal: `missing_field` without a path; `import_failed` if the file lies outside the model roots, does not
+                exist, or MuJoCo rejects it.
+        """
+        if not path:
+            raise Refusal("missing_field", "path: name the MJCF file to import")
+        file, source = self._locate(path, trusted=trusted)
+        stem = sanitized(file.stem)
+        try:
+            size = file.stat().st_size
+            if size > self.limits.model_file_bytes and not trusted:
+                raise Refusal(
+                    "import_failed",
+                    f"{file} has {size} bytes, more than the limit model_file_bytes, {self.limits.model_file_bytes}",
+                )
+            text = file.read_bytes()
+        except OSError as error:
+            raise Refusal("import_failed", f"cannot read {file}: {error.strerror or error}") from None
+        known = self._blueprints.get(stem)
+        if known is not None and not force_reimport:
+            _warn_if_stale(known, source, text)
+            return known, False
+        try:
+            blueprint = self._import(file, stem, source, hashlib.sha256(text).hexdigest(), trusted=trusted)
+        except OSError as error:
+            raise Refusal("import_failed", f"cannot store the snapshot of {file} in {self.root}: {error}") from None
+        finally:
+            with contextlib.suppress(OSError):  # a folder with a blueprint in it stays
+                (self.root / IMPORTS / stem).rmdir()
+        self._blueprints[stem] = blueprint
+        return blueprint, True
+
+    def adopt(self, record: Path, digest: str) -> Blueprint | None:
+        """Register the blueprint of another content root, copying its snapshot.
+
+        Args:
+            record: Its `blueprint.json`.
+            digest: The snapshot wanted.
+
+        Returns:
+            The blueprint; None if the other content root has another snapshot by now.
+
+        Raises:
+            OSError, ValueError: It is not a usable blueprint.
+        """
+        other = _load(record)
+        if other.digest != digest:
+            return None
+        home = self.root / IMPORTS / other.stem
+        folder = home / other.digest
+        if not folder.exists():
+            home.mkdir(parents=True, exist_ok=True)
+            with (
+                working_in(self.root / IMPORTS),
+                tempfile.TemporaryDirectory(dir=home, prefix=_UNDER_WAY) as temporary_folder,
+            ):
+                copy = Path(temporary_folder) / "snapshot"
+                shutil.copytree(other.folder, copy)
+                os.replace(copy, folder)
+        return self._register(home, folder, _record(other))
+
+    def remove_blueprint(self, stem: str) -> None:
+        """Forget a blueprint and delete its folder.
+
+        Raises:
+            OSError: It cannot be deleted.
+        """
+        removed = self.root / IMPORTS / f"{_UNDER_WAY}{stem}"
+        shutil.rmtree(removed, ignore_errors=True)
+        os.replace(self.root / IMPORTS / stem, removed)  # whole, or not at all
+        del self._blueprints[stem]
+        shutil.rmtree(removed, ignore_errors=True)
+
+    def open_to_clients(self, path: Path) -> bool:
+        """Whether a resolved path lies where clients may read: below the content root, a model root, or bundled."""
+        return any(path.is_relative_to(root) for root in (self.root, *self.model_roots, bundled_root()))
+
+    def level_file(self, package: str) -> Path:
+        """Return the file that stands for a level's package path, as `level_package` returns it."""
+        return self.root.joinpath(*package.removeprefix("/Game/").split("/")).with_suffix(".json")
+
+    def snapshot_record(self, blueprint: Blueprint) -> Path:
+        """Return the `blueprint.json` of a registered blueprint."""
+        return self.root / IMPORTS / blueprint.stem / "blueprint.json"
+
+    def _locate(self, path: str, *, trusted: bool) -> tuple[Path, str]:
+        """Return the file behind a request's path and how the blueprint names its source."""
+        bundled = bundled_models()
+        name = path.removeprefix(BUNDLED_PREFIX)
+        if name in bundled:  # no file is meant: MuJoCo reads none without a suffix
+            return bundled[name], f"{BUNDLED_PREFIX}{name}"
+        if name != path:
+            raise Refusal("import_failed", f"no bundled model is called '{name}': use {', '.join(bundled)}")
+        try:
+            candidates = self._candidates(path, trusted=trusted)
+            file = next((candidate for candidate in candidates if candidate.is_file()), None)
+        except (OSError, ValueError) as error:  # too long, a null byte, a loop of links
+            raise Refusal("import_failed", f"{path!r} is no usable path: {error}") from None
+        if file is not None:
+            packaged = {location.resolve(): name for name, location in bundled.items()}
+            return file, f"{BUNDLED_PREFIX}{packaged[file]}" if file in packaged else str(file)
+        if not candidates:
+            raise Refusal(
+                "import_failed",
+                f"{path} lies outside the folders this server may read models from ({self._roots_text()}); "
+                "start it with --model-root DIR to allow another",
+            )
+        if any(candidate.is_dir() for candidate in candidates):
+            raise Refusal("import_failed", f"{path} is a folder; name an MJCF file")
+        where = f" in {self._roots_text()}" if not Path(path).is_absolute() else ""
+        raise Refusal("import_failed", f"{path} does not exist{where}")
+
+    def _candidates(self, path: str, *, trusted: bool) -> list[Path]:
+        """Return the resolved places that may stand for `path`; empty when all are out of bounds."""
+        bases = [Path.cwd()] if trusted else self.model_roots
+        places = [Path(path)] if Path(path).is_absolute() else [base / path for base in bases]
+        resolved = [place.resolve() for place in places]
+        if trusted:
+            return resolved
+        allowed = (*self.model_roots, bundled_root())
+        return [place for place in resolved if any(place.is_relative_to(root) for root in allowed)]
+
+    def _roots_text(self) -> str:
+        return ", ".join(map(str, self.model_roots)) or "none but the bundled models"
+
+    def _import(self, file: Path, stem: str, source: str, source_digest: str, *, trusted: bool) -> Blueprint:
+        home = self.root / IMPORTS / stem
+        home.mkdir(parents=True, exist_ok=True)
+        with (
+            working_in(self.root / IMPORTS),
+            tempfile.TemporaryDirectory(dir=home, prefix=_UNDER_WAY) as temporary_folder,
+        ):
+            snapshot = Path(temporary_folder) / "snapshot"
+            compiled = self._build(file, snapshot, trusted=trusted)
+            for message in compiled.messages:
+                logger.warning("%s: %s", file, one_line(message))
+            digest = _digest(snapshot)
+            folder = home / digest
+            is_new = not folder.exists()
+            if is_new:
+                os.replace(snapshot, folder)
+        record = _Record(
+            stem=stem,
+            source=source,
+            source_digest=source_digest,
+            imported_at=datetime.now(UTC),
+            digest=digest,
+            model_name=compiled.model_name,
+            joints=compiled.joints,
+            actuators=compiled.actuators,
+            actuator_types=compiled.actuator_types,
+            sensors=compiled.sensors,
+            cameras=compiled.cameras,
+            n_bytes=compiled.n_bytes,
+        )
+        try:
+            return self._register(home, folder, record)
+        except OSError:
+            if is_new:
+                shutil.rmtree(folder, ignore_errors=True)
+            raise
+
+    def _build(self, file: Path, snapshot: Path, *, trusted: bool) -> Compiled:
+        if trusted or file.is_relative_to(bundled_root()):
+            try:
+                return build_snapshot(file, snapshot)
+            except (ValueError, mujoco.FatalError) as error:
+                raise Refusal("import_failed", f"MuJoCo rejects {file}: {one_line(error)}") from None
+        from urlab_client.server.assets.sandbox import build_confined  # noqa: PLC0415 - it imports this module
+
+        return build_confined(file, snapshot, (*self.model_roots, bundled_root()), self.limits)
+
+    def _register(self, home: Path, folder: Path, record: _Record) -> Blueprint:
+        known = self._blueprints.get(record.stem)
+        write_atomic(home / "blueprint.json", msgspec.json.format(msgspec.json.encode(record)))
+        blueprint = _blueprint(folder, record)
+        self._blueprints[record.stem] = blueprint
+        # A play session under way may still read the model before this one; older ones serve nobody.
+        keep = {folder, known.folder if known is not None else folder}
+        for stale in home.iterdir():
+            if stale.is_dir() and stale not in keep and not stale.name.startswith("."):
+                shutil.rmtree(stale, ignore_errors=True)
+        return blueprint
+
+
+def build_snapshot(file: Path, snapshot: Path) -> Compiled:
+    """Compile an MJCF file and write what is kept of it.
+
+    Args:
+        file: The file.
+        snapshot: Folder to write, which must not exist.
+
+    Raises:
+        ValueError, mujoco.FatalError: MuJoCo rejects it.
+    """
+    with mujoco_messages() as messages:
+        spec = mujoco.MjSpec.from_file(str(file))
+        # Compiles the file itself, so that an error names the source's own line.
+        original = mujoco.MjModel.from_xml_path(str(file))
+        prepared = _prepared(spec)
+        kinds = {actuator.name: _actuator_kind(actuator) for actuator in prepared.actuators}
+        _write_snapshot(prepared, snapshot, messages)
+        model = mujoco.MjModel.from_xml_path(str(snapshot / "model.xml"))
+        check_copy(original, model)
+    return Compiled(
+        model_name="" if spec.modelname in DEFAULT_MODEL_NAMES else spec.modelname,
+        joints=_names(model.njnt, model.joint),
+        actuators=_names(actuator_count(model), model.actuator),
+        actuator_types=kinds,
+        sensors=_names(model.nsensor, model.sensor),
+        cameras=_names(model.ncam, model.camera),
+        messages=tuple(dict.fromkeys(messages)),
+        n_bytes=mujoco.mj_sizeModel(model),
+        largest_image=int(model.cam_resolution.max(initial=0)),
+    )
+
+
+_hook_lock = threading.Lock()
+
+
+@contextlib.contextmanager
+def mujoco_messages() -> Generator[list[str]]:
+    """Collect the warnings that MuJoCo gives this thread, instead of letting it print and write `MUJOCO_LOG.TXT`.
+
+    MuJoCo has one handler per process. Warnings that other threads cause meanwhile go to the handler that was there,
+    or else to the log.
+    """
+    thread = threading.get_ident()
+    messages: list[str] = []
+    with _hook_lock:
+        previous: Callable[[str], None] | None = mujoco.get_mju_user_warning()
+
+        def collect(text: str) -> None:
+            if threading.get_ident() == thread:
+                messages.append(text)
+            elif previous is not None:
+                previous(text)
+            else:
+                logger.warning("MuJoCo: %s", text)
+
+        mujoco.set_mju_user_warning(collect)
+        try:
+            yield messages
+        finally:
+            mujoco.set_mju_user_warning(previous)
+
+
+def _load(record: Path) -> Blueprint:
+    decoded = _RECORD.decode(record.read_bytes())
+    if not decoded.stem or decoded.stem != sanitized(decoded.stem) or not _DIGEST.fullmatch(decoded.digest):
+        raise ValueError(f"'{decoded.stem}' and '{decoded.digest}' cannot be the names of folders")
+    folder = record.parent / decoded.digest
+    if not (folder / "model.xml").is_file():
+        raise ValueError(f"its snapshot {folder} is gone")
+    return _blueprint(folder, decoded)
+
+
+def _blueprint(folder: Path, record: _Record) -> Blueprint:
+    return Blueprint(
+        stem=record.stem,
+        folder=folder,
+        source=record.source,
+        source_digest=record.source_digest,
+        imported_at=record.imported_at,
+        digest=record.digest,
+        model_name=record.model_name,
+        joints=record.joints,
+        actuators=record.actuators,
+        actuator_types=MappingProxyType(record.actuator_types),
+        sensors=record.sensors,
+        cameras=record.cameras,
+        n_bytes=record.n_bytes,
+    )
+
+
+def _record(blueprint: Blueprint) -> _Record:
+    return _Record(
+        stem=blueprint.stem,
+        source=blueprint.source,
+        source_digest=blueprint.source_digest,
+        imported_at=blueprint.imported_at,
+        digest=blueprint.digest,
+        model_name=blueprint.model_name,
+        joints=blueprint.joints,
+        actuators=blueprint.actuators,
+        actuator_types=dict(blueprint.actuator_types),
+        sensors=blueprint.sensors,
+        cameras=blueprint.cameras,
+        n_bytes=blueprint.n_bytes,
+    )
+
+
+def _warn_if_stale(known: Blueprint, source: str, text: bytes) -> None:
+    if known.source != source:
+        logger.warning(
+            "%s was not imported: blueprint '%s' of %s exists and is used. Rename one of the files, or import with "
+            "force_reimport.",
+            source,
+            known.stem,
+            known.source,
+        )
+    elif known.source_digest != hashlib.sha256(text).hexdigest():
+        logger.warning(
+            "%s has changed since it was imported at %s, and that import is used. Import with force_reimport to take "
+            "the changes.",
+            source,
+            known.imported_at.isoformat(timespec="seconds"),
+        )
+
+
+def _write_snapshot(spec: mujoco.MjSpec, folder: Path, messages: list[str]) -> None:
+    """Write a spec and every file it needs to `folder`, as `model.xml` and what is beside it."""
+    before = len(messages)
+    try:
+        write_model(spec, folder)
+    except mujoco.FatalError:
+        # A model made of attached parts is written only once compilation has assembled its keyframes.
+        del messages[before:]
+        spec.compile()
+        write_model(spec, folder)
+
+
+def _digest(folder: Path) -> str:
+    digest = hashlib.sha256()
+    for file in sorted(path for path in folder.rglob("*") if path.is_file()):
+        digest.update(file.relative_to(folder).as_posix().encode() + b"\0")
+        digest.update(hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()[:16]
+
+
+def _names(count: int, element: Callable[[int], Any]) -> tuple[str, ...]:
+    return tuple(element(index).name for index in range(count))
+
+
+def _prepared(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """Return a copy of a parsed spec as the importer of the plugin would leave it: all named, keyframes complete."""
+    prepared = spec.copy()  # a copy no longer repeats the warnings of parsing when it is compiled
+    prepared.compiler.settotalmass = -1.0  # has no effect once attached, and warns at every compilation
+    _name_elements(prepared)
+    _complete_keyframes(prepared)
+    return prepared
+
+
+_SENSOR_TAGS: Final = {
+    "JOINTACTFRC": "Jointactuatorfrc",
+    "TENDONACTFRC": "Tendonactuatorfrc",
+    "GEOMDIST": "Distance",
+    "GEOMNORMAL": "Normal",
+    "GEOMFROMTO": "Fromto",
+}
+"""Sensors whose MJCF element is called differently from MuJoCo's constant."""
+
+
+def _constant(value: Any) -> str:
+    """Return the last part of an enumeration member: `SPHERE` for `mjGEOM_SPHERE`."""
+    return str(value.name).partition("_")[2]
+
+
+def _actuator_kind(actuator: Any) -> str:
+    kind = actuator_kind(actuator)
+    return "motor" if kind == "general" else kind
+
+
+def _file_stem(asset: Any) -> str:
+    return re.split(r"[/\\]", asset.file)[-1].rpartition(".")[0]
+
+
+def _naming(spec: mujoco.MjSpec) -> list[tuple[Sequence[Any], Callable[[Any], str]]]:
+    """Return each kind of element that MJCF allows without a name, and what the plugin's importer calls one."""
+    return [
+        (spec.bodies[1:], lambda body: f"{body.parent.name if body.parent.id else 'worldbody'}_Body"),
+        (spec.joints, lambda joint: f"{_constant(joint.type).capitalize()}Joint"),
+        (spec.geoms, lambda geom: f"Geom_{_constant(geom.type).capitalize()}"),
+        (spec.sites, lambda _: "Site"),
+        (spec.cameras, lambda _: "Camera"),
+        (spec.lights, lambda _: "Light"),
+        (spec.actuators, lambda actuator: f"{actuator_kind(actuator).capitalize()}Actuator"),
+        (
+            spec.sensors,
+            lambda sensor: f"{_SENSOR_TAGS.get(_constant(sensor.type), _constant(sensor.type).capitalize())}Sensor",
+        ),
+        (spec.tendons, lambda _: "Tendon"),
+        (spec.equalities, lambda equality: f"{_constant(equality.type).capitalize()}Equality"),
+        (spec.pairs, lambda _: "Pair"),
+        (spec.excludes, lambda _: "Exclude"),
+        (spec.keys, lambda _: "Keyframe"),
+        (spec.meshes, lambda mesh: _file_stem(mesh) or "Mesh"),
+        (spec.hfields, lambda hfield: _file_stem(hfield) or "Hfield"),
+        (spec.textures, lambda texture: _file_stem(texture) or "Texture"),
+        (spec.skins, lambda _: "Skin"),
+    ]
+
+
+def _name_elements(spec: mujoco.MjSpec) -> None:
+    """Give every unnamed element a name that no other of its kind has: `HingeJoint`, then `HingeJoint1`, …"""
+    for elements, base in _naming(spec):
+        taken = {element.name for element in elements}
+        following: dict[str, int] = {}
+        for element in elements:
+            if element.name:
+                continue
+            stem = base(element)
+            count = following.get(stem, 0)
+            name = stem if count == 0 else f"{stem}{count}"
+            while name in taken:
+                count += 1
+                name = f"{stem}{count}"
+            following[stem] = count + 1
+            taken.add(name)
+            element.name = name
+
+
+def _complete_keyframes(spec: mujoco.MjSpec) -> None:
+    """Bring keyframes to the form in which the plugin merges them.
+
+    Vectors that leave out the free joints get an identity block for each. Mocap poses are dropped: every key of a
+    merged scene holds the compiled poses.
+    """
+    free = mujoco.mjtJoint.mjJNT_FREE
+    widths = {free: (7, 6), mujoco.mjtJoint.mjJNT_BALL: (4, 3)}
+    joints = [(joint.type == free, *widths.get(joint.type, (1, 1))) for joint in spec.joints]
+    for key in spec.keys:
+        key.qpos = _with_free_joints(list(key.qpos), [(is_free, nq) for is_free, nq, _ in joints], _REST_POSE)
+        key.qvel = _with_free_joints(list(key.qvel), [(is_free, nv) for is_free, _, nv in joints], _REST_VELOCITY)
+        key.mpos = []
+        key.mquat = []
+
+
+_REST_POSE: Final = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+_REST_VELOCITY: Final = (0.0,) * 6
+
+
+def _with_free_joints(values: list[float], joints: list[tuple[bool, int]], block: Sequence[float]) -> list[float]:
+    """Return `values` with `block` put in for each free joint, if it has exactly the other joints' coordinates."""
+    if not values or len(values) != sum(width for is_free, width in joints if not is_free):
+        return values
+    complete: list[float] = []
+    position = 0
+    for is_free, width in joints:
+        if is_free:
+            complete += block
+        else:
+            complete += values[position : position + width]
+            position += width
+    return complete

@@ -1,0 +1,236 @@
+"""Compiling models that clients name, in a child process with limits.
+
+For `ContentRoot`. MuJoCo's compiler takes all the memory and time that a file asks for, cannot be broken off, and is
+written in C++: so it runs where it may fail. One child per server process is started with the first such model, with
+MuJoCo loaded; for each model it forks a grandchild, which lives under the limits and sees no other model. Where there
+is no `fork` (Windows) the child does the work itself and is replaced after each model; there the limits are wall time
+and what the operating system gives.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import os
+import select
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from urlab_client._children import APART
+from urlab_client._confined import limit_process
+from urlab_client._landlock import confine_files
+from urlab_client.server.assets.confinement import Outside, check_references
+from urlab_client.server.assets.content import Compiled, build_snapshot, one_line
+from urlab_client.server.limits import Limits
+from urlab_client.server.refusal import Refusal
+
+__all__ = ["build_confined"]
+
+_GRACE_S: Final = 5.0
+_REPLY_BYTES: Final = 64 * 2**20
+
+
+class _SandboxJob(msgspec.Struct):
+    """One line to the child."""
+
+    file: str
+    snapshot: str
+    roots: list[str]
+    limits: Limits
+
+
+class _Outcome(msgspec.Struct):
+    """One line back: what was done, or why not, and of what that is said if not of the file alone."""
+
+    done: Compiled | None = None
+    refused: str = ""
+    subject: str = ""
+
+
+_ORDER: Final = msgspec.json.Decoder(_SandboxJob)
+_OUTCOME: Final = msgspec.json.Decoder(_Outcome)
+
+
+class _Child:
+    """The process that compiles; started when needed and kept."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._pid = 0
+
+    def build(self, order: _SandboxJob) -> _Outcome:
+        """Have a model compiled."""
+        with self._lock:
+            if self._pid != os.getpid():  # a forked copy of this program has no child of its own
+                self._process, self._pid = None, os.getpid()
+            for _ in range(2):  # a child that ended meanwhile is replaced, once
+                process = self._process or self._start()
+                line = self._exchange(process, msgspec.json.encode(order) + b"\n", order.limits.model_wall_s)
+                if line:
+                    if not hasattr(os, "fork"):
+                        self._end()
+                    return _OUTCOME.decode(line)
+                self._end()
+        return _Outcome(refused="compilation ended without an answer: it exceeded its limits, or MuJoCo failed")
+
+    def close(self) -> None:
+        """End the child."""
+        with self._lock:
+            if self._pid == os.getpid():
+                self._end()
+
+    def _start(self) -> subprocess.Popen[bytes]:
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "urlab_client.server.assets.sandbox"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            **APART,
+        )
+        return self._process
+
+    def _exchange(self, process: subprocess.Popen[bytes], line: bytes, wall_s: float) -> bytes:
+        if process.stdin is None or process.stdout is None:
+            raise TypeError("the child's input and output must be pipes")
+        watchdog = threading.Timer(wall_s + _GRACE_S, process.kill)
+        watchdog.daemon = True
+        watchdog.start()
+        try:
+            process.stdin.write(line)
+            process.stdin.flush()
+            answer = process.stdout.readline(_REPLY_BYTES)
+        except OSError:
+            return b""
+        finally:
+            watchdog.cancel()
+            watchdog.join()
+        return answer if answer.endswith(b"\n") else b""
+
+    def _end(self) -> None:
+        process, self._process = self._process, None
+        if process is None:
+            return
+        for stream in (process.stdin, process.stdout):
+            if stream is not None:
+                with contextlib.suppress(OSError):
+                    stream.close()
+        process.kill()
+        process.wait()
+
+
+_child = _Child()
+atexit.register(_child.close)
+
+
+def build_confined(file: Path, snapshot: Path, roots: tuple[Path, ...], limits: Limits) -> Compiled:
+    """Do what `build_snapshot` does, in a child process, for a file that may only name files below `roots`.
+
+    Raises:
+        Refusal: `import_failed`, with what was wrong or which limit was exceeded.
+    """
+    order = _SandboxJob(str(file), str(snapshot), [str(root) for root in roots], limits)
+    outcome = _child.build(order)
+    if outcome.done is None:
+        raise Refusal("import_failed", f"{outcome.subject or file}: {outcome.refused}")
+    return outcome.done
+
+
+# The child.
+
+
+def _serve() -> None:
+    """Take orders from standard input until it ends."""
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what libraries print is no answer
+    for signum in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(signum, signal.SIG_IGN)  # they are for the server, which ends this process
+    for line in sys.stdin.buffer:
+        order = _ORDER.decode(line)
+        outcome = _fork(order) if hasattr(os, "fork") else _work(order)
+        answers.write(msgspec.json.encode(outcome) + b"\n")
+        answers.flush()
+
+
+def _fork(order: _SandboxJob) -> _Outcome:
+    reading, writing = os.pipe()
+    pid = os.fork()
+    if pid == 0:
+        os.close(reading)
+        try:
+            limit_process(order.limits.model_memory_bytes, order.limits.model_cpu_s)
+            confine_files(map(Path, order.roots), (Path(order.snapshot).parent,))
+            with os.fdopen(writing, "wb") as stream:
+                stream.write(msgspec.json.encode(_work(order)))
+        finally:
+            os._exit(0)
+    os.close(writing)
+    try:
+        answer, in_time = _read(reading, time.monotonic() + order.limits.model_wall_s)
+    finally:
+        os.close(reading)
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+        status = os.waitpid(pid, 0)[1]
+    if answer and in_time:
+        return _OUTCOME.decode(answer)
+    limits = order.limits
+    if not in_time:
+        return _Outcome(refused=f"compilation took longer than the limit model_wall_s, {limits.model_wall_s} s")
+    if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU:
+        return _Outcome(refused=f"compilation took more than the limit model_cpu_s, {limits.model_cpu_s} s")
+    return _Outcome(
+        refused="MuJoCo failed on it, or compilation needs more memory than the limit model_memory_bytes, "
+        f"{limits.model_memory_bytes}"
+    )
+
+
+def _read(descriptor: int, deadline: float) -> tuple[bytes, bool]:
+    """Read to the end; return what came, and whether it ended by the deadline."""
+    parts: list[bytes] = []
+    while select.select([descriptor], [], [], max(0.0, deadline - time.monotonic()))[0]:
+        part = os.read(descriptor, 1 << 16)
+        if not part:
+            return b"".join(parts), True
+        parts.append(part)
+    return b"", False
+
+
+def _work(order: _SandboxJob) -> _Outcome:
+    limits, stage = order.limits, f"cannot read {order.file}"
+    try:
+        check_references(Path(order.file), tuple(map(Path, order.roots)), limits)
+        snapshot, stage = Path(order.snapshot), f"cannot store the snapshot of {order.file}"
+        compiled = build_snapshot(Path(order.file), snapshot)
+        check_references(snapshot / "model.xml", (snapshot,), limits)  # the server reads it with nothing in its way
+    except (Outside, Refusal) as refusal:
+        return _Outcome(refused=refusal.message)
+    except MemoryError:
+        return _Outcome(
+            refused=f"compilation needs more than the limit model_memory_bytes, {limits.model_memory_bytes}"
+        )
+    except OSError as error:
+        return _Outcome(refused=one_line(error), subject=stage)
+    except Exception as error:  # noqa: BLE001 - whatever it was, the server must hear of it
+        return _Outcome(refused=one_line(error), subject=f"MuJoCo rejects {order.file}")
+    exceeded = _exceeded(compiled, limits)
+    return _Outcome(refused=exceeded) if exceeded else _Outcome(done=compiled)
+
+
+def _exceeded(compiled: Compiled, limits: Limits) -> str:
+    """Return which limit a compiled model exceeds, or nothing."""
+    if compiled.n_bytes > limits.model_bytes:
+        return f"compiled it takes {compiled.n_bytes} bytes, more than the limit model_bytes, {limits.model_bytes}"
+    if compiled.largest_image > limits.camera_side:
+        return f"a camera of {compiled.largest_image} pixels exceeds the limit camera_side, {limits.camera_side}"
+    return ""
+
+
+if __name__ == "__main__":
+    _serve()

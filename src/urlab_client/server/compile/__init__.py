@@ -1,0 +1,1 @@
+"""From the actors of a level to one MuJoCo model."""

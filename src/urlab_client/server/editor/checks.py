@@ -1,0 +1,58 @@
+"""Checks of what a request says about an actor: names, numbers, rotations, poses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from ctypes import c_float
+
+from urlab_client.protocol.base import Quat, Vec3
+from urlab_client.protocol.rotation import euler_to_quat, normalized
+from urlab_client.server.assets.actors import UNIT_SCALE
+from urlab_client.server.refusal import Refusal
+
+__all__ = ["float32", "pose", "refuse_infinite", "refuse_scale", "require", "rotation"]
+
+
+def require(value: str, name: str) -> None:
+    """Refuse with `missing_field` when a name is empty."""
+    if not value:
+        raise Refusal("missing_field", f"{name} must not be empty")
+
+
+def float32(value: float) -> float:
+    """Round to single precision, in which the plugin keeps it."""
+    return c_float(value).value
+
+
+def refuse_infinite(values: Iterable[float], names: str, code: str) -> None:
+    """Refuse with `code` unless all numbers are finite."""
+    if not all(math.isfinite(value) for value in values):
+        raise Refusal(code, f"{names} must be finite numbers")
+
+
+def refuse_scale(scale: Vec3, code: str) -> None:
+    """Refuse with `code` unless the scale is 1."""
+    if scale != UNIT_SCALE:
+        raise Refusal(
+            code,
+            f"an articulation cannot be scaled by {list(scale)}: MuJoCo has no scale for a placed model; "
+            "change the sizes in the MJCF",
+        )
+
+
+def rotation(quat: Quat | None, euler: Vec3 | None, code: str) -> Quat | None:
+    """Return the rotation a spawn op means, unnormalised; None if it names none."""
+    if quat is not None or euler is None:
+        return quat
+    refuse_infinite(euler, "rotation_euler", code)
+    return euler_to_quat(euler)
+
+
+def pose(location: Vec3, rotation: Quat, code: str) -> tuple[Vec3, Quat]:
+    """Return position and unit quaternion; refuse with `code` what is not a pose."""
+    refuse_infinite(location, "location", code)
+    try:
+        return location, normalized(rotation)
+    except ValueError as error:
+        raise Refusal(code, f"rotation_quat: {error}") from None

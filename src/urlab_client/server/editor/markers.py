@@ -1,0 +1,186 @@
+"""Debug drawing: primitives with a time to live, and one line of text.
+
+For the `debug` handlers, which add to a `Drawings`, and for `snapshot`, which reads from it. Robot cameras do not show
+any of it, so that it gets into no training data. Positions are metres and rotations quaternions (x, y, z, w), both in
+MuJoCo's frame.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final, TypeAlias
+
+from urlab_client.protocol.base import Quat, Vec3
+from urlab_client.server.limits import Limits
+
+__all__ = ["MARKER_RADIUS_M", "Arrow", "Box", "DebugLine", "Drawings", "Primitive", "Sphere", "Text"]
+
+logger = logging.getLogger("urlab_client.server")
+
+MARKER_RADIUS_M: Final = 0.05
+OVERLAY_S: Final = 10.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sphere:
+    """A sphere of `MARKER_RADIUS_M`.
+
+    Attributes:
+        center: Centre.
+        color: Red, green, blue in 0..1, in steps of 1/255.
+    """
+
+    center: Vec3
+    color: Vec3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Text:
+    """A label in the world.
+
+    Attributes:
+        at: Where it stands.
+        text: The text.
+        color: Red, green, blue in 0..1.
+    """
+
+    at: Vec3
+    text: str
+    color: Vec3
+
+
+@dataclass(frozen=True, kw_only=True)
+class DebugLine:
+    """A line segment.
+
+    Attributes:
+        start: One end.
+        end: The other.
+        color: Red, green, blue in 0..1.
+        thickness: Width; 1 is the usual.
+    """
+
+    start: Vec3
+    end: Vec3
+    color: Vec3
+    thickness: float = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Box:
+    """A box of lines.
+
+    Attributes:
+        center: Centre.
+        half_extents: Half sizes.
+        rotation: Unit quaternion.
+        color: Red, green, blue in 0..1.
+    """
+
+    center: Vec3
+    half_extents: Vec3
+    rotation: Quat
+    color: Vec3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arrow:
+    """An arrow.
+
+    Attributes:
+        start: Tail.
+        end: Tip.
+        color: Red, green, blue in 0..1.
+        head: Size of the head, metres.
+        thickness: Width of its lines; 1 is the usual.
+    """
+
+    start: Vec3
+    end: Vec3
+    color: Vec3
+    head: float
+    thickness: float = 1.0
+
+
+Primitive: TypeAlias = Sphere | Text | DebugLine | Box | Arrow
+
+
+@dataclass(frozen=True)
+class _Marker:
+    primitive: Primitive
+    expires: float | None  # None: with the next frame
+
+
+class Drawings:
+    """What was drawn into the edited world and into the play world. Safe to use from several threads."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic, *, limit: int = Limits.markers) -> None:
+        """Start with nothing.
+
+        Args:
+            clock: Seconds since any moment; never goes back.
+            limit: Primitives kept per world; the oldest give way.
+        """
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._worlds: dict[bool, deque[_Marker]] = {False: deque(), True: deque()}
+        self._overlay = ("", -math.inf)
+        self._limit = limit
+
+    def add(self, primitives: Sequence[Primitive], *, ttl: float, in_play: bool) -> None:
+        """Draw.
+
+        Args:
+            primitives: What to draw.
+            ttl: Seconds to live; 0 for the next frame alone, negative until cleared.
+            in_play: In the play world, rather than the edited one.
+        """
+        now = self._clock()
+        expires = math.inf if ttl < 0.0 else now + ttl if ttl > 0.0 else None
+        with self._lock:
+            entries = self._alive(in_play, now)
+            entries.extend(_Marker(primitive, expires) for primitive in primitives)
+            surplus = len(entries) - self._limit
+            for _ in range(surplus):
+                entries.popleft()
+        if surplus > 0:
+            logger.warning(
+                "more than %d debug primitives (limit markers): the oldest are dropped; use clear_markers", self._limit
+            )
+
+    def clear(self, *, in_play: bool) -> None:
+        """Remove everything drawn into a world."""
+        with self._lock:
+            self._worlds[in_play].clear()
+
+    def take_frame(self, *, in_play: bool) -> list[Primitive]:
+        """Return what the next frame shows; what was to last one frame is gone after it."""
+        with self._lock:
+            entries = self._alive(in_play, self._clock())
+            shown = [entry.primitive for entry in entries]
+            self._worlds[in_play] = deque(entry for entry in entries if entry.expires is not None)
+        return shown
+
+    def set_overlay(self, text: str) -> None:
+        """Show a line of text for ten seconds, instead of any other; empty text clears it."""
+        with self._lock:
+            self._overlay = (text, self._clock() + OVERLAY_S)
+
+    @property
+    def overlay(self) -> str:
+        """The line of text; empty when there is none."""
+        text, expires = self._overlay
+        return text if self._clock() < expires else ""
+
+    def _alive(self, in_play: bool, now: float) -> deque[_Marker]:
+        entries = self._worlds[in_play]
+        if any(entry.expires is not None and entry.expires <= now for entry in entries):
+            entries = deque(entry for entry in entries if entry.expires is None or entry.expires > now)
+            self._worlds[in_play] = entries
+        return entries

@@ -1,0 +1,1 @@
+"""A play session: stepping, controllers, options, what replies report, recording and replay."""

@@ -1,0 +1,139 @@
+"""Reply blocks made from `mjData`: what an articulation, an entity and the clocks look like on the wire.
+
+For the op handlers and publishers. The caller holds the engine's lock; everything returned is a copy.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from urlab_client.protocol.enums import ObservationLevel
+from urlab_client.protocol.messages.session import ArticulationState, BodyPose, Clock, EntityState, TwistState
+from urlab_client.server.compile.scene import CompiledScene, EntityIndex
+from urlab_client.server.physics.controllers import ArticulationControl
+
+__all__ = ["Observer", "sim_clock", "wall_clock"]
+
+INT32_MAX = 2**31 - 1
+
+
+def sim_clock(seconds: float) -> Clock:
+    """Split a time in seconds into integers, truncating; what no 32-bit second can hold reads as the nearest one."""
+    if not math.isfinite(seconds):
+        return Clock(sec=0, nsec=0)
+    sec = max(-INT32_MAX, min(INT32_MAX, int(seconds)))
+    return Clock(sec=sec, nsec=int((seconds - sec) * 1e9) if abs(seconds) <= INT32_MAX else 0)
+
+
+def wall_clock() -> Clock:
+    """Return UTC now; `nsec` is a multiple of 100."""
+    sec, nsec = divmod(time.time_ns(), 1_000_000_000)
+    return Clock(sec=sec, nsec=nsec - nsec % 100)
+
+
+class _StateReader:
+    """Where one articulation's values lie, prepared so that reading costs one gather per field."""
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, control: ArticulationControl) -> None:
+        index = control.index
+        self._twist = control.twist
+        self._qpos = data.qpos
+        self._qvel = data.qvel
+        self._ctrl = data.ctrl
+        self._act = data.act
+        self._force = data.actuator_force
+        self._sensordata = data.sensordata
+        self._xpos = data.xpos
+        self._xquat = data.xquat
+        self._qpos_adr = index.qpos_adr.astype(np.intp)
+        self._qvel_adr = index.qvel_adr.astype(np.intp)
+        self._ctrl_adr = index.ctrl_adr.astype(np.intp)
+        self._force_adr = index.force_adr.astype(np.intp)
+        stateful = index.act_adr >= 0
+        self._act_places = np.flatnonzero(stateful)
+        self._act_adr = index.act_adr[stateful].astype(np.intp)
+        self._bodies = index.bodies.astype(np.intp)
+        self._body_names = index.body_names
+        self._sensor_adr, self._sensors = _sensors(model, index.sensors, index.sensor_names)
+
+    def read(self, level: ObservationLevel) -> ArticulationState:
+        twist = self._twist
+        state = ArticulationState(
+            qpos=self._qpos.take(self._qpos_adr),
+            qvel=self._qvel.take(self._qvel_adr),
+            twist=TwistState(linear=twist.linear, angular=twist.angular),
+            actions=twist.actions,
+        )
+        if level is ObservationLevel.MINIMAL:
+            return state
+        state.ctrl = self._ctrl.take(self._ctrl_adr)
+        state.act = np.zeros(len(self._ctrl_adr))
+        if len(self._act_adr):
+            state.act[self._act_places] = self._act.take(self._act_adr)
+        values: list[float] = self._sensordata.take(self._sensor_adr).tolist()
+        state.sensors = {name: values[start:stop] for name, start, stop in self._sensors}
+        if level is ObservationLevel.STANDARD:
+            return state
+        xpos: list[list[float]] = self._xpos.take(self._bodies, axis=0).tolist()
+        xquat: list[list[float]] = self._xquat.take(self._bodies, axis=0).tolist()
+        state.bodies = {
+            name: BodyPose(xpos=(x, y, z), xquat=(qw, qx, qy, qz))
+            for name, (x, y, z), (qw, qx, qy, qz) in zip(self._body_names, xpos, xquat, strict=True)
+        }
+        state.actuator_force = self._force.take(self._force_adr)
+        return state
+
+
+def _sensors(
+    model: mujoco.MjModel, sensors: NDArray[np.int32], names: Sequence[str]
+) -> tuple[NDArray[np.intp], tuple[tuple[str, int, int], ...]]:
+    """Return where the sensors' values lie, and each sensor's span among the gathered values."""
+    adr: list[int] = []
+    spans: list[tuple[str, int, int]] = []
+    for sensor, name in zip(sensors, names, strict=True):
+        first, dim = int(model.sensor_adr[sensor]), int(model.sensor_dim[sensor])
+        spans.append((name, len(adr), len(adr) + dim))
+        adr.extend(range(first, first + dim))
+    return np.array(adr, dtype=np.intp), tuple(spans)
+
+
+class Observer:
+    """Reads reply blocks from a scene's data."""
+
+    def __init__(self, scene: CompiledScene, controls: Mapping[str, ArticulationControl]) -> None:
+        """Prepare for a scene.
+
+        Args:
+            scene: The scene.
+            controls: `Engine.controls` of the engine that steps it; holds the twists.
+        """
+        data = scene.data
+        self._readers = {key: _StateReader(scene.model, data, control) for key, control in controls.items()}
+        self._entities = scene.entities
+        self._xpos = data.xpos
+        self._xquat = data.xquat
+        self._qpos = data.qpos
+        self._qvel = data.qvel
+
+    def articulations(self, level: ObservationLevel) -> dict[str, ArticulationState]:
+        """Return the state of every articulation by key, with the fields of `level`."""
+        return {key: reader.read(level) for key, reader in self._readers.items()}
+
+    def entities(self) -> dict[str, EntityState]:
+        """Return the state of every entity by name; `qpos` (7,) and `qvel` (6,) for those with a free joint."""
+        return {entity.name: self._entity(entity) for entity in self._entities}
+
+    def _entity(self, entity: EntityIndex) -> EntityState:
+        x, y, z = self._xpos[entity.body].tolist()
+        qw, qx, qy, qz = self._xquat[entity.body].tolist()
+        state = EntityState(xpos=(x, y, z), xquat=(qw, qx, qy, qz))
+        if entity.free_joint is not None:
+            state.qpos = self._qpos[entity.qpos_adr : entity.qpos_adr + 7].copy()
+            state.qvel = self._qvel[entity.qvel_adr : entity.qvel_adr + 6].copy()
+        return state

@@ -1,0 +1,218 @@
+"""What `set_sim_options` remembers of a play session and does to `mjOption`.
+
+For the handler, which holds the engine's lock. The numbers are not validated, as in the plugin.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+from msgspec import Struct
+
+from urlab_client._mujoco import set_threads, thread_limit
+from urlab_client.protocol.base import Vec3
+from urlab_client.protocol.types import SimOptions
+from urlab_client.server.physics.controllers import float32
+from urlab_client.server.refusal import Refusal
+
+__all__ = ["OptionOverrides", "OptionsInForce"]
+
+CHOICES: Final = {
+    "integrator": {
+        "euler": mujoco.mjtIntegrator.mjINT_EULER,
+        "rk4": mujoco.mjtIntegrator.mjINT_RK4,
+        "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
+        "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    },
+    "cone": {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC},
+    "solver": {
+        "pgs": mujoco.mjtSolver.mjSOL_PGS,
+        "cg": mujoco.mjtSolver.mjSOL_CG,
+        "newton": mujoco.mjtSolver.mjSOL_NEWTON,
+    },
+}
+SCALARS: Final = (
+    "timestep",
+    "density",
+    "viscosity",
+    "impratio",
+    "tolerance",
+    "noslip_tolerance",
+    "ccd_tolerance",
+    "sleep_tolerance",
+)
+SCALED: Final = ("gravity", "wind")
+IN_ORDER: Final = (
+    "timestep",
+    "gravity",
+    "wind",
+    "magnetic",
+    "density",
+    "viscosity",
+    "impratio",
+    "tolerance",
+    "iterations",
+    "ls_iterations",
+    "integrator",
+    "cone",
+    "solver",
+    "noslip_iterations",
+    "noslip_tolerance",
+    "ccd_iterations",
+    "ccd_tolerance",
+    "enable_multiccd",
+    "enable_sleep",
+    "sleep_tolerance",
+)
+"""The remembered options in the order in which a request's are looked at: an unknown name stops at its place."""
+
+SLEEP: Final = int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+NO_MULTICCD: Final = int(mujoco.mjtDisableBit.mjDSBL_MULTICCD)
+
+
+class OptionsInForce(Struct, omit_defaults=True):
+    """The fields of `SimOptions` in the order of the reply; a derived struct would keep the other order."""
+
+    timestep: float | None = None
+    num_worker_threads: int | None = None
+    max_worker_threads: int | None = None
+    gravity: Vec3 | None = None
+    wind: Vec3 | None = None
+    magnetic: Vec3 | None = None
+    density: float | None = None
+    viscosity: float | None = None
+    impratio: float | None = None
+    tolerance: float | None = None
+    iterations: int | None = None
+    ls_iterations: int | None = None
+    integrator: str | None = None
+    cone: str | None = None
+    solver: str | None = None
+    noslip_iterations: int | None = None
+    noslip_tolerance: float | None = None
+    ccd_iterations: int | None = None
+    ccd_tolerance: float | None = None
+    enable_multiccd: bool | None = None
+    enable_sleep: bool | None = None
+    sleep_tolerance: float | None = None
+    disableflags: int | None = None
+    enableflags: int | None = None
+
+
+class OptionOverrides:
+    """The options set in one play session; all that were ever set are written again by every successful call.
+
+    The raw masks are written once and not remembered. The plugin's two named switches move bits that mean something
+    else in current MuJoCo releases, and clear them in every call; here they move the flags they are named after, and
+    only once they have been used, so that raw masks stay as they were sent.
+    """
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        """Start with the integrator the scene was compiled with.
+
+        Args:
+            model: The model of the play session.
+        """
+        self._kept: dict[str, Any] = {"integrator": int(model.opt.integrator), "sleep_tolerance": float32(1e-4)}
+        self._threads = 0
+
+    def apply(self, model: mujoco.MjModel, data: mujoco.MjData, options: SimOptions) -> OptionsInForce:
+        """Take over the options that are not None, write all remembered ones and return what is in force.
+
+        Raises:
+            Refusal: `bad_value` for an unknown integrator, cone or solver. Nothing is written, but options that come
+                earlier in the order are remembered and take effect with the next successful call.
+        """
+        for name in IN_ORDER:
+            value = getattr(options, name)
+            if value is not None:
+                self._kept[name] = _stored(name, value)
+        opt, kept = model.opt, self._kept
+        for name in ("disableflags", "enableflags"):
+            mask = getattr(options, name)
+            if mask is not None:
+                setattr(opt, name, mask)
+        for name, value in kept.items():
+            if name in ("gravity", "wind", "magnetic"):
+                getattr(opt, name)[:] = value
+            elif name not in ("enable_multiccd", "enable_sleep", "sleep_tolerance"):
+                setattr(opt, name, value)
+        if "enable_multiccd" in kept:
+            opt.disableflags = _switched(opt.disableflags, NO_MULTICCD, not kept["enable_multiccd"])
+        if "enable_sleep" in kept:
+            opt.enableflags = _switched(opt.enableflags, SLEEP, kept["enable_sleep"])
+            if kept["enable_sleep"]:
+                opt.sleep_tolerance = kept["sleep_tolerance"]
+        if options.num_worker_threads is not None:
+            self._set_threads(data, options.num_worker_threads)
+        return self._in_force(model)
+
+    def _set_threads(self, data: mujoco.MjData, threads: int) -> None:
+        threads = max(0, min(threads, thread_limit(_cores())))
+        if threads != self._threads:
+            set_threads(data, threads)
+            self._threads = threads
+
+    def _in_force(self, model: mujoco.MjModel) -> OptionsInForce:
+        opt = model.opt
+        return OptionsInForce(
+            timestep=opt.timestep,
+            num_worker_threads=self._threads,
+            max_worker_threads=thread_limit(_cores()),
+            gravity=_vec3(opt.gravity),
+            wind=_vec3(opt.wind),
+            magnetic=_vec3(opt.magnetic),
+            density=opt.density,
+            viscosity=opt.viscosity,
+            impratio=opt.impratio,
+            tolerance=opt.tolerance,
+            iterations=opt.iterations,
+            ls_iterations=opt.ls_iterations,
+            integrator=_choice("integrator", opt.integrator),
+            cone=_choice("cone", opt.cone),
+            solver=_choice("solver", opt.solver),
+            noslip_iterations=opt.noslip_iterations,
+            noslip_tolerance=opt.noslip_tolerance,
+            ccd_iterations=opt.ccd_iterations,
+            ccd_tolerance=opt.ccd_tolerance,
+            enable_multiccd=not opt.disableflags & NO_MULTICCD,
+            enable_sleep=bool(opt.enableflags & SLEEP),
+            sleep_tolerance=opt.sleep_tolerance,
+            disableflags=opt.disableflags,
+            enableflags=opt.enableflags,
+        )
+
+
+def _stored(name: str, value: Any) -> Any:
+    if name in CHOICES:
+        found = CHOICES[name].get(value.casefold())
+        if found is None:
+            raise Refusal("bad_value", f"unknown {name} '{value}': use {', '.join(CHOICES[name])}")
+        return int(found)
+    if name in SCALARS:
+        return float32(value)
+    if name in SCALED:
+        return [float32(item * 100.0) / 100.0 for item in value]
+    if name == "magnetic":
+        return [float32(item) for item in value]
+    return value
+
+
+def _choice(name: str, number: int) -> str:
+    """Return an option's name; a model of its own options may use one that the protocol has no name for."""
+    return next((text for text, item in CHOICES[name].items() if int(item) == int(number)), str(int(number)))
+
+
+def _vec3(values: np.ndarray[Any, np.dtype[np.float64]]) -> Vec3:
+    return (float(values[0]), float(values[1]), float(values[2]))
+
+
+def _switched(mask: int, bit: int, on: bool) -> int:
+    return mask | bit if on else mask & ~bit
+
+
+def _cores() -> int:
+    return os.cpu_count() or 1

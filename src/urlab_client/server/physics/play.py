@@ -1,0 +1,234 @@
+"""The life of a play session: off, compiling, ready or failed, and what runs while it is ready.
+
+For the `sim` handlers, which start and stop it, and for the handlers that need a running simulation. Compilation has a
+thread of its own, so that whoever asked for it can give up waiting.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Final
+
+from urlab_client.protocol.enums import PIEState
+from urlab_client.server.compile.scene import CompiledScene, CompileFailed
+from urlab_client.server.limits import Limits
+from urlab_client.server.physics.engine import Engine
+from urlab_client.server.physics.observe import Observer
+from urlab_client.server.physics.options import OptionOverrides
+from urlab_client.server.physics.replay import ReplaySessions
+from urlab_client.server.physics.reply_template import StepReplies
+from urlab_client.server.refusal import Refusal
+from urlab_client.server.render.camera_renderer import CameraRenderer
+
+__all__ = ["Play", "Running"]
+
+logger = logging.getLogger("urlab_client.server")
+
+MAX_WAIT_S: Final = 86400.0
+_DEFAULT_LIMITS: Final = Limits()
+
+
+@dataclass(frozen=True)
+class Running:
+    """A simulation that is ready.
+
+    Attributes:
+        scene: What was compiled.
+        engine: What steps it; started.
+        observer: What reads its state.
+        cameras: What draws its cameras.
+        recordings: Files in the folder of recordings at the start.
+        limits: How much is done for clients.
+    """
+
+    scene: CompiledScene
+    engine: Engine
+    observer: Observer
+    cameras: CameraRenderer
+    recordings: Sequence[Path] = ()
+    limits: Limits = _DEFAULT_LIMITS
+
+    @cached_property
+    def step_frames(self) -> StepReplies:
+        """What encodes the replies to `step`."""
+        return StepReplies(self.scene, self.engine.controls)
+
+    @cached_property
+    def options(self) -> OptionOverrides:
+        """What `set_sim_options` remembers."""
+        return OptionOverrides(self.scene.model)
+
+    @cached_property
+    def sessions(self) -> ReplaySessions:
+        """The recorded sessions."""
+        return ReplaySessions(self.scene, self.recordings, self.limits)
+
+    def close(self, timeout: float = 1.0) -> bool:
+        """End it within about `timeout` seconds; return False when something was still busy then."""
+        deadline = time.monotonic() + timeout
+        drawn = self.cameras.close(timeout / 2.0)
+        return self.engine.close(max(0.0, deadline - time.monotonic())) and drawn
+
+
+class _Attempt:
+    """One start of play, from the request to its end."""
+
+    def __init__(self) -> None:
+        self.running: Running | None = None
+        self.error: str | None = None
+        self.abandoned = False
+
+    @property
+    def state(self) -> PIEState:
+        if self.running is not None:
+            return PIEState.READY
+        return PIEState.COMPILING if self.error is None else PIEState.COMPILE_FAILED
+
+
+class Play:
+    """The play session of a server: at most one at a time. Safe to use from several threads.
+
+    Attributes:
+        listeners: Called with the simulation when it is ready and with None when it goes, in order; must return at
+            once.
+    """
+
+    def __init__(self) -> None:
+        self.listeners: list[Callable[[Running | None], None]] = []
+        self._changed = threading.Condition()
+        self._attempt: _Attempt | None = None
+        self._closing = False
+
+    @property
+    def state(self) -> PIEState:
+        """`OFF`, `COMPILING`, `COMPILE_FAILED` or `READY`."""
+        attempt = self._attempt
+        return PIEState.OFF if attempt is None else attempt.state
+
+    @property
+    def compile_error(self) -> str:
+        """MuJoCo's message in state `COMPILE_FAILED`, else empty."""
+        attempt = self._attempt
+        return "" if attempt is None or attempt.error is None else attempt.error
+
+    @property
+    def manager_present(self) -> bool:
+        """Whether a play session runs, compiled or not."""
+        return self._attempt is not None
+
+    @property
+    def current(self) -> Running | None:
+        """The simulation, or None while there is none."""
+        attempt = self._attempt
+        return None if attempt is None else attempt.running
+
+    def running(self) -> Running:
+        """Return the simulation.
+
+        Raises:
+            Refusal: `not_ready` when there is none; the message says why.
+        """
+        running = self.current
+        if running is None:
+            error = self.compile_error
+            why = f"the model did not compile: {error}" if error else "the model is still being compiled"
+            raise Refusal("not_ready", why)
+        return running
+
+    def begin(self, build: Callable[[], Running]) -> None:
+        """Start play in a thread of its own, instead of whatever was there.
+
+        Args:
+            build: Compiles and starts the simulation. Must not touch what the caller may change meanwhile.
+        """
+        self.stop()
+        attempt = _Attempt()
+        with self._changed:
+            self._attempt = attempt
+        threading.Thread(target=self._build, args=(attempt, build), name="urlab-compile", daemon=True).start()
+
+    def wait(self, timeout_s: float) -> PIEState:
+        """Wait until compilation has ended and return the state.
+
+        Args:
+            timeout_s: Seconds to wait; afterwards the state is `TIMEOUT`, and compilation goes on.
+
+        Raises:
+            Refusal: `shutting_down`.
+        """
+        # NaN compares false, so it does not wait.
+        wait_s = min(timeout_s, MAX_WAIT_S) if timeout_s > 0.0 else 0.0
+        with self._changed:
+            self._changed.wait_for(lambda: self._closing or self.state is not PIEState.COMPILING, wait_s)
+            if self._closing:
+                raise Refusal("shutting_down", "the server is stopping")
+            return PIEState.TIMEOUT if self.state is PIEState.COMPILING else self.state
+
+    def stop(self) -> None:
+        """End play; a compilation under way is left to finish for nothing."""
+        with self._changed:
+            attempt, self._attempt = self._attempt, None
+            if attempt is not None:
+                attempt.abandoned = True
+                self._announce(None)
+        if attempt is not None and attempt.running is not None:
+            attempt.running.close()
+
+    def close(self, timeout: float) -> bool:
+        """End play for good and release whoever waits, with `shutting_down`.
+
+        Args:
+            timeout: Seconds to wait for the simulation to end.
+
+        Returns:
+            False when it was still busy then.
+        """
+        with self._changed:
+            self._closing = True
+            attempt = self._attempt
+            if attempt is not None:
+                attempt.abandoned = True
+            self._changed.notify_all()
+        running = self.current
+        return running is None or running.close(timeout)
+
+    def _build(self, attempt: _Attempt, build: Callable[[], Running]) -> None:
+        running: Running | None = None
+        error = ""
+        try:
+            running = build()
+        except CompileFailed as failure:
+            error = failure.message
+        except BaseException as failure:  # noqa: BLE001 - who waits for the start must not wait for ever
+            error = _unexpected(failure)
+        with self._changed:
+            if not attempt.abandoned:
+                if running is not None:
+                    try:
+                        self._announce(running)
+                    except Exception as failure:  # noqa: BLE001 - likewise
+                        error = _unexpected(failure)
+                        self._announce(None)
+                    else:
+                        attempt.running, running = running, None
+                if attempt.running is None:
+                    attempt.error = error
+            self._changed.notify_all()
+        if running is not None:
+            running.close()
+
+    def _announce(self, running: Running | None) -> None:
+        for listener in self.listeners:
+            listener(running)
+
+
+def _unexpected(failure: BaseException) -> str:
+    """Log why play could not be started, and return how that reads."""
+    logger.error("play could not be started", exc_info=failure)
+    return f"the server failed with {type(failure).__name__}: {failure}; its log has the details"

@@ -1,0 +1,301 @@
+"""Recorded joint states: sessions, the files they are kept in, and what records them.
+
+For the `recording` and `replay` handlers. The file format is the plugin's; playing a session is in `replay`.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import logging
+import math
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, cast
+
+import msgspec
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from urlab_client.server.compile.scene import CompiledScene
+
+__all__ = [
+    "LIVE_SESSION",
+    "Frame",
+    "JointLayout",
+    "LiveRecording",
+    "decode_csv",
+    "decode_json",
+    "duration",
+    "encode_json",
+    "joint_name",
+]
+
+logger = logging.getLogger("urlab_client.server")
+
+Floats = NDArray[np.float64]
+
+LIVE_SESSION: Final = "Live Recording"
+
+FRAME_OVERHEAD: Final = 500
+"""About the bytes a frame takes besides its numbers."""
+
+CSV_PERIOD_S: Final = 0.002
+
+
+@dataclass(frozen=True)
+class JointLayout:
+    """Which part of a frame's arrays belongs to which joint; shared by frames.
+
+    Attributes:
+        joints: Joint name to its slices of `qpos` and `qvel`; a velocity slice is empty if none was recorded.
+    """
+
+    joints: Mapping[str, tuple[slice, slice]]
+
+    @staticmethod
+    def of(widths: Iterable[tuple[str, int, int]]) -> JointLayout:
+        """Lay joints out one after the other, given their names and numbers of coordinates and velocities."""
+        joints: dict[str, tuple[slice, slice]] = {}
+        qpos = qvel = 0
+        for name, coordinates, velocities in widths:
+            joints[name] = (slice(qpos, qpos + coordinates), slice(qvel, qvel + velocities))
+            qpos, qvel = qpos + coordinates, qvel + velocities
+        return JointLayout(joints)
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """The joints of a scene at one time.
+
+    Attributes:
+        time: Simulation time, seconds.
+        layout: Where each joint's numbers are.
+        qpos: Coordinates, m or rad or quaternion (w, x, y, z).
+        qvel: Velocities, m/s or rad/s.
+    """
+
+    time: float
+    layout: JointLayout
+    qpos: Floats
+    qvel: Floats
+
+
+def joint_name(model: mujoco.MjModel, joint: int) -> str:
+    """Return the name a joint has in recordings."""
+    return mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint) or f"Joint_{joint}"
+
+
+class LiveRecording:
+    """The session that recording writes to. The caller holds the engine's lock.
+
+    Attributes:
+        frames: What was recorded, oldest first.
+        max_duration_s: Length of the rolling window, seconds of simulation time; 0 or less is unlimited.
+    """
+
+    def __init__(self, scene: CompiledScene, most_bytes: int) -> None:
+        """Prepare for a scene.
+
+        Args:
+            scene: The scene.
+            most_bytes: Memory for frames; beyond it the oldest go, as if the window were shorter.
+        """
+        self._most_bytes = most_bytes
+        self.frames: deque[Frame] = deque()
+        self.max_duration_s = 0.0
+        self._data = scene.data
+        model = scene.model
+        coordinates = np.diff(np.append(model.jnt_qposadr, model.nq))
+        velocities = np.diff(np.append(model.jnt_dofadr, model.nv))
+        self._layout = JointLayout.of(
+            (joint_name(model, joint), int(coordinates[joint]), int(velocities[joint])) for joint in range(model.njnt)
+        )
+        self._max_frames = most_bytes // (8 * (model.nq + model.nv) + FRAME_OVERHEAD)
+        self._trimmed = False
+
+    def start(self, max_duration_s: float) -> None:
+        """Begin a new recording in place of the old one."""
+        self.clear()
+        self.max_duration_s = max_duration_s
+
+    def clear(self) -> None:
+        """Forget the frames."""
+        self.frames.clear()
+        self._trimmed = False
+
+    def capture(self) -> None:
+        """Append the present state and drop what has left the window."""
+        data, frames = self._data, self.frames
+        now = float(data.time)
+        frames.append(Frame(now, self._layout, data.qpos.copy(), data.qvel.copy()))
+        if self.max_duration_s > 0.0:
+            while frames[0].time < now - self.max_duration_s:
+                frames.popleft()
+        if len(frames) > self._max_frames:
+            frames.popleft()
+            if not self._trimmed:
+                self._trimmed = True
+                logger.warning(
+                    "the recording has reached the limit recording_bytes, %d (%d frames): the oldest are dropped",
+                    self._most_bytes,
+                    self._max_frames,
+                )
+
+
+# Files.
+
+
+class _Joint(msgspec.Struct, forbid_unknown_fields=True):
+    qPos: list[float] = []  # noqa: N815 - as in the file
+    qVel: list[float] = []  # noqa: N815
+
+
+class _Position(msgspec.Struct, forbid_unknown_fields=True):
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+
+
+class _Rotation(msgspec.Struct, forbid_unknown_fields=True):
+    pitch: float = 0.0
+    yaw: float = 0.0
+    roll: float = 0.0
+
+
+class _RecordedFrame(msgspec.Struct, forbid_unknown_fields=True):
+    timestamp: float = 0.0
+    jointStates: dict[str, _Joint] = {}  # noqa: N815
+    cameraPosition: _Position = msgspec.field(default_factory=_Position)  # noqa: N815
+    cameraRotation: _Rotation = msgspec.field(default_factory=_Rotation)  # noqa: N815
+    bHasCameraData: bool = False  # noqa: N815
+
+
+class _RecordingFile(msgspec.Struct, forbid_unknown_fields=True):
+    Frames: list[_RecordedFrame]
+
+
+_FILE: Final = msgspec.json.Decoder(_RecordingFile)
+
+
+def encode_json(frames: Iterable[Frame]) -> bytes:
+    """Return the content of a recording file."""
+    # Frame by frame: one call for all of them would keep physics from running for as long as it takes.
+    encode = msgspec.json.Encoder().encode
+    return b"".join((b'{"Frames":[', b",".join(encode(_to_file(frame)) for frame in frames), b"]}"))
+
+
+def _to_file(frame: Frame) -> _RecordedFrame:
+    qpos, qvel = frame.qpos.tolist(), frame.qvel.tolist()
+    joints = {name: _Joint(qpos[where], qvel[rates]) for name, (where, rates) in frame.layout.joints.items()}
+    return _RecordedFrame(timestamp=frame.time, jointStates=joints)
+
+
+def decode_json(content: bytes) -> list[Frame]:
+    """Read a recording file: keys in any case, missing ones at their defaults, unknown ones ignored.
+
+    Raises:
+        ValueError: It is not JSON, or has no list of frames.
+    """
+    text = _text(content)
+    try:
+        try:
+            frames = _FILE.decode(text).Frames
+        except msgspec.ValidationError:
+            frames = _read_loosely(msgspec.json.decode(text))
+    except (RecursionError, OverflowError) as error:
+        raise ValueError(f"it is no recording: {error}") from None
+    made: dict[tuple[tuple[str, int, int], ...], JointLayout] = {}
+    return [_from_file(frame, made) for frame in frames]
+
+
+def _text(content: bytes) -> str:
+    """Decode a text file: Unreal writes UTF-16 with a mark as soon as a name is not ASCII."""
+    wide = content[:2] in (b"\xff\xfe", b"\xfe\xff")
+    return content.decode("utf-16" if wide else "utf-8-sig")
+
+
+def _from_file(frame: _RecordedFrame, made: dict[tuple[tuple[str, int, int], ...], JointLayout]) -> Frame:
+    states = frame.jointStates
+    widths = tuple((name, len(state.qPos), len(state.qVel)) for name, state in states.items())
+    layout = made.get(widths) or made.setdefault(widths, JointLayout.of(widths))
+    qpos = [value for state in states.values() for value in state.qPos]
+    qvel = [value for state in states.values() for value in state.qVel]
+    if not all(map(math.isfinite, (frame.timestamp, *qpos, *qvel))):
+        raise ValueError(f"the frame at {frame.timestamp} s holds a number that is not finite")
+    return Frame(frame.timestamp, layout, np.array(qpos, dtype=np.float64), np.array(qvel, dtype=np.float64))
+
+
+def _read_loosely(plain: object) -> list[_RecordedFrame]:
+    frames = _folded(plain).get("frames")
+    if not isinstance(frames, list):
+        raise ValueError("there is no list 'Frames'")  # noqa: TRY004 - the file is wrong, not the caller
+    found: list[_RecordedFrame] = []
+    for item in cast("list[object]", frames):
+        fields = _folded(item)
+        stamp, states = fields.get("timestamp"), fields.get("jointstates")
+        joints: dict[str, _Joint] = {}
+        for name, state in cast("dict[str, object]", states if isinstance(states, dict) else {}).items():
+            values = _folded(state)
+            joints[name] = _Joint(_numbers(values.get("qpos")), _numbers(values.get("qvel")))
+        found.append(
+            _RecordedFrame(timestamp=float(stamp) if isinstance(stamp, int | float) else 0.0, jointStates=joints)
+        )
+    return found
+
+
+def _folded(value: object) -> dict[str, object]:
+    if not isinstance(value, dict):
+        return {}
+    return {key.casefold(): item for key, item in cast("dict[str, object]", value).items()}
+
+
+def _numbers(value: object) -> list[float]:
+    try:
+        return msgspec.convert(value, list[float])
+    except msgspec.ValidationError:
+        return []
+
+
+def decode_csv(content: bytes) -> list[Frame]:
+    """Read a table of joint positions: a column per scalar joint, `name[k]` for the others, and `time` or `timestamp`.
+
+    Without a time column the rows are 0.002 s apart. There are no velocities. Camera columns are ignored.
+
+    Raises:
+        ValueError: It has no header, or a cell is no number.
+    """
+    try:
+        rows = [row for row in csv.reader(io.StringIO(_text(content))) if row]
+    except csv.Error as error:
+        raise ValueError(f"it is no table: {error}") from None
+    if not rows:
+        raise ValueError("the table is empty")
+    header = [name.strip() for name in rows[0]]
+    clock = next((at for at, name in enumerate(header) if name.casefold() in ("time", "timestamp")), None)
+    columns: dict[str, dict[int, int]] = {}
+    for at, name in enumerate(header):
+        if at != clock and name and not name.casefold().startswith("cam_"):
+            stem, bracket, index = name.removesuffix("]").partition("[")
+            place = int(index) if bracket else 0
+            columns.setdefault(stem, {})[place] = at
+    joints = {name: [places[at] for at in sorted(places)] for name, places in columns.items()}
+    layout = JointLayout.of((name, len(places), 0) for name, places in joints.items())
+    order = [at for places in joints.values() for at in places]
+    frames: list[Frame] = []
+    for number, row in enumerate(rows[1:]):
+        if len(row) < len(header):
+            raise ValueError(f"row {number + 2} has {len(row)} cells, the header has {len(header)}")
+        time = float(row[clock]) if clock is not None else number * CSV_PERIOD_S
+        qpos = np.array([float(row[at]) for at in order], dtype=np.float64)
+        if not (math.isfinite(time) and np.isfinite(qpos).all()):
+            raise ValueError(f"row {number + 2} holds a number that is not finite")
+        frames.append(Frame(time, layout, qpos, np.empty(0)))
+    return frames
+
+
+def duration(frames: Sequence[Frame] | deque[Frame]) -> float:
+    """Return the seconds from the first frame to the last; 0 with fewer than two, or when time ran back in between."""
+    return max(0.0, frames[-1].time - frames[0].time) if len(frames) > 1 else 0.0

@@ -1,0 +1,1 @@
+"""Pictures: the robots' cameras and the viewport."""

@@ -1,0 +1,176 @@
+"""From a request frame to a reply frame: the order of checks, the handlers and what becomes of their errors.
+
+For the transports, which call a `Dispatcher`, and for the handler modules, which register with `handles`.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Generator, Mapping
+from contextlib import contextmanager
+from typing import Any, Final, TypeVar, get_args, get_type_hints
+
+from urlab_client.protocol.base import Effect, Needs, Reply, Request
+from urlab_client.protocol.codec import encode_reply
+from urlab_client.protocol.enums import Transport
+from urlab_client.protocol.messages.session import ErrorReply
+from urlab_client.protocol.registry import OPS
+from urlab_client.server.core import ServerCore
+from urlab_client.server.refusal import Refusal
+from urlab_client.server.rpc.requests import Incoming, RequestReader
+
+__all__ = ["HANDLERS", "Dispatcher", "Handler", "HandlerTable", "handles"]
+
+logger = logging.getLogger("urlab_client.server")
+
+Q = TypeVar("Q", bound=Request[Any])
+A = TypeVar("A", bound=Reply | bytes)
+Handler = Callable[[ServerCore, Any], Reply | bytes]
+"""Returns the reply, or its msgpack frame where that is quicker to make; a session in JSON gets replies only."""
+
+BARE_NAMES: Final = ("recording", "replay")
+"""Namespaces whose ops are looked up in any case but recognise only their exact name."""
+
+
+class HandlerTable:
+    """Which function serves which op.
+
+    Attributes:
+        handlers: By op name.
+        structs: By op name, the struct that a handler reads where it is wider than the declared one.
+    """
+
+    def __init__(self) -> None:
+        self.handlers: dict[str, Handler] = {}
+        self.structs: dict[str, type[Request[Any]]] = {}
+
+    def handles(self, request: type[Q]) -> Callable[[Callable[[ServerCore, Q], A]], Callable[[ServerCore, Q], A]]:
+        """Register the decorated function for an op.
+
+        Args:
+            request: The op's request struct, or a struct derived from it that reads more fields than clients send.
+
+        Raises:
+            TypeError: No op has such a request, the op has a handler, or the function does not return its reply.
+        """
+        op = OPS.get(str(request.__struct_config__.tag))
+        if op is None or not issubclass(request, op.request):
+            raise TypeError(f"{request.__name__} is no op's request")
+
+        def register(handler: Callable[[ServerCore, Q], A]) -> Callable[[ServerCore, Q], A]:
+            annotation = get_type_hints(handler)["return"]
+            for returned in get_args(annotation) or (annotation,):
+                if returned is not bytes and not issubclass(returned, op.reply):
+                    raise TypeError(
+                        f"{handler.__qualname__} returns {returned.__name__}, {op.name} wants {op.reply.__name__}"
+                    )
+            if op.name in self.handlers:
+                raise TypeError(f"{op.name} has two handlers")
+            self.handlers[op.name] = handler
+            if request is not op.request:
+                self.structs[op.name] = request
+            return handler
+
+        return register
+
+
+HANDLERS: Final = HandlerTable()
+"""The handlers of this package; filled when `urlab_client.server.handlers` is imported."""
+
+handles = HANDLERS.handles
+
+
+class Dispatcher:
+    """Answers requests, one at a time whatever transport they came by."""
+
+    def __init__(self, core: ServerCore, table: HandlerTable) -> None:
+        """Prepare for a server.
+
+        Args:
+            core: What the handlers work on.
+            table: The handlers.
+        """
+        self._core = core
+        self._handlers: Mapping[str, Handler] = table.handlers
+        self._reader = RequestReader(ops=core.dialect.ops, structs=table.structs, limits=core.world.content.limits)
+        self._lock = threading.Lock()
+
+    def answer(
+        self, frame: bytes, transport: Transport = Transport.ZMQ, *, max_reply_bytes: int | None = None
+    ) -> bytes:
+        """Return the reply to a request; whatever happens, there is one.
+
+        Args:
+            frame: The request's bytes.
+            transport: How it came; shared memory does not take the editor's ops.
+            max_reply_bytes: Longest reply that can be sent. A request whose reply cannot be shorter is not executed.
+        """
+        with self._lock:
+            name = "request"
+            try:
+                incoming = self._reader.read(frame)
+                name = incoming.name or name
+                reply = self._serve(incoming, transport, max_reply_bytes)
+                frame = reply if isinstance(reply, bytes) else encode_reply(reply, json=self._core.session.json)
+                return _fitting(frame, incoming, max_reply_bytes)
+            except Refusal as refusal:
+                path = refusal.absolute_path if refusal.code == "path_not_writable" else None
+                error = ErrorReply(code=refusal.code, message=refusal.message, absolute_path=path)
+            except Exception as failure:
+                logger.exception("%s failed", name)
+                error = ErrorReply(
+                    code="internal_error",
+                    message=f"{name}: the server failed with {type(failure).__name__}; its log has the details",
+                )
+            return encode_reply(error, json=self._core.session.json)
+
+    @contextmanager
+    def standstill(self, timeout: float) -> Generator[bool]:
+        """Answer no request meanwhile; yields False if the one under way did not end within `timeout` seconds."""
+        idle = self._lock.acquire(timeout=timeout)
+        try:
+            yield idle
+        finally:
+            if idle:
+                self._lock.release()
+
+    def _serve(self, incoming: Incoming, transport: Transport, max_reply_bytes: int | None) -> Reply | bytes:
+        op, name = incoming.op, incoming.name
+        if self._core.health.failure is not None:
+            raise Refusal("internal_error", f"{self._core.health.failure}; start the server again")
+        if transport is Transport.SHM and op is not None and op.needs is Needs.EDITOR:
+            raise Refusal("wrong_transport", f"op '{name}' is not served over shared memory: send it over ZMQ")
+        if name is None:
+            raise Refusal("missing_op", "the request has no field 'op' that reads as a string")
+        if op is None or op.needs is not Needs.NOTHING:
+            self._check_session(incoming.session_id)
+        if op is None:
+            raise Refusal("unknown_op", f"this server has no op '{name}'")
+        if incoming.missing:
+            raise Refusal("missing_field", f"{op.name}: required field '{incoming.missing[0]}' is missing")
+        if op.needs is Needs.MANAGER and not self._core.play.manager_present:
+            raise Refusal("no_active_manager", f"op '{op.name}' needs a running play session: call begin_pie first")
+        if op.ns in BARE_NAMES and name != op.name:
+            raise Refusal("unknown_op", name)
+        handler = self._handlers.get(op.name)
+        if handler is None:
+            raise Refusal("unsupported", f"op '{op.name}' is not implemented by this simulated server")
+        if max_reply_bytes is not None and self._core.least_reply_bytes(incoming.request) > max_reply_bytes:
+            raise Refusal(
+                "wrong_transport", f"the reply to '{name}' would not fit into shared memory: send it over ZMQ"
+            )
+        return handler(self._core, incoming.request)
+
+    def _check_session(self, session_id: str) -> None:
+        if not self._core.session.accepts(session_id):
+            raise Refusal("session_expired", f"session '{session_id}' is not the active one: send hello first")
+
+
+def _fitting(reply: bytes, incoming: Incoming, limit: int | None) -> bytes:
+    if limit is None or len(reply) <= limit:
+        return reply
+    executed = ""
+    if incoming.op is not None and incoming.op.effect is not Effect.READ:
+        executed = " It was executed: do not send it again."
+    raise Refusal("reply_too_large", f"{incoming.name}: the reply has {len(reply)} bytes, {limit} fit.{executed}")

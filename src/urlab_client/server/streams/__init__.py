@@ -1,0 +1,1 @@
+"""What the server publishes without being asked: states, rows and camera pictures."""

@@ -1,0 +1,249 @@
+"""Camera images of live mode: a PUB socket per camera, each on a port of its own.
+
+For `SimulatedServer`. One thread draws, about thirty times a second and whatever physics does, the cameras that
+somebody has subscribed to. In the stepped modes nothing is published: images come with `step` there, as in the plugin.
+Shared memory gets images in every mode.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import Final
+
+import zmq
+
+from urlab_client._uninterrupted import uninterrupted
+from urlab_client.protocol.enums import StepMode
+from urlab_client.protocol.rows import camera_filter
+from urlab_client.server.physics.play import Running
+from urlab_client.server.refusal import Refusal
+from urlab_client.server.system.health import Health
+from urlab_client.server.system.thread_join import ended
+from urlab_client.server.transport.curve_authentication import CurveKeys, ZapAuthenticator
+from urlab_client.server.transport.endpoint import PortInUse, bind_tcp, bound_peers, tcp
+from urlab_client.server.transport.shared_memory import SharedMemoryServer
+
+__all__ = ["CameraStreams"]
+
+logger = logging.getLogger("urlab_client.server")
+
+PERIOD_S: Final = 1.0 / 30.0
+QUEUED_FRAMES: Final = 10
+
+MAX_FILTER_BYTES: Final = 4096
+"""A larger subscription costs its sender the connection."""
+
+PORTS: Final = 100
+"""How many ports above the first are tried for a camera."""
+
+
+class _Stream:
+    """The socket of one camera. An XPUB socket is a PUB socket that tells who listens."""
+
+    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], guard: ZapAuthenticator, host: str, port: int) -> None:
+        self.socket = context.socket(zmq.XPUB)
+        self.socket.maxmsgsize = MAX_FILTER_BYTES
+        guard.protect(self.socket)
+        bound_peers(self.socket)
+        self.socket.sndhwm = QUEUED_FRAMES
+        self.socket.linger = 0
+        self.key = ""
+        self.topic = b""
+        self._filters: set[bytes] = set()
+        try:
+            self.port = bind_tcp(self.socket, host, port, "camera_port")
+        except BaseException:
+            self.socket.close()
+            raise
+
+    def wanted(self) -> bool:
+        """Whether somebody has subscribed to the camera."""
+        with contextlib.suppress(zmq.Again):
+            while True:
+                message = self.socket.recv(zmq.DONTWAIT)
+                if message[:1] == b"\x01":
+                    self._filters.add(message[1:])
+                else:
+                    self._filters.discard(message[1:])
+        return bool(self.key) and any(self.topic.startswith(prefix) for prefix in self._filters)
+
+    def show(self, key: str) -> None:
+        """Publish a camera from now on, by `ARTICULATION/CAMERA`; none, if it is empty."""
+        articulation, _, camera = key.partition("/")
+        self.key = key
+        self.topic = camera_filter(f"{articulation}/camera/{camera}")
+
+
+class CameraStreams:
+    """Publishes the cameras of the play session. The first port is held for as long as the server is open.
+
+    Attributes:
+        filter: What becomes of an image to subscribers, from its topic and pixels: its pixels, or None for nothing.
+            Set it before `start`; called on the thread that sends.
+    """
+
+    def __init__(
+        self,
+        *,
+        health: Health,
+        host: str,
+        port: int,
+        curve_keys: CurveKeys | None = None,
+        memory: SharedMemoryServer | None = None,
+    ) -> None:
+        """Bind the first port.
+
+        Args:
+            health: Told when images cannot be published any more.
+            host: Address of the interface.
+            port: Port of the first camera; the others get the free ones after it. 0 picks any.
+            door: Who may connect; None for anybody who reaches the interface.
+            memory: Shared memory that gets the images as well, in every mode.
+
+        Raises:
+            PortInUse: Somebody has the port.
+            OSError: The address is none of this machine.
+        """
+        self.filter: Callable[[bytes, bytes], bytes | None] | None = None
+        self._host = host
+        self._memory = memory
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._authenticator = ZapAuthenticator(self._context, curve_keys, health)
+        self._health = health
+        self._failed = 0
+        self._lock = threading.Lock()
+        self._stopping = threading.Event()
+        self._running: Running | None = None
+        self._streams: list[_Stream] = []
+        self._thread = threading.Thread(target=self._run, name="urlab-cameras", daemon=True)
+        try:
+            self._streams.append(_Stream(self._context, self._authenticator, host, port))
+        except BaseException:
+            self._authenticator.close()
+            with uninterrupted():
+                self._context.term()
+            raise
+        self.port = self._streams[0].port
+
+    @property
+    def alive(self) -> bool:
+        """Whether images are published."""
+        return self._thread.is_alive()
+
+    def start(self) -> None:
+        """Start publishing."""
+        self._thread.start()
+
+    def endpoint(self, articulation: str, camera: str) -> str:
+        """Return where a camera publishes; the first port for one that does not."""
+        key = f"{articulation}/{camera}"
+        with self._lock:
+            port = next((stream.port for stream in self._streams if stream.key == key), self.port)
+        return f"{tcp(self._host)}:{port}"
+
+    def show(self, running: Running | None) -> None:
+        """Publish the cameras of a simulation instead of any other; None for none."""
+        with self._lock:
+            if self._stopping.is_set():
+                return
+            self._running = running
+            for stream in self._streams[1:]:
+                stream.socket.close()
+            del self._streams[1:]
+            keys = [] if running is None else running.cameras.keys
+            if self._memory is not None:
+                self._memory.show_cameras({} if running is None else running.cameras.resolutions())
+            self._streams[0].show(keys[0] if keys else "")
+            for key in keys[1:]:
+                stream = self._next_free()
+                if stream is None:
+                    logger.warning("no free port for camera '%s' and those after it; they have no stream", key)
+                    break
+                stream.show(key)
+                self._streams.append(stream)
+
+    def stop(self) -> None:
+        """Ask the thread to end."""
+        self._stopping.set()
+
+    def join(self, timeout: float) -> bool:
+        """Wait for the end and release the sockets; return False when a picture was still being drawn."""
+        if self._thread.ident is not None:
+            ended(self._thread, timeout)
+        with self._lock:
+            self._running = None
+            for stream in self._streams:
+                stream.socket.close()
+            self._streams.clear()
+        self._authenticator.close()
+        with uninterrupted():
+            self._context.term()
+        return not self._thread.is_alive()
+
+    def _next_free(self) -> _Stream | None:
+        last = self._streams[-1].port
+        for port in range(last + 1, min(self.port + PORTS, 65535) + 1):
+            with contextlib.suppress(PortInUse):
+                return _Stream(self._context, self._authenticator, self._host, port)
+        return None
+
+    def _run(self) -> None:
+        pause = 0.0
+        with self._health.watch():
+            while not self._stopping.wait(pause):
+                began = time.monotonic()
+                try:
+                    self._publish()
+                except Exception as error:  # noqa: BLE001 - the next images may do better
+                    self._skip("the camera images of a moment are not published", error)
+                pause = max(0.0, began + PERIOD_S - time.monotonic())
+
+    def _skip(self, what: str, error: Exception) -> None:
+        """Log what went wrong, unless the sockets were closed because the server closes."""
+        self._failed += 1
+        if not self._stopping.is_set() and self._failed & (self._failed - 1) == 0:  # what fails once often fails again
+            logger.error("%s (%d so far)", what, self._failed, exc_info=error)
+
+    def _publish(self) -> None:
+        with self._lock:
+            running = self._running
+            topics = {stream.key: stream.topic for stream in self._streams if stream.wanted()}
+        if running is None:
+            return
+        if running.engine.mode in (StepMode.DIRECT, StepMode.PUPPET):
+            topics = {}
+        shared = [] if self._memory is None else self._memory.wanted_cameras()
+        if not (topics or shared):
+            return
+        shots = running.cameras.shots(dict.fromkeys([*topics, *shared], "sync"))
+        try:
+            with running.engine.lock:
+                exposure = running.cameras.capture(shots)
+        except Refusal:  # physics is busy; the next time, then
+            return
+        frames = running.cameras.frames(shots, exposure) or {}
+        if self._memory is not None:
+            with self._lock:
+                for key, frame in frames.items() if self._running is running else ():
+                    self._memory.publish_picture(key, frame.data)
+        images: dict[str, bytes] = {}
+        for key in filter(frames.__contains__, topics):
+            try:
+                image = self._filtered(topics[key], frames[key].data)
+            except Exception as error:  # noqa: BLE001 - the other cameras are none the worse
+                self._skip(f"an image of '{key}' is not published", error)
+                continue
+            if image is not None:
+                images[key] = image
+        with self._lock:
+            if self._running is running:
+                for stream in self._streams:
+                    if stream.key in images:
+                        stream.socket.send_multipart([stream.topic, images[stream.key]], zmq.DONTWAIT)
+
+    def _filtered(self, topic: bytes, image: bytes) -> bytes | None:
+        return image if self.filter is None else self.filter(topic, image)

@@ -1,0 +1,1 @@
+"""What the server needs from the operating system: threads, memory, temporary folders."""

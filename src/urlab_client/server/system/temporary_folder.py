@@ -1,0 +1,144 @@
+"""Temporary folders that do not outlive their process for long, not even one that was killed.
+
+A folder holds a lock that ends with the process, however that dies. Whoever makes a folder removes those whose lock
+nobody holds. Likewise `working_in` and `sweep`, for folders that several processes work in.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Generator
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Self
+
+__all__ = ["TemporaryFolder", "sweep", "working_in"]
+
+_PREFIX: Final = "urlab-"
+_LOCK: Final = ".alive"
+
+
+class TemporaryFolder:
+    """A temporary folder of this process.
+
+    Not a `tempfile.TemporaryDirectory`, which a forked child would remove.
+
+    Attributes:
+        path: The folder.
+    """
+
+    path: Path
+
+    def __init__(self) -> None:
+        """Make the folder, and remove those that killed processes have left."""
+        root = Path(tempfile.gettempdir())
+        for folder in root.glob(f"{_PREFIX}*"):
+            with contextlib.suppress(OSError):
+                _remove_if_left(folder)
+        self._pid = os.getpid()
+        self._lock: int | None = None
+        while self._lock is None:
+            self.path = Path(tempfile.mkdtemp(prefix=_PREFIX))
+            # Between making and locking the file somebody else may have taken it for one that was left.
+            self._lock = _hold(self.path / _LOCK, os.O_RDWR | os.O_CREAT)
+
+    def close(self) -> None:
+        """Remove the folder. Idempotent; a forked child leaves it to its parent."""
+        if self._lock is None or os.getpid() != self._pid:
+            return
+        os.close(self._lock)
+        self._lock = None
+        shutil.rmtree(self.path, ignore_errors=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _hold(file: Path, flags: int) -> int | None:
+    """Open and lock a file; None if another process holds it. Where there are no such locks, it is just opened."""
+    descriptor = os.open(file, flags, 0o600)
+    if sys.platform != "win32":
+        import fcntl  # noqa: PLC0415
+
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(descriptor)
+            return None
+    return descriptor
+
+
+def _remove_if_left(folder: Path) -> None:
+    if sys.platform == "win32" or folder.is_symlink() or folder.stat().st_uid != os.geteuid():
+        return
+    descriptor = _hold(folder / _LOCK, os.O_RDWR)
+    if descriptor is not None:
+        try:
+            shutil.rmtree(folder, ignore_errors=True)
+        finally:
+            os.close(descriptor)
+
+
+@contextlib.contextmanager
+def working_in(folder: Path) -> Generator[None]:
+    """Keep `sweep` in other processes from removing what is under way below a folder.
+
+    Raises:
+        OSError: The folder cannot be opened.
+    """
+    if sys.platform == "win32":
+        yield
+        return
+    import fcntl  # noqa: PLC0415
+
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        with contextlib.suppress(OSError):  # a file system without locks
+            fcntl.flock(descriptor, fcntl.LOCK_SH)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def sweep(folder: Path, *patterns: str) -> None:
+    """Remove what killed processes have left below a folder, unless another process works in it.
+
+    Args:
+        folder: The folder; it need not exist.
+        patterns: What such things are called, relative to it.
+    """
+    with contextlib.suppress(OSError), _alone_in(folder):
+        for pattern in patterns:
+            for left in folder.glob(pattern):
+                shutil.rmtree(left, ignore_errors=True)
+                with contextlib.suppress(OSError):
+                    left.parent.rmdir()  # if it held nothing else
+
+
+@contextlib.contextmanager
+def _alone_in(folder: Path) -> Generator[None]:
+    """Lock a folder that nobody works in.
+
+    Raises:
+        OSError: Somebody does, or there is no such folder.
+    """
+    if sys.platform == "win32":
+        yield
+        return
+    import fcntl  # noqa: PLC0415
+
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,1 @@
+"""The server's sockets and shared memory, and who may use them."""

@@ -1,0 +1,279 @@
+"""The request socket of a server: one ZeroMQ REP socket, served by one thread. Also what all its sockets need to bind.
+
+For `SimulatedServer`. Knows frames, not their meaning: whoever opens it says how to answer one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import logging
+import os
+import socket
+import threading
+from collections.abc import Callable
+from typing import ClassVar, Final
+
+import zmq
+
+from urlab_client._uninterrupted import uninterrupted
+from urlab_client.server.limits import Limits
+from urlab_client.server.system.health import Health
+from urlab_client.server.system.thread_join import ended
+from urlab_client.server.transport.curve_authentication import CurveKeys, ZapAuthenticator
+
+__all__ = ["PortInUse", "RpcEndpoint", "bind_tcp", "bound_peers", "connect_host", "numeric_host", "tcp"]
+
+logger = logging.getLogger("urlab_client.server")
+
+LINGER_MS: Final = 500
+"""How long a reply under way may keep the socket open after the end."""
+
+HEARTBEAT_MS: Final = 2000
+SILENCE_MS: Final = 10_000
+"""A peer that answers no heartbeat for so long is dropped. Its I/O thread answers, however busy its program is."""
+
+HANDSHAKE_MS: Final = 5000
+"""A connection that has not become a ZeroMQ peer by then is closed."""
+
+BACKLOG: Final = 128
+"""Connections that may wait to be accepted."""
+
+QUEUED_REQUESTS: Final = 16
+"""Requests of one peer that may wait; a peer that sends more is not read. Clients send one at a time. Each time half of
+so many have been taken, ZeroMQ wakes its I/O thread: with 4 a step takes a twentieth longer."""
+
+_WAKE = "inproc://urlab-wake"
+
+
+class PortInUse(OSError):
+    """Another program, often another server, holds a port.
+
+    Attributes:
+        host: Address of the interface.
+        port: TCP port.
+    """
+
+    host: str
+    port: int
+
+    def __init__(self, host: str, port: int, option: str = "port") -> None:
+        """Describe the conflict.
+
+        Args:
+            host: Address of the interface.
+            port: TCP port.
+            option: Name of the setting that chooses another port.
+        """
+        super().__init__(
+            errno.EADDRINUSE,
+            f"{tcp(host)}:{port} is in use: end the program that holds it, "
+            f"or choose another {option} (0 picks a free one)",
+        )
+        self.host = host
+        self.port = port
+        self._option = option
+
+    def __reduce__(self) -> tuple[type[PortInUse], tuple[str, int, str]]:
+        return type(self), (self.host, self.port, self._option)
+
+
+def numeric_host(host: str) -> str:
+    """Return the IP address to bind for `host`; empty or `*` means all IPv4 interfaces.
+
+    Raises:
+        OSError: No such host.
+    """
+    if host in ("", "*"):
+        return "0.0.0.0"  # noqa: S104 - asked for
+    try:
+        found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
+    except socket.gaierror as error:
+        raise OSError(error.errno, f"cannot bind to {host!r}: {error.strerror}") from error
+    # IPv4 first, as clients do: they look for `localhost` at 127.0.0.1.
+    family_first = sorted(found, key=lambda entry: entry[0] != socket.AF_INET)
+    return str(family_first[0][4][0])
+
+
+def connect_host(host: str) -> str:
+    """Return where a client on this machine reaches a server bound to the address `host`."""
+    return {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104
+
+
+def tcp(host: str) -> str:
+    """Return the address of an IP address, without a port."""
+    return f"tcp://[{host}]" if ":" in host else f"tcp://{host}"
+
+
+def _bind_error(code: int | None, host: str, port: int, option: str) -> OSError:
+    if code == errno.EADDRINUSE:
+        return PortInUse(host, port, option)
+    return OSError(code, f"cannot bind {tcp(host)}:{port}: {os.strerror(code or 0)}")
+
+
+def bind_tcp(socket: zmq.Socket[bytes], host: str, port: int, option: str) -> int:
+    """Bind a ZeroMQ socket and return its port.
+
+    Args:
+        socket: The socket; options that count from the first connection are set.
+        host: IP address of the interface.
+        port: TCP port; 0 picks a free one.
+        option: Name of the setting, for the error.
+
+    Raises:
+        PortInUse: Somebody has the port.
+        OSError: The address is not one of this machine.
+    """
+    socket.ipv6 = ":" in host
+    try:
+        socket.bind(f"{tcp(host)}:{port}")
+    except zmq.ZMQError as error:
+        raise _bind_error(error.errno, host, port, option) from error
+    return int(socket.get_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
+
+
+def bound_peers(socket: zmq.Socket[bytes]) -> None:
+    """Drop peers that are gone, half-open or only pretend to speak ZeroMQ; before the socket is bound."""
+    socket.heartbeat_ivl = HEARTBEAT_MS
+    socket.heartbeat_timeout = SILENCE_MS
+    socket.heartbeat_ttl = SILENCE_MS
+    socket.handshake_ivl = HANDSHAKE_MS
+    socket.backlog = BACKLOG
+
+
+class RpcEndpoint:
+    """Receives requests one at a time and sends what `answer` returns.
+
+    Attributes:
+        kind: Type of the ZeroMQ socket.
+        port: TCP port that is bound.
+    """
+
+    kind: ClassVar[int] = zmq.REP
+    port: int
+
+    def __init__(
+        self,
+        answer: Callable[[bytes], bytes],
+        *,
+        refuse: Callable[[str, str], bytes],
+        health: Health,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        curve_keys: CurveKeys | None = None,
+        request_bytes: int = Limits.request_bytes,
+    ) -> None:
+        """Bind the socket; `start` begins to serve.
+
+        Args:
+            answer: Turns the frame of a request into the frame of its reply; must not raise.
+            refuse: Makes the frame of an error from its code and message, for when it raises all the same.
+            health: Told when requests cannot be served any more.
+            host: IP address of the interface.
+            port: TCP port; 0 picks a free one.
+            door: Who may connect; None for anybody who reaches the interface.
+            request_bytes: Largest request that is answered with anything but its size.
+
+        Raises:
+            PortInUse: Somebody has the port.
+            OSError: The address is not one of this machine.
+        """
+        self._answer = answer
+        self._refuse = refuse
+        self._health = health
+        self._context = zmq.Context()
+        self._context.linger = LINGER_MS
+        self._authenticator = ZapAuthenticator(self._context, curve_keys, health)
+        self._socket = self._context.socket(self.kind)
+        self._authenticator.protect(self._socket)
+        bound_peers(self._socket)
+        # A frame between the two limits is answered with the reason, one beyond both costs the sender its connection.
+        self._socket.maxmsgsize = 2 * request_bytes
+        self._socket.rcvhwm = QUEUED_REQUESTS
+        try:
+            self.port = bind_tcp(self._socket, host, port, "step_port")
+        except BaseException:
+            self._authenticator.close()
+            with uninterrupted():
+                self._context.destroy(linger=0)
+            raise
+        self._socket.bind(_WAKE)
+        self._waker = self._context.socket(zmq.DEALER)
+        self._waker.connect(_WAKE)
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name="urlab-rpc", daemon=True)
+
+    @property
+    def alive(self) -> bool:
+        """Whether requests are served."""
+        return self._thread.is_alive()
+
+    def start(self) -> None:
+        """Start the thread that serves."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Ask the thread to end after the request under way, without waiting. Call once."""
+        self._stopping = True
+        with contextlib.suppress(zmq.ZMQError):  # the thread has ended already
+            self._waker.send_multipart([b"", b""], zmq.NOBLOCK)
+        self._waker.close()
+
+    def join(self, timeout: float) -> bool:
+        """Wait for the end after `stop`.
+
+        Args:
+            timeout: Seconds to wait.
+
+        Returns:
+            False when the request under way took longer; the thread then closes the socket when it is done.
+        """
+        if self._thread.ident is None:
+            self._close()
+        elif self._thread is not threading.current_thread():
+            return ended(self._thread, timeout)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        try:
+            while self._serve():
+                pass
+        except zmq.ZMQError as error:
+            self._health.report(error)
+        finally:
+            self._close()
+
+    def _serve(self) -> bool:
+        """Answer one request, with the reason where that fails; return False when it is time to end."""
+        try:
+            return self._exchange()
+        except zmq.ZMQError:
+            raise
+        except BaseException as error:  # noqa: BLE001 - clients wait; from now on the answer says what happened
+            reason = self._health.report(error)
+            with contextlib.suppress(zmq.ZMQError):  # nobody has asked
+                self._send_owed(self._refuse("internal_error", reason))
+            return True
+
+    def _send_owed(self, reply: bytes) -> None:
+        """Answer the request that was received last, if it is unanswered."""
+        self._socket.send(reply, zmq.NOBLOCK)
+
+    def _exchange(self) -> bool:
+        """Answer one request; return False when it is time to end."""
+        socket = self._socket
+        frame = socket.recv()
+        # A request of several frames is none: to execute the first one would be a guess.
+        while socket.getsockopt(zmq.RCVMORE):
+            socket.recv()
+            frame = b""
+        if self._stopping:
+            return False
+        socket.send(self._answer(frame))
+        return True
+
+    def _close(self) -> None:
+        self._socket.close()
+        self._authenticator.close()
+        with uninterrupted():
+            self._context.term()

@@ -1,0 +1,182 @@
+"""The 3-D view: MuJoCo's own web viewer, fed with the state that everybody sees and served through the console's door.
+
+MuJoCo ships the page, which draws a compiled model with WebGL. Its server is not used: that one listens on a port of
+its own, for everybody. Here a page only watches; of what it can ask for it gets the model and the newest state.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import re
+import zlib
+from collections.abc import Mapping
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import anyio.to_thread
+import numpy as np
+
+from urlab_client.aio.model.layout import articulation_layouts
+from urlab_client.protocol.messages.streams import StateSnapshot
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from urlab_client.aio import URLabClient
+
+__all__ = ["SHOWN", "SPECTATOR", "TAKEN", "Files", "MujocoViewer", "Shown", "files"]
+
+SPECTATOR = "viewers=1;role=spectator;queue_pos=0;queue_len=0;max_spectators=0"
+"""Tells a page that it watches."""
+
+SHOWN = "state_ack"
+"""What a page says when it has taken a state over."""
+
+TAKEN = 4001
+"""Close code that tells a page that somebody else has MuJoCo's own panels."""
+
+_SHIM = '<script src="../static/mujoco_viewer.js"></script>'
+_INLINE = re.compile(r"<script>(.*?)</script>", re.DOTALL)
+
+
+class Files(NamedTuple):
+    """What the MuJoCo package ships for browsers: `page` with our adapter in it, and where the rest lies.
+
+    `policy` is the content security policy that the page needs: it compiles WebAssembly and the calls into it.
+    """
+
+    page: str
+    policy: str
+    dist: Path
+    assets: Path
+
+
+@cache
+def files() -> Files | None:
+    """Return what is shipped, None if this MuJoCo comes without its web viewer."""
+    payload = _payload()
+    if payload is None:
+        return None
+    root = Path(str(import_module("mujoco.studio").__file__)).parent
+    dist = root / "web" / "dist"
+    page = dist / "index.html"
+    if not page.is_file():
+        return None
+    html = page.read_text("utf-8")
+    hashes = " ".join(f"'sha256-{_digest(script)}'" for script in _INLINE.findall(html))
+    policy = (
+        f"default-src 'self'; script-src 'self' 'unsafe-eval' {hashes}; style-src 'self' 'unsafe-inline'; "
+        "img-src 'self' blob: data:; frame-ancestors 'self'; base-uri 'none'; form-action 'none'"
+    )
+    return Files(html.replace("<head>", f"<head>{_SHIM}", 1), policy, dist, root / "assets")
+
+
+def _digest(script: str) -> str:
+    return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+
+
+@cache
+def _payload() -> Any:
+    """Return MuJoCo's module that writes what its page reads, or None."""
+    try:
+        return import_module("mujoco.studio.web.state_payload")
+    except ImportError:
+        return None
+
+
+class Shown(NamedTuple):
+    """A model as the page gets it: `bundle` with the number `crc` that tells it from others, and where values go."""
+
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    bundle: bytes
+    crc: int
+    addresses: Mapping[str, Any]
+    camera: Any
+    flags: list[int]
+
+
+class MujocoViewer:
+    """The model and the newest state for browsers; each state is written once, however many watch.
+
+    Args:
+        client: The client.
+    """
+
+    def __init__(self, client: URLabClient) -> None:
+        self._client = client
+        self._shown: Shown | None = None
+        self._written: tuple[StateSnapshot, bytes] | None = None
+
+    @property
+    def missing(self) -> str:
+        """Why there is no view; empty when there is one."""
+        if files() is None:
+            return "this MuJoCo comes without its web viewer: pip install mujoco-studio"
+        return "" if self._client.model is not None else "there is no compiled model: no play session runs"
+
+    async def shown(self) -> Shown | None:
+        """Return the client's model, made ready for browsers, or None without one."""
+        model = self._client.model
+        if model is None or files() is None:
+            return None
+        if self._shown is None or self._shown.model is not model:
+            keys = list(self._client.articulations)
+            self._shown = await anyio.to_thread.run_sync(_prepare, model, keys)
+            self._written = None
+        return self._shown
+
+    def write(self, shown: Shown, snapshot: StateSnapshot) -> bytes:
+        """Return a state as the page reads it."""
+        if self._written is None or self._written[0] is not snapshot:
+            self._written = snapshot, self._write(shown, snapshot)
+        return self._written[1]
+
+    def _write(self, shown: Shown, snapshot: StateSnapshot) -> bytes:
+        import mujoco  # noqa: PLC0415
+
+        model, data = shown.model, shown.data
+        data.time = snapshot.time
+        for key, state in snapshot.per_articulation.items():
+            addresses = shown.addresses.get(key)
+            if addresses is not None and len(state.qpos) == len(addresses):
+                data.qpos[addresses] = state.qpos
+        for name, pose in snapshot.entities.items():
+            entity = self._client.entities.get(name)
+            if entity is None:
+                continue
+            mocap = int(model.body_mocapid[entity.body_id])
+            if mocap >= 0:
+                data.mocap_pos[mocap], data.mocap_quat[mocap] = pose.xpos, pose.xquat
+            elif pose.qpos is not None and entity.qpos_offset is not None:
+                data.qpos[entity.qpos_offset : entity.qpos_offset + 7] = pose.qpos
+        what = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+        state = np.empty(mujoco.mj_stateSize(model, what))
+        mujoco.mj_getState(model, data, state, what)
+        payload = _payload()
+        return payload.serialize_state_payload(
+            shown.crc,
+            what,
+            state.tobytes(),
+            shown.camera,
+            mujoco.MjvPerturb(),
+            mujoco.MjvOption(),
+            model,
+            shown.flags,
+            [],
+            payload.ViewerInputState(),
+        )
+
+
+def _prepare(model: mujoco.MjModel, keys: list[str]) -> Shown:
+    import mujoco  # noqa: PLC0415
+
+    bundle: bytes = _payload().serialize_model_bundle(model)
+    camera = mujoco.MjvCamera()
+    mujoco.mjv_defaultFreeCamera(model, camera)
+    addresses = {key: layout.qpos_adr for key, layout in articulation_layouts(model, keys).items()}
+    flags = [int(flag) for flag in mujoco.MjvScene(model, maxgeom=1).flags]  # shadows, reflections, sky
+    return Shown(model, mujoco.MjData(model), bundle, zlib.crc32(bundle), addresses, camera, flags)

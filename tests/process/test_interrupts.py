@@ -1,0 +1,93 @@
+"""Interrupts at random moments: nothing is left behind, nothing is lost, and the next call works."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+PROGRAM = """
+import collections, contextlib, gc, logging, os, random, signal, sys, threading, warnings
+from urlab_client import SessionTakenOver, URLabClient
+from urlab_client.server import SimulatedServer
+from urlab_client.sync import _loop
+
+MOMENTS = int(sys.argv[1])
+_loop.GRACE = 60  # what waits for it, does so for a reason that is told
+
+class Struck(Exception):
+    pass
+
+def strike(*_):
+    raise Struck
+
+def interrupted(work, longest):
+    "Do the work, and strike at a random moment; return whether that came in time."
+    try:
+        try:
+            signal.setitimer(signal.ITIMER_REAL, random.uniform(1e-6, longest))
+            work()
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+    except Struck:
+        return True
+    return False
+
+def is_ours(problem):
+    "Whether somebody but the collector was struck: what strikes in its callbacks and in `__del__` is printed and gone."
+    return not isinstance(problem.exc_value, Struck)
+
+problems = []
+sys.unraisablehook = lambda problem: is_ours(problem) and problems.append(repr(problem))
+threading.excepthook = lambda problem: problems.append(repr(problem))
+warnings.showwarning = lambda message, *_, **__: "unclosed" in str(message) or problems.append(str(message))
+logging.getLogger("urlab_client.sync").addFilter(lambda record: problems.append(record.getMessage()))
+signal.signal(signal.SIGALRM, strike)
+
+def make_use_and_close():
+    # The hello of the client before, which was interrupted, may come after this one's.
+    with URLabClient(**options) as client, contextlib.suppress(SessionTakenOver):
+        client.discover()
+        client.step()
+
+def held():
+    gc.collect()
+    return len(os.listdir("/proc/self/fd")), threading.active_count()
+
+with SimulatedServer("ball", play=True) as server:
+    options = {**server.client_options(), "step_mode": "direct", "local_model": False}
+    make_use_and_close()
+    before = held()
+    struck = sum(interrupted(make_use_and_close, 0.03) for _ in range(MOMENTS))
+    print("made and closed:", struck > MOMENTS / 10, [now - then for now, then in zip(held(), before)], flush=True)
+
+    with URLabClient(**options) as client:
+        client.discover()
+        with client.state_stream() as states:
+            def read():
+                client.step()
+                next(states)
+            read()
+            struck = sum(interrupted(read, 0.002) for _ in range(MOMENTS))
+            print("read:", struck > MOMENTS / 10, flush=True)
+            client.resync()
+            client.step()
+            print("usable:", next(states) is not None, flush=True)
+print("problems:", collections.Counter(problems))
+"""
+
+EXPECTED = """\
+made and closed: True [0, 0]
+read: True
+usable: True
+problems: Counter()
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="descriptors are counted in /proc")
+@pytest.mark.parametrize("moments", [60, pytest.param(3000, marks=[pytest.mark.long, pytest.mark.timeout(600)])])
+def test_at_random_moments(moments: int) -> None:
+    program = [sys.executable, "-W", "always", "-c", PROGRAM, str(moments)]
+    done = subprocess.run(program, capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr) == (EXPECTED, "")
