@@ -6,7 +6,7 @@ import contextlib
 import sys
 from pathlib import Path
 
-__all__ = ["limit_process"]
+__all__ = ["forbid_opening", "limit_process"]
 
 
 def limit_process(memory_bytes: int, cpu_s: int) -> None:
@@ -27,3 +27,17 @@ def limit_process(memory_bytes: int, cpu_s: int) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
     resource.setrlimit(resource.RLIMIT_FSIZE, (memory, memory))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+def forbid_opening() -> bool:
+    """Keep this process from opening files, sockets and pipes, for good. What is open stays usable.
+
+    Returns:
+        False, and nothing was done, on Windows, which has no such limit.
+    """
+    if sys.platform == "win32":
+        return False
+    import resource  # noqa: PLC0415 - not on Windows
+
+    resource.setrlimit(resource.RLIMIT_NOFILE, (0, 0))
+    return True

@@ -1,7 +1,7 @@
 """What differs between the MuJoCo releases that this package runs on: 3.8 and later. Nothing else asks for that.
 
 Each difference is found out where it shows, by asking MuJoCo for what it has; nothing compares version numbers. What an
-older release lacks is done in another way where there is one, and said where there is none.
+older release lacks is done in another way where there is one; otherwise the error says so.
 
 The client's import of this module must not import MuJoCo: that takes longer than the rest of the client.
 """
@@ -11,11 +11,13 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
+import importlib
+import re
 import tempfile
 import zipfile
-from collections.abc import Generator, Iterable
+from collections.abc import Callable, Generator, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +29,7 @@ __all__ = [
     "MODEL_FILE",
     "actuator_count",
     "actuator_kind",
+    "batch_class",
     "check_copy",
     "control_counts",
     "control_starts",
@@ -39,9 +42,11 @@ __all__ = [
     "reset_controls",
     "set_threads",
     "thread_limit",
+    "without_newer_attributes",
     "write_model",
 ]
 
+T = TypeVar("T")
 Indices = NDArray[np.int32]
 
 MODEL_FILE = "model.xml"
@@ -233,6 +238,30 @@ def _unwritable() -> ValueError:
     )
 
 
+def without_newer_attributes(xml: str, compiled: Callable[[str], T]) -> tuple[T, list[str]]:
+    """Compile an MJCF that a newer MuJoCo has written; return the result and which attributes were left out for that.
+
+    Raises:
+        ValueError: It cannot be compiled, for any other reason than attributes that this MuJoCo does not know.
+    """
+    left_out: list[str] = []
+    while True:
+        try:
+            return compiled(xml), left_out
+        except ValueError as error:
+            found = _UNKNOWN_ATTRIBUTE.search(str(error))
+            if found is None:
+                raise
+            attribute, element = found.groups()
+            xml, count = re.subn(rf'(<{element}\b[^<>]*?)\s{attribute}="[^"]*"', r"\1", xml)
+            if not count:
+                raise
+            left_out.append(f"{element}.{attribute}")
+
+
+_UNKNOWN_ATTRIBUTE = re.compile(r"unrecognized attribute: '([\w:-]+)'\s+Element '([\w:-]+)'")
+
+
 def mujoco_version() -> str:
     """Return the release in use."""
     import mujoco  # noqa: PLC0415
@@ -246,6 +275,14 @@ def copy_options(options: mujoco.MjOption, model: mujoco.MjModel) -> None:
         value = getattr(options, name)
         if not name.startswith("_") and not callable(value):
             setattr(model.opt, name, value)
+
+
+def batch_class() -> Any:
+    """Return `mujoco.batch.Batch`, None before 3.17."""
+    try:
+        return importlib.import_module("mujoco.batch").Batch
+    except ImportError:
+        return None
 
 
 def merge_assets(spec: mujoco.MjSpec, folders: Iterable[Path]) -> None:

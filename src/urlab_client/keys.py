@@ -57,11 +57,11 @@ class KeyPair:
             The public file and the secret one.
 
         Raises:
-            KeyFileError: The name is no file name, or one of the files exists: keys are never overwritten.
+            KeyFileError: The name is not a valid file name, or one of the files exists: keys are never overwritten.
             OSError: They cannot be written.
         """
         if not name or name.startswith(".") or not all(char.isalnum() or char in "-_." for char in name):
-            raise KeyFileError(f"{name!r} is no name for a key: use letters, digits, '-', '_' and '.'")
+            raise KeyFileError(f"{name!r} is not a valid key name: use letters, digits, '-', '_' and '.'")
         files = folder / f"{name}{PUBLIC_SUFFIX}", folder / f"{name}{SECRET_SUFFIX}"
         for file in files:
             if file.exists():
@@ -107,7 +107,7 @@ def public_keys(sources: Iterable[str | os.PathLike[str]]) -> frozenset[bytes]:
     """Return the public keys of files, and of all `*.key` files of folders.
 
     Raises:
-        KeyFileError: One is no key file, or a folder has none.
+        KeyFileError: One is not a key file, or a folder has none.
     """
     found: set[bytes] = set()
     for source in map(Path, sources):
@@ -130,16 +130,16 @@ def _create(file: Path, text: str, mode: int) -> None:
 def _read(path: Path) -> tuple[bytes, bytes | None]:
     try:
         if path.stat().st_size > _MAX_BYTES:
-            raise KeyFileError(f"{path} is no key file: it is too long.")
+            raise KeyFileError(f"{path} is not a key file: it is too long.")
         lines = path.read_text("utf-8").splitlines()
     except OSError as error:
         raise KeyFileError(f"{path}: the key cannot be read: {error.strerror or error}.") from None
     except UnicodeDecodeError:
-        raise KeyFileError(f"{path} is no key file.", hint="urlab keys new makes key files.") from None
+        raise KeyFileError(f"{path} is not a key file.", hint="urlab keys new makes key files.") from None
     entries = {name.strip(): value.strip().strip('"') for name, _, value in (line.partition("=") for line in lines)}
     public, secret = entries.get("public-key"), entries.get("secret-key")
     for key in (public, secret) if secret is not None else (public,):
         if key is None or len(key) != _LENGTH or not _Z85.issuperset(key):
             # The text is not shown: it may be most of a secret.
-            raise KeyFileError(f"{path} is no key file.", hint="urlab keys new makes key files.")
+            raise KeyFileError(f"{path} is not a key file.", hint="urlab keys new makes key files.")
     return str(public).encode(), None if secret is None else secret.encode()

@@ -462,6 +462,19 @@ def test_any_handshake_without_a_local_model(scripted: Any) -> None:
     session.close()
 
 
+def test_poses_of_entities_without_a_model_are_copies(scripted: Any, direct: Session) -> None:
+    client = URLabClient("tcp://127.0.0.1", step_port=scripted.port, step_mode="direct", local_model=False)
+    direct.run(client.discover())
+    scripted.on("step", STEP)
+    reply = direct.run(client.step())
+    crate = client.entities["crate"]
+    crate.root_pos_w[:] = crate.root_lin_vel_w[:] = 77.0
+    reply.entities["crate"].qpos[:] = reply.entities["crate"].qvel[:] = 77.0
+    assert crate.root_pos_w.tolist() == [0.0, 3.0, 2.0]
+    assert crate.root_lin_vel_w.tolist() == [0.0] * 3
+    direct.run(client.close())
+
+
 def test_any_snapshot_is_taken_over_whole_or_not_at_all(direct: Session) -> None:
     client = direct.client
     direct.run(client.runtime.set_mode("live"))

@@ -364,7 +364,7 @@ async def test_a_client_stays_with_its_loop(scripted: Any) -> None:
     ["tcp://localhost:rpc", "tcp://localhost:70000", "tcp://localhost:0", "tcp://:5559", "tcp://::1", "tcp://", "lab"],
 )
 def test_what_is_no_address_is_refused_at_once(address: str) -> None:
-    with pytest.raises(ValueError, match=r"is no address; write tcp://HOST"):
+    with pytest.raises(ValueError, match=r"is not a valid address; write tcp://HOST"):
         URLabClient(address)
 
 

@@ -212,7 +212,7 @@ class TestWhatIsHandedOut:
         try:
             StateSnapshot.decode(payload, "state/full")
         except ProtocolError as error:
-            assert "state/full" in str(error)  # noqa: PT017  # some of it is no nonsense
+            assert "state/full" in str(error)  # noqa: PT017  # some of it is not nonsense
 
 
 class TestNarrowness:
@@ -788,7 +788,7 @@ class TestEvents:
         dropped = bus.stream(3)
         del dropped
         gc.collect()
-        assert not bus._sinks
+        assert not bus._handlers
 
 
 class TestBackground:
@@ -855,5 +855,5 @@ class TestBackground:
             await marker.passed()
         assert (reception.stats.absorbed, reception.stats.received) == (1, 4)
         (warning,) = [text for record in caplog.records if "live state" in (text := record.getMessage())]
-        assert "is not taken over: state snapshot: Expected `object`, got `int`." in warning
+        assert "was not applied: state snapshot: Expected `object`, got `int`." in warning
         reception.stop()

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from hello import hello_ok
 
@@ -88,6 +90,47 @@ async def test_documents_that_came_with_it_read_none_either(told: Callable[..., 
         for xml in (INCLUDING, ATTACHING):
             with pytest.raises(ValueError, match=r"secret\.obj, a file of this machine"):
                 compilation._refuse_local_files(xml, {"part.xml": (disguise + part).encode()})
+
+
+PART = (
+    '<mujoco><asset><mesh name="m" file="{file}"/></asset>'
+    '<worldbody><body name="b"><geom type="mesh" mesh="m"/></body></worldbody></mujoco>'
+)
+ATTACHED = (
+    '<mujoco><asset><model name="a" file="part.xml"/></asset>'
+    '<worldbody><frame><attach model="a" body="b" prefix="x"/></frame></worldbody></mujoco>'
+)
+UNWATCHED = """
+import sys
+from urlab_client.aio.model import compilation
+
+compilation._refuse_local_files = compilation.confine_files = lambda *_, **__: None
+compilation._main(sys.argv[1])
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a process cannot give up opening files")
+@pytest.mark.parametrize(
+    ("xml", "assets"),
+    [
+        (PART, {}),
+        (INCLUDING, {"part.xml": PART}),
+        (ATTACHED, {"part.xml": PART}),
+    ],
+)
+def test_what_its_names_hide_from_the_client_cannot_be_opened(tmp_path: Path, xml: str, assets: dict[str, str]) -> None:
+    """The compiling process without its own look at the model, and without Landlock."""
+    secret = tmp_path / "secret.obj"
+    secret.write_text(MESH)
+    job = compilation._CompileJob(
+        xml.replace("{file}", str(secret)),
+        {name: text.replace("{file}", str(secret)).encode() for name, text in assets.items()},
+        compilation._MEMORY_BYTES,
+        compilation._CPU_S,
+    )
+    command = [sys.executable, "-c", UNWATCHED, str(tmp_path)]
+    done = subprocess.run(command, input=msgspec.msgpack.encode(job), capture_output=True, check=True)
+    assert done.stdout.startswith(b"-")
 
 
 async def test_it_may_not_hide_names_in_entities(told: Callable[..., URLabClient]) -> None:

@@ -108,7 +108,7 @@ def test_an_address_that_is_none_is_one_line_that_says_so(
     assert main([name, "gopher://lab", *others]) == 2
     out, err = capsys.readouterr()
     assert (out, err.count("\n")) == ("", 1)
-    assert err.startswith(f"urlab {name}: 'gopher://lab' is no address; write tcp://HOST")
+    assert err.startswith(f"urlab {name}: 'gopher://lab' is not a valid address; write tcp://HOST")
 
 
 def test_the_package_runs_as_the_command(tmp_path: Path) -> None:

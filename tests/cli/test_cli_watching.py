@@ -61,7 +61,7 @@ async def test_another_client_that_takes_over_meanwhile_is_an_end(server: Simula
         await thief.discover()
         relay.cut()
         relay.thaw()
-        with pytest.raises(CommandError, match="another client drives it"):
+        with pytest.raises(CommandError, match="another client took the session over"):
             await going
 
 

@@ -90,6 +90,84 @@ async def test_arrays_follow_the_model(connect: Any, bot: str) -> None:
         assert not np.array_equal(art.qpos_array, copy)
 
 
+async def test_what_a_user_writes_into_arrays_stays_with_the_user(connect: Any, bot: str) -> None:
+    with SimulatedServer(bot, play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover(observations="full")
+        (art,) = client.articulations.values()
+        art.set_ctrl({"slide": 0.5, "swing": 0.2})
+        reply = await client.step(50)
+        names = ("qpos_array", "qvel_array", "dof_qpos", "dof_qvel", "act_array", "last_applied_ctrl")
+        names += ("root_pos_w", "root_quat_w", "root_lin_vel_w", "root_ang_vel_b", "projected_gravity_b")
+        before = {name: getattr(art, name).tolist() for name in names}
+        force = art.actuators["swing"].force
+        for name in names:
+            getattr(art, name)[:] = 77.0
+        (state,) = reply.per_articulation.values()
+        for array in (state.qpos, state.qvel, state.ctrl, state.act, state.actuator_force):
+            array[:] = 77.0
+        assert {name: getattr(art, name).tolist() for name in names} == before
+        assert art.actuators["swing"].force == force
+        assert art.get_qpos()["slide"] == before["dof_qpos"][1]
+
+
+async def test_forward_leaves_the_state_of_a_puppets_user_alone(connect: Any, bot: str) -> None:
+    with SimulatedServer(bot, play=True) as server:
+        client = connect(server, step_mode="puppet")
+        await client.discover()
+        client.data.qpos[2] = 5.0
+        client.data.time = 3.0
+        reply = await client.runtime.forward()
+        assert reply.time == 0.0
+        assert (client.data.qpos[2], client.data.time) == (5.0, 3.0)
+        await client.step(0)
+        assert (client.data.qpos[2], client.data.time) == (5.0, 3.0)
+        assert (await client.runtime.forward()).time == 3.0
+
+
+MIMO = """
+<mujoco model="mimo"><worldbody>
+  <body name="base" pos="0 0 1"><joint name="hip" type="hinge"/><geom size=".1" mass="1"/>
+    <body name="arm"><joint name="elbow" type="hinge"/><geom size=".1" mass="1"/>
+      <body name="hand"><joint name="wrist" type="ball"/><geom size=".1" mass="1" pos="0 0 .2"/></body></body></body>
+</worldbody><actuator>
+  <pid name="servo" joint="hip" kp="3" kv="1"/>
+  <orientation name="wrist" joint="wrist" kp="2"/>
+  <motor name="elbow" joint="elbow"/>
+</actuator></mujoco>
+"""
+
+
+async def test_forces_of_actuators_with_several_inputs_and_outputs(connect: Any, tmp_path: Path) -> None:
+    """Inputs, as in `ctrl`, and outputs, as in `actuator_force`, both in actuator order, are not as many."""
+    (tmp_path / "mimo.xml").write_text(MIMO)
+    with SimulatedServer(tmp_path / "mimo.xml", play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover(observations="full")
+        (art,) = client.articulations.values()
+        servo, wrist, elbow = art.actuators.values()
+        assert [a.ctrl_local for a in (servo, wrist, elbow)] == [slice(0, 2), slice(2, 5), slice(5, 6)]
+        servo.set_control([0.5, 0.0])
+        elbow.set_control(0.25)
+        reply = await client.step()
+        assert reply.per_articulation["mimo"].actuator_force.tolist() == [1.5, 0.0, 0.0, 0.0, 0.25]
+        assert [a.force for a in (servo, wrist, elbow)] == [1.5, 0.0, 0.25]
+
+
+async def test_forces_without_a_model_are_told_where_it_is_clear_whose_they_are(
+    connect: Any, bot: str, tmp_path: Path
+) -> None:
+    (tmp_path / "mimo.xml").write_text(MIMO)
+    with SimulatedServer(bot, tmp_path / "mimo.xml", play=True) as server:
+        client = connect(server, step_mode="direct", local_model=False)
+        await client.discover(observations="full")
+        simple, mimo = client.articulations["bot"], client.articulations["mimo"]
+        simple.set_ctrl({"swing": 0.5})
+        await client.step()
+        assert simple.actuators["swing"].force == 0.5
+        assert [actuator.force for actuator in mimo.actuators.values()] == [None] * 3
+
+
 async def test_handles(connect: Any, bot: str) -> None:
     with SimulatedServer(bot, play=True) as server:
         client = connect(server, step_mode="direct")

@@ -4,7 +4,7 @@ A block may carry a directive, an HTML comment on the line above it, which reade
 
     <!-- test -->                        python block: a test file, run by pytest
     <!-- needs: EXTRA -->                python block: run where the extra is installed, apart from the others
-    <!-- as is: REASON -->               text block that is no output: why it does not run
+    <!-- as is: REASON -->               text block that is not an output: why it does not run
 
 and on `docs/adding-an-op.md`, for `test_docs_adding_an_op.py`:
 

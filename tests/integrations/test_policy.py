@@ -114,7 +114,7 @@ def arm() -> Iterator[URLabClient]:
         ("[0.5, 0.25]", "nan", "action: scale holds NaN"),
         ("decimation = 10", "decimation = 10.5", "decimation: Expected `int`, got `float`"),
         ("decimation = 10", "decimation = 0", "decimation: Expected `int` >= 1"),
-        ('"direct", "live"', '"puppet"', "step_modes are 'direct' and 'live', not 'puppet'"),
+        ('"direct", "live"', '"puppet"', "step_modes must be 'direct' and 'live', not 'puppet'"),
         ('"direct", "live"', '"fast"', r"step_modes\[0\]: Invalid enum value 'fast'"),
         ('via = "controller"', 'via = "client"', "step_modes cannot have 'live' with action.via = 'client'"),
         ('via = "controller"', 'via = "actuators"', "'actuators' has no use for the table .gains."),

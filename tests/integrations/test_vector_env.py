@@ -163,6 +163,21 @@ def test_wrong_arguments_start_nothing(arguments: Any, options: Any, reason: str
         URLabVectorEnv(*arguments, **options)
 
 
+@pytest.mark.parametrize("threads", [1, 2])
+def test_older_releases_of_mujoco_step_a_batch_with_the_same_results(
+    made: list[Any], monkeypatch: pytest.MonkeyPatch, threads: int
+) -> None:
+    options: Any = {"n_substeps": 2, "reset_noise": 0.1, "max_episode_steps": 4}
+    newest = URLabBatchEnv("sim://quadruped?controller=quadruped=pd,kp=60,kv=2", 3, **options)
+    monkeypatch.setattr("urlab_client.integrations.gym.batch.batch_class", lambda: None)
+    older = URLabBatchEnv("sim://quadruped?controller=quadruped=pd,kp=60,kv=2", 3, n_threads=threads, **options)
+    made += [newest, older]
+    assert np.array_equal(newest.reset(seed=3)[0], older.reset(seed=3)[0])
+    for action in actions_of(newest, 10):
+        for ours, theirs in zip(newest.step(action)[:4], older.step(action)[:4], strict=True):
+            assert np.array_equal(ours, theirs)
+
+
 def test_resets_refuse_masks_and_seeds_that_do_not_fit(made: list[Any]) -> None:
     env = URLabBatchEnv("sim://arm", 3)
     made.append(env)

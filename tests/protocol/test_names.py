@@ -85,7 +85,7 @@ class TestLookUp:
         assert twin.matches == caught.value.matches
 
     def test_an_alias_of_nothing_is_a_mistake(self) -> None:
-        with pytest.raises(ValueError, match="alias 'arm' stands for 'arm_C_9', which is no articulation here"):
+        with pytest.raises(ValueError, match="alias 'arm' stands for 'arm_C_9', but no articulation has that name"):
             NameMap({"arm_C_0": 1}, {"arm": ["arm_C_0", "arm_C_9"]}, "articulation")
 
     @given(st.dictionaries(short, st.integers()), st.data(), short)

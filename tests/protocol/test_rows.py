@@ -191,7 +191,7 @@ class TestEndpoints:
             rows.resolve_endpoint(endpoint, "sim.lab")
 
     def test_the_host_itself_must_be_an_address(self) -> None:
-        with pytest.raises(ValueError, match="no address to connect to"):
+        with pytest.raises(ValueError, match="not an address to connect to"):
             rows.resolve_endpoint("tcp://0.0.0.0:5558", "0.0.0.0")
 
 

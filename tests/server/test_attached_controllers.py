@@ -58,7 +58,10 @@ def test_an_mjcf_names_its_controller(tmp_path: Path, data: str | None, expected
 
 @pytest.mark.parametrize(
     ("data", "reason"),
-    [("lqr", "'lqr' is no controller; there are pd, passthrough"), ("pd,kp=stiff", "kp is a number from 0")],
+    [
+        ("lqr", "'lqr' is not a controller; the controllers are pd, passthrough"),
+        ("pd,kp=stiff", "kp is a number from 0"),
+    ],
 )
 def test_an_mjcf_that_names_none_says_what_there_is(tmp_path: Path, data: str, reason: str) -> None:
     with (

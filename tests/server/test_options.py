@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -70,6 +71,41 @@ def test_094_refusals_remember_what_came_before(ball: Wire) -> None:
     echo = options(ball)
     assert echo["timestep"] == float32(0.01)
     assert echo["cone"] == "pyramidal"
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("timestep", [0, -1, math.nan, math.inf, 1e-50]),  # the last is 0 as the float32 that it is kept as
+        ("impratio", [0, math.nan]),
+        ("density", [-1, math.inf, 1e39]),
+        ("viscosity", [-1]),
+        ("tolerance", [-1e-9, math.nan]),
+        ("noslip_tolerance", [-1]),
+        ("ccd_tolerance", [math.inf]),
+        ("sleep_tolerance", [math.nan]),
+        ("gravity", [[0, 0, math.nan], [math.inf, 0, 0]]),
+        ("wind", [[0, -math.inf, 0]]),
+        ("magnetic", [[0, 0, math.nan]]),
+        *((name, [-1, 10_001, 2**31 - 1]) for name in ("iterations", "ls_iterations")),
+        *((name, [-1, 10_001, 2**31 - 1]) for name in ("noslip_iterations", "ccd_iterations")),
+    ],
+)
+def test_numbers_that_no_simulation_survives_are_refused_and_change_nothing(
+    ball: Wire, name: str, values: list[Any]
+) -> None:
+    before = options(ball)
+    for value in values:
+        code, message = ball.refusal("set_sim_options", options={"viscosity": 0.5, name: value, "cone": "elliptic"})
+        assert code == "bad_value"
+        assert name in message
+    assert options(ball) == before
+    assert ball.ask("step")["time"] == pytest.approx(0.002)
+
+
+def test_what_is_at_the_edge_is_taken(ball: Wire) -> None:
+    assert options(ball, iterations=10_000, tolerance=0)["iterations"] == 10_000
+    assert options(ball, ccd_iterations=0)["ccd_iterations"] == 0
 
 
 def test_095_raw_masks_stay_raw(ball: Wire) -> None:

@@ -20,7 +20,7 @@ from wire import Wire
 from urlab_client import ImportFailed, URLabTimeoutError
 from urlab_client._landlock import is_available
 from urlab_client.aio import URLabClient
-from urlab_client.server import Limits, SimulatedServer, simulated
+from urlab_client.server import Limits, ModelError, SimulatedServer, simulated
 from urlab_client.server.assets import sandbox
 
 Serve = Callable[..., Wire]
@@ -90,6 +90,61 @@ def test_the_limit_that_a_model_exceeds_is_named(folder: Path) -> None:
         with SimulatedServer(model_roots=[folder / "root"], limits=Limits(**limits)) as server, Wire(server) as wire:
             wire.hello()
             assert name in refusal(wire, path)
+
+
+BODY = '<worldbody><body name="b"><joint name="j"/><geom name="g" size=".1"/></body></worldbody>'
+LARGE = {
+    "sensors": ('<sensor><contact geom1="g" num="2000000"/></sensor>', "2000000 numbers", "sensor_values"),
+    "more sensors": ('<sensor><contact geom1="g" num="40000000"/></sensor>', "bytes", "data_bytes"),
+    "far more sensors": ('<sensor><contact geom1="g" num="1000000000"/></sensor>', "memory", "model_memory_bytes"),
+    "arena": ('<size memory="300M"/>', "314577", "data_bytes"),
+    "user data": ('<size nuserdata="40000000"/>', "320004", "data_bytes"),
+    "constraints": ('<size njmax="2000000000"/>', "memory", "model_memory_bytes"),
+    "iterations": ('<option iterations="2147483647" tolerance="0"/>', "2147483647", "solver_iterations"),
+    "timestep": ('<option timestep="0"/>', "timestep must be a positive number", "timestep"),
+}
+
+
+@pytest.mark.parametrize("kind", LARGE)
+def test_what_its_simulation_takes_is_bounded_too(kind: str, wire: Wire, folder: Path) -> None:
+    part, number, limit = LARGE[kind]
+    model = folder / "root" / "small_file.xml"
+    model.write_text(f"<mujoco>{part}{BODY}</mujoco>")
+    message = refusal(wire, model)
+    assert number in message
+    assert limit in message
+
+
+def test_the_level_as_a_whole_is_bounded_before_play(folder: Path) -> None:
+    for name, count in (("one", 40), ("other", 1)):
+        (folder / "root" / name).mkdir()
+        (folder / "root" / name / "feeler.xml").write_text(
+            f'<mujoco>{BODY}<sensor><contact geom1="g" num="{count}"/></sensor></mujoco>'
+        )
+    limits = Limits(sensor_values=100)
+    with SimulatedServer(model_roots=[folder / "root"], limits=limits) as server, Wire(server) as wire:
+        wire.hello()
+        wire.ask("create_level", name="lab")
+        wire.ask("ensure_manager")
+        blueprint = wire.ask("import_xml", path="other/feeler.xml")["blueprint_class_path"]
+        wire.ask("spawn_grid", blueprint=blueprint, base_actor_id="f", count_x=3, count_y=1)
+        wire.ask("import_xml", path="one/feeler.xml", force_reimport=True)  # what was spawned grows
+        failed = wire.ask("begin_pie")
+        assert failed["state"] == "compile_failed"
+        assert "120 numbers together, more than the limit sensor_values, 100" in failed["compile_error"]
+        assert "sensor_values" in wire.refusal("spawn_actor", blueprint=blueprint, actor_id="more")[1]
+        wire.ask("stop_pie")
+        wire.ask("destroy_actor", target="f_0_0")
+        assert wire.ask("begin_pie")["state"] == "ready"
+
+
+def test_options_of_a_model_have_ranges_where_they_count(folder: Path) -> None:
+    model = folder / "secret_options.xml"
+    model.write_text(f'<mujoco><option iterations="2147483647" tolerance="0"/>{BODY}</mujoco>')
+    with pytest.raises(ModelError, match="iterations must be from 0 to the limit solver_iterations, 10000"):
+        SimulatedServer(model, mjcf_options=True, play=True).start()
+    with SimulatedServer(model, play=True):  # without, they do not count
+        pass
 
 
 def test_entities_are_not_expanded(wire: Wire, folder: Path) -> None:

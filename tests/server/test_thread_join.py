@@ -1,4 +1,4 @@
-"""Waits for threads: a deadline that passed while this process was stopped is no reason to give up at once."""
+"""Waits for threads: a deadline that passed while this process was stopped is not a reason to give up at once."""
 
 from __future__ import annotations
 

@@ -339,8 +339,8 @@ def load(workspace: Workspace, level: object) -> EditorWorld:
 @pytest.mark.parametrize(
     ("level", "text"),
     [
-        ("{", "is no level"),
-        ("[]", "is no level"),
+        ("{", "is not a level"),
+        ("[]", "is not a level"),
         ('{"format": "other"}', 'it lacks "format": "urlab-level"'),
         (HEAD | {"version": 2, "actors": []}, "version 2"),
         (HEAD, "actors"),
@@ -483,7 +483,7 @@ def test_an_id_of_another_class_is_refused(bot: str, ball: str, world: EditorWor
     assert refusal(world.spawn_actor, ball, "a").code == "spawn_failed"
     assert refusal(world.spawn_actor, bot, "LAMP").code == "spawn_failed"  # tags know no letter case
     assert not world.spawn_actor(bot, "A").was_existing  # ids of articulations do
-    assert not world.spawn_actor(ball, "bot").was_existing  # an object name is no id
+    assert not world.spawn_actor(ball, "bot").was_existing  # an object name is not an id
 
 
 def test_rotations_are_understood_in_mujocos_frame(bot: str, world: EditorWorld) -> None:

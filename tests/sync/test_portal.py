@@ -581,7 +581,7 @@ class TestInterrupt:
         interrupt_when_ready(process)
         code, out, err = outcome(process)
         assert (code, err) == (0, "")
-        assert out == ["stubborn goes on 0.05 s after it was interrupted", "interrupted", "ended by itself"]
+        assert out == ["stubborn is still running 0.05 s after it was interrupted", "interrupted", "ended by itself"]
 
     def test_works_inside_a_running_loop(self) -> None:
         process = child("""

@@ -279,7 +279,7 @@ def test_a_recording_is_made_and_replayed_and_one_can_go_to_any_place_in_it(page
     page.slide(0.9)
     page.until(page.elbow_is(0.9))
     page.ask("api/ops/configure_controller", {"articulation": "quadruped", "params": {"kp": {"RR_hip": 41}}})
-    assert page.ask("api/status")["recording"], "tuning a controller is no reason to think that it ended"
+    assert page.ask("api/status")["recording"], "tuning a controller is not a reason to think that it ended"
     page.click("#record")
     page.until("document.querySelector('#toasts').innerText.includes('frames')")
     page.click("#replay")

@@ -37,6 +37,7 @@ class MjOption:
 
 class MjModel:
     nq: int
+    narena: int
     nv: int
     nu: int
     na: int
@@ -109,6 +110,8 @@ class MjModel:
     def __getattr__(self, name: str) -> Any: ...
 
 class MjData:
+    nbuffer: int
+    narena: int
     time: float
     qpos: _Floats
     qvel: _Floats

@@ -242,32 +242,32 @@ class URLabArticulation(URLabEntity):
     @property
     def last_applied_ctrl(self) -> Floats:
         """`mjData.ctrl` as the server applied it last, after any controller, shape (n_actuators,)."""
-        return self._record.applied
+        return self._record.applied.copy()
 
     @property
     def act_array(self) -> Floats:
         """Activation per actuator, shape (n_actuators,); 0 for stateless ones."""
-        return self._record.act
+        return self._record.act.copy()
 
     @property
     def qpos_array(self) -> Floats:
         """Joint positions, shape (nq,), in joint order: radians, metres, quaternions (w, x, y, z)."""
-        return self._record.qpos
+        return self._record.qpos.copy()
 
     @property
     def qvel_array(self) -> Floats:
         """Joint velocities, shape (nv,), in joint order: rad/s, m/s; of a free base linear world, angular body."""
-        return self._record.qvel
+        return self._record.qvel.copy()
 
     @property
     def dof_qpos(self) -> Floats:
         """Joint positions without the free base, shape (nq,) or (nq - 7,)."""
-        return self._record.qpos[7:] if self.has_free_base else self._record.qpos
+        return self._record.qpos[7 if self.has_free_base else 0 :].copy()
 
     @property
     def dof_qvel(self) -> Floats:
         """Joint velocities without the free base, shape (nv,) or (nv - 6,)."""
-        return self._record.qvel[6:] if self.has_free_base else self._record.qvel
+        return self._record.qvel[6 if self.has_free_base else 0 :].copy()
 
     @property
     def twist_linear(self) -> Floats:

@@ -38,7 +38,10 @@ class URLabCameraView:
 
     @property
     def latest_frame(self) -> Pixels | None:
-        """Newest frame: real (H, W, 4) RGBA, depth (H, W) metres, else (H, W, 4) BGRA; yours to keep."""
+        """Newest frame: real (H, W, 4) RGBA, depth (H, W) metres, else (H, W, 4) BGRA.
+
+        Yours to keep: later frames are other arrays. Until one comes, this is the same array for all who ask.
+        """
         return self.pictures.newest()[0]
 
     @property

@@ -150,7 +150,7 @@ class URLabClient:
             live_pictures=live_pictures,
         )
         if encoding not in {"msgpack", "json"}:
-            raise ValueError(f"encoding is msgpack or json, not {encoding!r}")
+            raise ValueError(f"encoding must be msgpack or json, not {encoding!r}")
         if shm_dir is not None and Transport(transport) is not Transport.SHM:
             raise ValueError("shm_dir is for transport='shm'")
         if rcv_timeout_ms <= 0:
@@ -649,11 +649,13 @@ def _transport(address: str, step_port: int, keys: ClientKeys | None, *, shm: bo
         return LaunchedTransport(address, shm=shm)
     scheme, separator, rest = address.partition("://")
     if not separator or scheme not in {"tcp", "ipc"} or not rest:
-        raise ValueError(f"{address!r} is no address; write tcp://HOST, ipc://PATH or sim://MODEL")
+        raise ValueError(f"{address!r} is not a valid address; write tcp://HOST, ipc://PATH or sim://MODEL")
     own_port = False
     if scheme == "tcp":
         host = _HOST.fullmatch(rest)
         if host is None or not 0 < int(host["port"] or 1) <= _LAST_PORT:
-            raise ValueError(f"{address!r} is no address; write tcp://HOST or tcp://HOST:PORT, as in tcp://[::1]:5559")
+            raise ValueError(
+                f"{address!r} is not a valid address; write tcp://HOST or tcp://HOST:PORT, as in tcp://[::1]:5559"
+            )
         own_port = host["port"] is not None
     return ZmqTransport(address if own_port else f"{address}:{step_port}", keys)

@@ -131,7 +131,7 @@ async def _play(session: Session, state: SimState) -> tuple[Finding, bool]:
         second = await watched(lambda: session.call(PieStatus()), first)
     except URLabError as error:  # no answer, too: the editor's main thread may be stuck
         if isinstance(error, RPC_ERRORS["unknown_op"]):
-            return Finding(Verdict.NOTE, "play", "A packaged build: its play state cannot be asked for."), True
+            return Finding(Verdict.NOTE, "play", "A packaged build: it does not report its play state."), True
         subject = "session" if isinstance(error, SessionTakenOver) else "play"
         return Finding(Verdict.PROBLEM, subject, str(error)), False
     if second.state != PIEState.READY:

@@ -225,7 +225,7 @@ class LaunchedTransport:
         except TimeoutError:
             reason = f"not ready within {_START_S:g} s"
         raise ServerUnreachable(
-            f"{op.name}: no simulated server for {self._address}: {reason or 'it ended without a word'}", op=op.name
+            f"{op.name}: no simulated server for {self._address}: {reason or 'it exited without output'}", op=op.name
         )
 
 

@@ -307,7 +307,7 @@ class Session:
             raise URLabTimeoutError(
                 f"{op.name}: another call held {self._transport.endpoint} until the deadline. Nothing was sent.",
                 op=op.name,
-                hint="Calls of one client go one at a time; use a second client or a longer timeout.",
+                hint="A client sends one request at a time; use a second client or a longer timeout.",
             ) from None
         finally:
             self._queued -= 1

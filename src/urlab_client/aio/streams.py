@@ -234,7 +234,7 @@ class _StreamChannel(MessageHandler, Generic[T]):
                 raise StreamOverflow(
                     f"{self._source.name}: the reader fell behind: {lost} messages were lost, {waiting} wait.",
                     lost=lost,
-                    hint="Reading goes on with the oldest that waits. Read faster, or allow a larger buffer=….",
+                    hint="Reading continues with the oldest waiting item. Read faster, or pass a larger buffer=….",
                 )
             if entry is None:
                 if self._end is not None:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 __all__ = ["counted", "output", "progress_bar"]
 
-_COLUMNS = 120  # where the output is no terminal
+_COLUMNS = 120  # where the output is not a terminal
 
 
 @contextlib.contextmanager

@@ -27,7 +27,7 @@ _AWAY_S = 5.0
 def interruptible() -> Generator[asyncio.Event]:
     """Give an event that Ctrl-C sets while the block runs, instead of interrupting it."""
     loop, stop = asyncio.get_running_loop(), asyncio.Event()
-    # Not the loop's own way, which there is none of on Windows.
+    # Not the loop's own way, which Windows lacks.
     before = signal.signal(signal.SIGINT, lambda _number, _frame: loop.call_soon_threadsafe(stop.set))
     try:
         yield stop
@@ -78,7 +78,7 @@ async def _step(client: URLabClient) -> None:
     except (OutcomeUnknown, URLabTimeoutError):  # a connection that broke, a machine that was suspended
         found = await client.resync()
         if not (found.session_held and found.playing):
-            raise CommandError("the server has begun anew, or another client drives it") from None
+            raise CommandError("the server restarted, or another client took the session over") from None
 
 
 class _Watch:

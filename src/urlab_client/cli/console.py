@@ -79,7 +79,7 @@ def run(arguments: ConsoleArguments) -> int:
     except ImportError as error:
         raise CommandError(f"{error.name or error}: not installed; pip install 'urlab-client[web]'") from None
     if arguments.host not in {"127.0.0.1", "::1", "localhost"} and not arguments.allow_host:
-        raise CommandError(f"--host {arguments.host}: say with --allow-host NAME how browsers reach it")
+        raise CommandError(f"--host {arguments.host}: pass --allow-host NAME, the name under which browsers reach it")
     import_mujoco()
     with suppress(KeyboardInterrupt):  # Ctrl-C in the moment before uvicorn listens for it
         asyncio.run(_serve(arguments))

@@ -46,7 +46,7 @@ def run(arguments: KeysArguments) -> int:
     """Make or show keys.
 
     Raises:
-        KeyFileError: A file exists already, or is no key file.
+        KeyFileError: A file exists already, or is not a key file.
         OSError: A file cannot be written.
     """
     if arguments.action == "new":

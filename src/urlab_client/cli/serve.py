@@ -350,7 +350,7 @@ def _curve(arguments: ServeArguments) -> CurveServer | None:
             raise CommandError("--allow-client and --allow-any-client go with --server-key FILE")
         return None
     if not (arguments.allow_client or arguments.allow_any_client):
-        raise CommandError("--server-key: say whom to let in, with --allow-client PATH or --allow-any-client")
+        raise CommandError("--server-key: state who may connect, with --allow-client PATH or --allow-any-client")
     return CurveServer(
         server_key=arguments.server_key, allow=arguments.allow_client, allow_any=arguments.allow_any_client
     )
@@ -412,7 +412,7 @@ def _camera_mode(text: str) -> CameraOption:
     if not (equals and actor and slash and name):
         raise argparse.ArgumentTypeError(f"{text!r}: write ACTOR/CAMERA=MODE, for example arm/wrist=depth")
     if mode not in [*CameraMode]:
-        raise argparse.ArgumentTypeError(f"{text!r}: {mode!r} is no camera mode; there are {_names(CameraMode)}")
+        raise argparse.ArgumentTypeError(f"{text!r}: {mode!r} is not a camera mode; the modes are {_names(CameraMode)}")
     return CameraOption(camera, CameraMode(mode))
 
 

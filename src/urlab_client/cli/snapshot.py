@@ -165,7 +165,7 @@ def _of_running_server(arguments: SnapshotArguments) -> NDArray[np.uint8]:
     from urlab_client import URLabClient  # noqa: PLC0415
 
     if len(arguments.sources) > 1:
-        raise CommandError("give one address and nothing else, or models and no address")
+        raise CommandError("give one address or models, not both")
     if arguments.keyframe or arguments.seconds:
         raise CommandError("--keyframe and --seconds are for models: what a running server does is not changed")
     (address,) = arguments.sources
@@ -207,7 +207,7 @@ def _pixels(view: URLabCameraView) -> NDArray[np.uint8]:
     """Return red, green, blue and alpha of the newest frame; depth as grey, half as bright at twice the distance."""
     frame: NDArray[Any] | None = view.latest_frame
     if frame is None:
-        raise CommandError(f"the camera {view.name} gave no picture")
+        raise CommandError(f"camera {view.name} delivered no picture")
     if view.mode == CameraMode.REAL:
         return frame
     if view.mode != CameraMode.DEPTH:

@@ -157,7 +157,7 @@ async def _view(arguments: ViewArguments) -> None:
                 print(_said(arguments, view), flush=True)
                 await go_on(client, arguments.seconds, over=lambda: stop.is_set() or view.closed)
     if view.error is not None:
-        raise CommandError(f"the view has ended: {view.error}")
+        raise CommandError(f"the view ended: {view.error}")
     stats = view.stats
     print(f"{stats.states} states, {stats.frames} pictures shown; {stats.dropped_states} states left out")
 

@@ -19,7 +19,7 @@ Policy = Callable[[NDArray[Any], np.random.Generator], Any]
 
 
 class RolloutError(URLabError):
-    """An episode cannot be had: its policy raised, its attempts are used up, or no worker could be started."""
+    """An episode failed for good: its policy raised, its attempts are used up, or no worker could be started."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

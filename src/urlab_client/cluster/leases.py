@@ -132,9 +132,9 @@ class LeasePool:
             URLabError: Ray is not initialised.
         """
         if not addresses or len(set(addresses)) != len(addresses):
-            raise ValueError(f"addresses are one or more, each once, not {list(addresses)!r}")
+            raise ValueError(f"addresses must be one or more, each once, not {list(addresses)!r}")
         if not ttl > 0:
-            raise ValueError(f"ttl is above 0 seconds, not {ttl}")
+            raise ValueError(f"ttl must be above 0 seconds, not {ttl}")
         if not _ray.is_initialized():
             raise URLabError("Ray is not initialised.", hint="Call ray.init() first.")
         self.name = name

@@ -261,7 +261,7 @@ def rollouts(
         lease_timeout: Seconds that an attempt waits for a free address.
 
     Returns:
-        The episodes. Iterating raises `RolloutError` when an episode cannot be had.
+        The episodes. Iterating raises `RolloutError` when an episode failed for good.
 
     Raises:
         ValueError: An option out of range, or a scene that is not `sim://`.
@@ -270,7 +270,7 @@ def rollouts(
     names = [scenes.name] if isinstance(scenes, LeasePool) else [scenes] if isinstance(scenes, str) else list(scenes)
     pool = scenes if isinstance(scenes, LeasePool) else None
     if not names or (pool is None and not all(name.startswith("sim://") for name in names)):
-        raise ValueError(f"scenes are one or more sim:// addresses, or a LeasePool of others, not {names!r}")
+        raise ValueError(f"scenes must be one or more sim:// addresses, or a LeasePool of others, not {names!r}")
     if n < 0 or seed < 0 or n_workers < 0 or retries < 0 or max_episode_steps < 1:
         raise ValueError("n, seed, n_workers and retries are 0 or more, and max_episode_steps is at least 1")
     if min(episode_timeout, start_timeout, lease_timeout) <= 0:

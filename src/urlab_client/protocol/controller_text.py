@@ -28,11 +28,11 @@ class ControllerText(NamedTuple):
         """Read a line.
 
         Raises:
-            ValueError: An unknown kind or gain, or a gain that is no number from 0.
+            ValueError: An unknown kind or gain, or a gain that is not a number of at least 0.
         """
         kind, *gains = (part.strip() for part in text.split(","))
         if kind not in [*ControllerKind]:
-            raise ValueError(f"{kind!r} is no controller; there are {', '.join(ControllerKind)}")
+            raise ValueError(f"{kind!r} is not a controller; the controllers are {', '.join(ControllerKind)}")
         if gains and kind != ControllerKind.PD:
             raise ValueError(f"{gains[0]!r}: a {kind} controller has no gains")
         return cls(ControllerKind(kind), dict(map(_gain, gains)))
@@ -41,7 +41,7 @@ class ControllerText(NamedTuple):
 def _gain(text: str) -> tuple[str, float]:
     name, _, number = text.partition("=")
     if name not in _GAINS:
-        raise ValueError(f"{text!r} is no gain; write {', '.join(f'{name}=N' for name in _GAINS)}")
+        raise ValueError(f"{text!r} is not a gain; write {', '.join(f'{name}=N' for name in _GAINS)}")
     try:
         value = float(number)
     except ValueError:

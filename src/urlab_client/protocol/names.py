@@ -105,7 +105,7 @@ class NameMap(dict[str, T]):
         for alias, keys in (aliases or {}).items():
             for key in keys:
                 if not super().__contains__(key):
-                    raise ValueError(f"alias {alias!r} stands for {key!r}, which is no {kind} here")
+                    raise ValueError(f"alias {alias!r} stands for {key!r}, but no {kind} has that name")
             if keys and not super().__contains__(alias):
                 self._aliases[alias] = tuple(dict.fromkeys(keys))
 

@@ -59,7 +59,7 @@ def normalized(quat: Quat) -> Quat:
         return quat
     largest = max(abs(value) for value in quat)
     if largest == 0.0:
-        raise ValueError("a quaternion of four zeros is no rotation")
+        raise ValueError("a quaternion of four zeros is not a rotation")
     # Scaling first keeps the squares within range, whatever the components are.
     a, b, c, d = (value / largest for value in quat)
     norm = math.sqrt(a * a + b * b + c * c + d * d)

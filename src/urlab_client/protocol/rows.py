@@ -263,7 +263,7 @@ def resolve_endpoint(endpoint: str, host: str) -> str:
         ValueError: If `host` is itself unspecified.
     """
     if host in _UNSPECIFIED_HOSTS:
-        raise ValueError(f"host {host!r} is no address to connect to")
+        raise ValueError(f"host {host!r} is not an address to connect to")
     scheme, separator, address = endpoint.partition("://")
     if not separator:
         raise ProtocolError(f"endpoint {endpoint!r}: no scheme, expected tcp://HOST:PORT.")
@@ -629,7 +629,7 @@ class ActuatorInfo(Struct, frozen=True, eq=False):
         """Read a message; `where` names its source in errors.
 
         Raises:
-            ProtocolError: If it is not such a JSON object, its arrays differ in length, or an id is no int32.
+            ProtocolError: If it is not such a JSON object, its arrays differ in length, or an id is not an int32.
         """
         try:
             info = _INFO.decode(payload)

@@ -138,7 +138,12 @@ class ServerCore:
         physics = self.physics
 
         def build() -> Running:
-            scene = compile_scene(actors, honour_mjcf_options=physics.mjcf_options, camera_size=physics.camera_size)
+            scene = compile_scene(
+                actors,
+                honour_mjcf_options=physics.mjcf_options,
+                camera_size=physics.camera_size,
+                limits=self.limits,
+            )
             self.compiled = _Compiled(actors, scene, copy.copy(scene.model.opt))
             return self._run(scene, actors)
 
@@ -206,7 +211,8 @@ class ServerCore:
             CompileFailed: MuJoCo rejects the level.
         """
         actors = self.world.freeze()
-        return self._camera_renderer(compile_scene(actors, honour_mjcf_options=self.physics.mjcf_options), actors, {})
+        scene = compile_scene(actors, honour_mjcf_options=self.physics.mjcf_options, limits=self.limits)
+        return self._camera_renderer(scene, actors, {})
 
     def _camera_renderer(
         self, scene: CompiledScene, actors: Sequence[Actor], modes: Mapping[tuple[str, str], CameraMode]

@@ -80,9 +80,9 @@ class Fault:
         if self.topic is not None and self.op is not None:
             raise ValueError("a fault concerns the requests of an op or the messages of a topic, not both")
         if self.after < 0 or (self.times is not None and self.times < 1):
-            raise ValueError(f"after is at least 0 and times at least 1, not {self.after} and {self.times}")
+            raise ValueError(f"after must be at least 0 and times at least 1, not {self.after} and {self.times}")
         if not 0.0 <= self.probability <= 1.0:
-            raise ValueError(f"probability is a number from 0 to 1, not {self.probability}")
+            raise ValueError(f"probability must be a number from 0 to 1, not {self.probability}")
 
     def concerns_request(self, op: str) -> bool:
         """Whether requests of this op are concerned."""
@@ -106,7 +106,7 @@ class Delay(Fault):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not (self.seconds >= 0.0 and math.isfinite(self.seconds)):
-            raise ValueError(f"a delay is a finite number of seconds, at least 0, not {self.seconds}")
+            raise ValueError(f"a delay must be a finite number of seconds, at least 0, not {self.seconds}")
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ class Corrupt(Fault):
         if not self.executed:
             raise ValueError("a corrupt reply is that of an executed request")
         if self.flips < 0:
-            raise ValueError(f"flips is at least 0, not {self.flips}")
+            raise ValueError(f"flips must be at least 0, not {self.flips}")
 
 
 @dataclass(frozen=True)

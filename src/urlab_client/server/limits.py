@@ -23,13 +23,16 @@ class Limits:
         n_steps: Physics steps of one request. They run in slices, between which the server can be stopped.
         grid_cells: Cells of one `spawn_grid`.
         actors: Actors of a level.
-        scene_bytes: Memory of all the models of a level together, as MuJoCo compiles each.
+        scene_bytes: Memory of all the models of a level together, as MuJoCo compiles and simulates each.
+        sensor_values: Numbers that the sensors of a level give together; each step reports them.
+        solver_iterations: Iterations of the solver, of its line search, and of collision detection.
         markers: Debug primitives kept per world; the oldest give way.
         recording_bytes: Memory of a live recording; the oldest frames give way.
         recording_file_bytes: Size of a recording that is loaded.
         model_file_bytes: Size of an XML file that a client names, and of each that it includes.
         model_files: Files that a model may consist of.
         model_bytes: Memory of a model that a client names, once compiled.
+        data_bytes: Memory that its simulation takes: MuJoCo's `mjData`, with its arena.
         model_memory_bytes: Memory its compilation may take besides.
         model_cpu_s: Processor time its compilation may take, seconds.
         model_wall_s: Seconds it may take altogether.
@@ -43,12 +46,15 @@ class Limits:
     grid_cells: int = 1024
     actors: int = 4096
     scene_bytes: int = 1024 * _MIB
+    sensor_values: int = 1_000_000
+    solver_iterations: int = 10_000
     markers: int = 4096
     recording_bytes: int = 256 * _MIB
     recording_file_bytes: int = 256 * _MIB
     model_file_bytes: int = 64 * _MIB
     model_files: int = 4096
     model_bytes: int = 256 * _MIB
+    data_bytes: int = 256 * _MIB
     model_memory_bytes: int = 1024 * _MIB
     model_cpu_s: int = 10
     model_wall_s: int = 20

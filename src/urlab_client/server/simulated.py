@@ -176,23 +176,25 @@ class SimulatedServer:
                 `/dev/shm` spares the disk. None for no shared memory.
 
         Raises:
-            ValueError: A port, mode or size that is none, two levels, or both `curve` and `insecure_no_auth`.
+            ValueError: An invalid port, mode or size, two levels, or both `curve` and `insecure_no_auth`.
         """
         names = tuple(os.fspath(model) for model in models)
         if sum(map(_is_level, names)) > 1:
             raise ValueError(f"only one level can be open: {', '.join(filter(_is_level, names))}")
         if actor_names not in ("model", "plugin"):
-            raise ValueError(f"actor_names is 'model' or 'plugin', not {actor_names!r}")
+            raise ValueError(f"actor_names must be 'model' or 'plugin', not {actor_names!r}")
         if render_quality not in get_args(RenderQuality):
-            raise ValueError(f"render_quality is {', '.join(get_args(RenderQuality))}, not {render_quality!r}")
+            raise ValueError(f"render_quality must be {', '.join(get_args(RenderQuality))}, not {render_quality!r}")
         if camera_size is not None and (len(camera_size) != 2 or min(camera_size) < 1):
-            raise ValueError(f"camera_size is a width and a height of at least 1 pixel, not {camera_size!r}")
+            raise ValueError(f"camera_size must be a width and a height of at least 1 pixel, not {camera_size!r}")
         if curve is not None and insecure_no_auth:
-            raise ValueError("curve and insecure_no_auth exclude each other: with keys a server is not open to all")
+            raise ValueError(
+                "curve and insecure_no_auth exclude each other: a server with keys is not open to everyone"
+            )
         ports = _Ports(step=step_port, state=state_port, ctrl=ctrl_port, info=info_port, camera=camera_port)
         for name, port in vars(ports).items():
             if not 0 <= port <= 65535:
-                raise ValueError(f"{name}_port is a number from 0 to 65535, not {port}")
+                raise ValueError(f"{name}_port must be a number from 0 to 65535, not {port}")
         self._config = _Config(
             models=names,
             play=play,
@@ -237,7 +239,7 @@ class SimulatedServer:
 
         Raises:
             PortInUse: Somebody has a port.
-            OSError: The host is none of this machine, or `saved_dir` cannot be used.
+            OSError: The host is not an address of this machine, or `saved_dir` cannot be used.
             UnprotectedServer: The host is not loopback, and neither `curve` nor `insecure_no_auth` was given.
             KeyFileError: A key file cannot be used.
             ModelError: A model is missing or broken, or play was asked for and MuJoCo rejects the scene.
@@ -294,11 +296,11 @@ class SimulatedServer:
         Raises:
             RenderingUnavailable: This machine has no OpenGL (the message names the packages), the level does not
                 compile, or the server is busy.
-            ValueError: A size that is none.
+            ValueError: An invalid size.
             RuntimeError: The server is closed.
         """
         if len(size) != 2 or not all(1 <= side <= LARGEST_PIXELS for side in size):
-            raise ValueError(f"size is a width and a height from 1 to {LARGEST_PIXELS} pixels, not {size!r}")
+            raise ValueError(f"size must be a width and a height from 1 to {LARGEST_PIXELS} pixels, not {size!r}")
         return self._running.snapshot((int(size[0]), int(size[1])), frame_all=frame_all)
 
     @property
@@ -645,7 +647,7 @@ class _Opened:
         for served in self._served():
             idle = served.join(max(0.0, deadline - time.monotonic())) and idle
         if not idle:
-            logger.warning("a request was still under way when the server closed; its thread ends after it")
+            logger.warning("a request was still running when the server closed; its thread ends after it")
         if self._temporary_folder is not None:
             self._temporary_folder.close()
 

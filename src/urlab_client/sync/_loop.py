@@ -243,7 +243,9 @@ class CallerDrivenLoop:
             else:
                 job.wait(left)
         if not job.finished:
-            _log.warning("%s goes on %g s after it was interrupted", getattr(job.coro, "__qualname__", job.coro), GRACE)
+            _log.warning(
+                "%s is still running %g s after it was interrupted", getattr(job.coro, "__qualname__", job.coro), GRACE
+            )
 
     def _drive(self, job: Job[Any], deadline: float | None = None) -> None:
         """Run the loop on this thread until `job` is finished, its caller called away or the deadline has passed."""

@@ -45,7 +45,10 @@ class URLabCameraView(Facade, twin=aio.URLabCameraView):
 
     @property
     def latest_frame(self) -> Pixels | None:
-        """Newest frame: real (H, W, 4) RGBA, depth (H, W) metres, else (H, W, 4) BGRA; yours to keep."""
+        """Newest frame: real (H, W, 4) RGBA, depth (H, W) metres, else (H, W, 4) BGRA.
+
+        Yours to keep: later frames are other arrays. Until one comes, this is the same array for all who ask.
+        """
         return self._aio.latest_frame
 
     @property

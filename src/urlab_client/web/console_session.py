@@ -411,14 +411,14 @@ class ConsoleSession:
         Raises:
             NotDriving: Somebody else has the controls.
             KeyError: An articulation or actuator is unknown; nothing was set.
-            ValueError: A value is no finite number; nothing was set.
+            ValueError: A value is not a finite number; nothing was set.
         """
         found = {key: (self.client.articulations[key], given) for key, given in values.items()}
         for art, given in found.values():
             for name, value in given.items():
                 art.actuators[name]  # raises
                 if not np.isfinite(value):
-                    raise ValueError(f"{name}: {value} is no set-point")
+                    raise ValueError(f"{name}: {value} is not a set-point")
         self.lease.use(viewer)
         for key, (art, given) in found.items():
             self._seed(key, art)
@@ -486,7 +486,7 @@ class ConsoleSession:
         """Go to a frame of the replay, and return the one reached and how many there are.
 
         No op does that. A replay goes on by what is stepped, though, and begins where it is started: to go back it is
-        started again. The plugin's plays by itself and says not where it is.
+        started again. The plugin's replay plays by itself and does not report its position.
 
         Raises:
             NotDriving: Somebody else has the controls.

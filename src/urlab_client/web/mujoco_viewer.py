@@ -115,7 +115,7 @@ class MujocoViewer:
     def missing(self) -> str:
         """Why there is no view; empty when there is one."""
         if files() is None:
-            return "this MuJoCo comes without its web viewer: pip install mujoco-studio"
+            return "this MuJoCo comes without its web viewer, which is in mujoco-studio, for MuJoCo 4.0 and later"
         return "" if self._client.model is not None else "there is no compiled model: no play session runs"
 
     async def shown(self) -> Shown | None:

@@ -96,7 +96,7 @@ class LiveState(MessageHandler):
             self._refuse(str(error))
 
     def on_malformed(self, problem: str) -> None:
-        """Take note of a message that is none."""
+        """Take note of a malformed message."""
         self.stats.received += 1
         self._refuse(problem)
 
@@ -130,7 +130,7 @@ class LiveState(MessageHandler):
         self.stats.refused += 1
         if not self._warned:
             self._warned = True
-            log.warning("live state is not taken over: %s More of these are only counted.", problem)
+            log.warning("live state was not applied: %s More of these are only counted.", problem)
 
     def _forget(self) -> None:
         self._payload = self._snapshot = None
@@ -161,7 +161,7 @@ class LatestPicture(MessageHandler):
             try:
                 self._source.attach(self)
             except (ProtocolError, ValueError) as error:  # the server says that they come from where nothing can
-                log.warning("pictures of a camera are not received by themselves: %s", error)
+                log.warning("a camera's pictures are not received in the background: %s", error)
                 return
             self._running = True
 
@@ -199,7 +199,7 @@ class LatestPicture(MessageHandler):
             self._lock.release()
 
     def on_malformed(self, problem: str) -> None:
-        """Take note of a message that is none."""
+        """Take note of a malformed message."""
         self._warn(problem)
 
     def on_end(self, error: Callable[[], URLabError]) -> None:

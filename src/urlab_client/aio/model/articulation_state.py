@@ -81,7 +81,11 @@ class MirroredEntity:
         """Take over a checked state, here and where asked for in the mirror. Call under the mirror's lock."""
         self.pose = state
         data = self.mirror.data
-        if not into_mirror or data is None or self.qpos_offset is None or self.qvel_offset is None:
+        if data is None:  # else it is read from there
+            qpos, qvel = (None if array is None else array.copy() for array in (state.qpos, state.qvel))
+            self.pose = EntityState(xpos=state.xpos, xquat=state.xquat, qpos=qpos, qvel=qvel)
+            return
+        if not into_mirror or self.qpos_offset is None or self.qvel_offset is None:
             return
         if state.qpos is not None and state.qvel is not None:
             data.qpos[self.qpos_offset : self.qpos_offset + 7] = state.qpos
@@ -92,14 +96,14 @@ class MirroredEntity:
         data = self.mirror.data
         if data is not None and self.qpos_offset is not None:
             return data.qpos[self.qpos_offset : self.qpos_offset + 7].copy()
-        return None if self.pose is None else self.pose.qpos
+        return None if self.pose is None or self.pose.qpos is None else self.pose.qpos.copy()
 
     def root_qvel(self) -> Floats | None:
         """Free-joint velocity, shape (6,), or None without a free base."""
         data = self.mirror.data
         if data is not None and self.qvel_offset is not None:
             return data.qvel[self.qvel_offset : self.qvel_offset + 6].copy()
-        return None if self.pose is None else self.pose.qvel
+        return None if self.pose is None or self.pose.qvel is None else self.pose.qvel.copy()
 
     def wrench_command(self, wrenches: Wrenches) -> ArticulationCommand:
         """Return what makes a direct step carry the wrenches alone."""
@@ -120,7 +124,8 @@ class MirroredEntity:
 class MirroredArticulation(MirroredEntity):
     """State of one articulation.
 
-    Arrays that come from a reply are replaced, never written: whoever holds one may keep it.
+    Its arrays are its own: those of a reply are its reader's, who may write into them. What is read from here goes out
+    as a copy for the same reason.
 
     Attributes:
         layout: Where its values live in the compiled model.
@@ -242,12 +247,13 @@ class MirroredArticulation(MirroredEntity):
 
     def absorb(self, state: ArticulationState) -> None:
         """Take over a checked state. Call under the mirror's lock."""
-        self.qpos, self.qvel = state.qpos, state.qvel
-        self.force, self.bodies = state.actuator_force, state.bodies
+        self.qpos, self.qvel = state.qpos.copy(), state.qvel.copy()
+        self.force = None if state.actuator_force is None else state.actuator_force.copy()
+        self.bodies = state.bodies
         if state.ctrl is not None:
-            self.applied = state.ctrl
+            self.applied = state.ctrl.copy()
         if state.act is not None:
-            self.act = state.act
+            self.act = state.act.copy()
         if state.sensors is not None:
             self.sensors = state.sensors
         if state.twist is not None:

@@ -19,7 +19,7 @@ from typing import Final
 import msgspec
 
 from urlab_client._children import APART
-from urlab_client._confined import limit_process
+from urlab_client._confined import forbid_opening, limit_process
 from urlab_client._landlock import confine_files
 from urlab_client._mjcf_files import NamedFiles, named_files
 
@@ -80,7 +80,7 @@ def compile_confined(xml: str, assets: Mapping[str, bytes]) -> bytes:
 
 def _main(folder: str) -> None:
     answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what libraries print is no answer
+    os.dup2(2, 1)  # what libraries print is not an answer
     order = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=_CompileJob)
     try:
         answer = _DONE + _compile(order, folder)
@@ -98,8 +98,10 @@ def _compile(order: _CompileJob, folder: str) -> bytes:
 
     os.chdir(folder)  # where there is nothing to find, and MuJoCo's log goes with it
     limit_process(order.memory_bytes, order.cpu_s)
-    confine_files(readable=(), writable=(Path(folder),))
     _refuse_local_files(order.xml, order.assets)
+    # All it needs came through its standard input: whatever MuJoCo makes of the model, there is nothing it can open.
+    confine_files(readable=(), writable=(Path(folder),))
+    forbid_opening()
     compiled = mujoco.MjModel.from_xml_string(order.xml, dict(order.assets))
     mujoco.mj_forward(compiled, mujoco.MjData(compiled))  # which the client does first, and could go on for ever
     buffer = np.zeros(mujoco.mj_sizeModel(compiled), dtype=np.uint8)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from urlab_client._mujoco import without_newer_attributes
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.errors import ProtocolError, URLabVersionMismatch
 from urlab_client.protocol.messages.session import HelloOk, Perturbation
@@ -184,7 +185,18 @@ class Mirror:
             if binary and hello.mjb is not None:
                 model = _from_binary(hello.mjb)
             elif hello.mjcf_compiled is not None:
-                model = _compiled(hello.mjcf_compiled, hello.vfs_assets or {}, trusted=trusted)
+                assets = hello.vfs_assets or {}
+                model, left_out = without_newer_attributes(
+                    hello.mjcf_compiled, lambda xml: _compiled(xml, assets, trusted=trusted)
+                )
+                if left_out:
+                    log.warning(
+                        "The server's MuJoCo %s writes attributes that MuJoCo %s does not know; the local model goes "
+                        "without them: %s.",
+                        hello.mujoco_version,
+                        mujoco.mj_versionString(),
+                        ", ".join(left_out),
+                    )
             else:
                 return None
         except (ValueError, mujoco.FatalError) as error:

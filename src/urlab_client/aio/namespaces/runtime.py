@@ -156,11 +156,13 @@ class RuntimeNamespace(RuntimeOps):
     async def forward(self, *, timeout: Timeout = DEFAULT) -> ForwardOk:
         """Run `mj_forward` on the server and take over the state: kinematics and dynamics, no integration.
 
+        In puppet mode `client.data` stays as it is: there it is yours, and what the server has was pushed from it.
+
         Returns:
             The state; time and step counter are unchanged.
         """
         async with self._session.turn(Forward, timeout=timeout) as turn:
             self._state.require_handshake("forward")
             reply = await turn.call(Forward())
-            self._state.absorb(reply, "forward")
+            self._state.absorb(reply, "forward", into_mirror=self._state.mode is not StepMode.PUPPET)
             return reply

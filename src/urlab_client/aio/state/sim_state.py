@@ -80,7 +80,7 @@ class StateObserver(Protocol):
     """Looks on while the client works. Called on the event loop, so it must be quick; it must not raise."""
 
     def on_state(self, reply: StateReply | StateSnapshot) -> None:
-        """Take note of a state that was taken over. Its arrays are replaced by later ones, never written."""
+        """Take note of a state that was taken over. Its arrays go on to the caller of `step()`: copy what is kept."""
         ...
 
     def wanted_pictures(self, asked: bool | dict[str, str | None], n_steps: int) -> bool | dict[str, str | None]:
@@ -108,7 +108,7 @@ class SimState:
         sim_time: Simulation time of the last reply, seconds.
         on_adopted: Told of each handshake taken over, and of the end of play.
         pending: Requests whose replies were lost.
-        stopping: Whether this client is ending play, so that its end is no news.
+        stopping: Whether this client is ending play, so that its end is not news.
         observers: Told of each state taken over, such as recorders.
     """
 
@@ -272,7 +272,7 @@ class SimState:
                 "The server offers its model only in MuJoCo's binary format, which is loaded from servers on this "
                 "machine and from servers known by their key.",
                 op="hello",
-                hint="Pass server_key=…, or trust_server=True if you trust all between here and there, or "
+                hint="Pass server_key=…, or trust_server=True if you trust the network in between, or "
                 "local_model=False.",
             )
         hello.mjb = None

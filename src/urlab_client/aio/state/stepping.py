@@ -104,7 +104,7 @@ def _puppet_step(state: SimState, n_steps: int) -> tuple[Step, Carried]:
     model, data = mirror.model, mirror.data
     if model is None or data is None:
         raise URLabError(
-            "step: puppet mode integrates the local model, and there is none.",
+            "step: puppet mode integrates the local model, which this client does not have.",
             op="step",
             hint="Make the client with local_model=True and call discover() during play.",
         )

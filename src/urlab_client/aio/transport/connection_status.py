@@ -1,6 +1,6 @@
 """What all ZeroMQ connections of the client have in common: how they notice a dead peer, and what stands in their way.
 
-A peer that is gone without a word (a pulled cable, a suspended machine, a stopped process) is noticed after
+A peer that is gone silently (a pulled cable, a suspended machine, a stopped process) is noticed after
 `HEARTBEAT_MS + SILENCE_MS` at the latest, one whose system closes the connection at once. Heartbeats are answered by
 the peer's I/O thread, also while its worker is busy for minutes: they tell a dead server, not a wedged one.
 """

@@ -59,7 +59,7 @@ def client_keys(address: str, server_key: str | None, client_key: str | None) ->
         client_key: The client's secret key file; None or empty for a key made up now.
 
     Raises:
-        KeyFileError: A key is none.
+        KeyFileError: A key is malformed.
         ValueError: Keys that cannot be used together, or for this address.
     """
     if not is_local(address):
@@ -67,7 +67,7 @@ def client_keys(address: str, server_key: str | None, client_key: str | None) ->
         client_key = os.environ.get(_CLIENT_VARIABLE) if client_key is None and server_key else client_key
     if not server_key:
         if client_key:
-            raise ValueError("client_key without server_key: which server is meant to see it must be known, too")
+            raise ValueError("client_key needs server_key: the client must know which server it talks to")
         return None
     if not address.startswith("tcp://"):
         raise ValueError(f"server_key is for servers at tcp:// addresses, not {address!r}")

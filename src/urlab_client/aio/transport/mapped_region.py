@@ -45,7 +45,7 @@ class MappedRegion:
     Raises:
         RegionNotReady: It is still being created.
         RegionInUse: Another client holds the lock.
-        ProtocolError: It is no region.
+        ProtocolError: It is not a region.
         OSError: It cannot be opened.
     """
 

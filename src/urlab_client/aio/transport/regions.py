@@ -143,7 +143,7 @@ class _RegionReader:
                     found = self.mapping.region.read_latest(take=take)
                     if found is not None:
                         return found
-                raise ProtocolError(f"{self.mapping.path}: pictures come faster than they can be read.")
+                raise ProtocolError(f"{self.mapping.path}: pictures arrive faster than they can be read.")
         raise MessageGone(f"{self.mapping.path}: the picture is gone.")
 
     def view(self) -> tuple[Publication[memoryview], Callable[[], bool]] | None:
@@ -356,7 +356,7 @@ class Regions:
     def _subscribe(self, handler: MessageHandler) -> None:
         source = self._sources.get(handler)
         if source is not None:
-            with contextlib.suppress(URLabError, ValueError):  # an address that is none: as silent as a closed port
+            with contextlib.suppress(URLabError, ValueError):  # an invalid address is as silent as a closed port
                 self._subscriptions.attach(handler, source.subscription)
 
     def _resume(self, reader: _RegionReader) -> None:

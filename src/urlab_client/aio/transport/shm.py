@@ -193,7 +193,7 @@ _JSON = msgspec.json.Decoder(_Envelope)
 
 
 def _envelope(reply: bytes) -> _Envelope:
-    """Read what a reply says about itself; empty if it is none."""
+    """Read what a reply says about itself; empty for what is not a reply."""
     try:
         return (_JSON if reply[:1] == b"{" else _MSGPACK).decode(reply)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):

@@ -63,7 +63,7 @@ class MessageHandler(ABC):
 
     @abstractmethod
     def on_malformed(self, problem: str) -> None:
-        """Take note of a message that is none."""
+        """Take note of a malformed message."""
 
     @abstractmethod
     def on_end(self, error: Callable[[], URLabError]) -> None:

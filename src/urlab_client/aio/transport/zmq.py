@@ -306,7 +306,7 @@ class ZmqTransport:
             URLabTimeoutError(
                 f"{entry.op.name}: no reply from {self._endpoint} within {_ms(seconds)}.{executed}",
                 op=entry.op.name,
-                hint="The connection stands, so the server is busy or blocked; allow more time with timeout=…",
+                hint="The connection is up, so the server is busy or blocked; allow more time with timeout=…",
             )
         )
         if self._loop is not None and self._silent_since is None:
@@ -432,14 +432,14 @@ class ZmqTransport:
         if entry.op.effect is Effect.READ:
             return ConnectionLost(text, op=name, hint="The op changes nothing: it can be sent again.")
         return OutcomeUnknown(
-            text, op=name, hint="Whether it was executed is unknown: client.resync() finds out, and goes on."
+            text, op=name, hint="Whether it was executed is unknown: client.resync() finds out and recovers."
         )
 
     def _clogged(self, op: Op) -> ServerUnreachable:
         return ServerUnreachable(
             f"{op.name}: {self._endpoint} has not taken the requests before this one. Nothing was sent.",
             op=op.name,
-            hint="The connection stands, but the server does not read from it: restart it.",
+            hint="The connection is up, but the server does not read from it: restart it.",
         )
 
     def _too_late(self, op: Op) -> URLabTimeoutError:

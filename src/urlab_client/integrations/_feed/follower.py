@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import copy
 import logging
 from collections.abc import Callable, Coroutine, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+from msgspec import Struct
 
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
@@ -22,6 +26,8 @@ __all__ = ["Follower"]
 log = logging.getLogger("urlab_client.feed")
 
 _NS = 1_000_000_000
+
+S = TypeVar("S", bound=Struct)
 
 
 class Follower:
@@ -50,7 +56,7 @@ class Follower:
         buffer: int,
     ) -> None:
         if isinstance(cameras, str) and cameras != "all":
-            raise ValueError(f"cameras is a sequence of names or 'all', not {cameras!r}")
+            raise ValueError(f"cameras must be a sequence of names or 'all', not {cameras!r}")
         self._client = client
         self._state: SimState = client._state  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
         self._name = name
@@ -80,7 +86,7 @@ class Follower:
             )
         if self._needs_model is not None and self._state.mirror.model is None:
             raise URLabError(
-                f"{self._name}: poses are computed with the local model, and there is none.",
+                f"{self._name}: poses are computed with the local model, which this client does not have.",
                 hint=f"Call discover() during play, with local_model=True{self._needs_model}.",
             )
         unknown = self._unknown_cameras()
@@ -121,7 +127,7 @@ class Follower:
             else:
                 self._ignore()
         if not live:
-            self._hand_on(reply)
+            self._hand_on(_detached(reply))
 
     def wanted_pictures(self, asked: bool | dict[str, str | None], n_steps: int) -> bool | dict[str, str | None]:
         """Add the cameras to a step when their next picture is due; see `StateObserver`."""
@@ -148,7 +154,7 @@ class Follower:
         hello = self._state.hello
         if self._scene is None or hello is not self._described:
             if self._scene is not None and (unknown := self._unknown_cameras()):
-                log.warning("%s: in the new scene there is %s", self._name, unknown)
+                log.warning("%s: the new scene has %s", self._name, unknown)
             self._described = hello
             self._scene = SceneMessages.of(self._state, self._views())
             if self._live:
@@ -215,7 +221,7 @@ class Follower:
     def _on_end(self, task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)
         if not task.cancelled() and (error := task.exception()) is not None:
-            log.warning("%s: a stream was not followed to its end: %s", self._name, error)
+            log.warning("%s: a stream was not read to its end: %s", self._name, error)
 
     def _ignore(self) -> None:
         self._live = False
@@ -251,3 +257,21 @@ class Follower:
                 nanoseconds = round((self._state.sim_time if sample.sim_time is None else sample.sim_time) * _NS)
                 if self._put is not None and schedule.due(nanoseconds):
                     self._put(CameraPicture(camera, sample.pixels, nanoseconds, sample.recv_wall_time_ns))
+
+
+def _detached(reply: StateReply | StateSnapshot) -> StateReply | StateSnapshot:
+    """Return a state with arrays of its own: the caller of `step()` may write to those it came with."""
+    own = copy.copy(reply)
+    own.per_articulation = {key: _with_own_arrays(state) for key, state in reply.per_articulation.items()}
+    if isinstance(own, (StepOk, StateSnapshot)) and own.entities is not None:
+        own.entities = {name: _with_own_arrays(state) for name, state in own.entities.items()}
+    return own
+
+
+def _with_own_arrays(struct: S) -> S:
+    own = copy.copy(struct)
+    for name in own.__struct_fields__:
+        value = getattr(own, name)
+        if isinstance(value, np.ndarray):
+            setattr(own, name, value.copy())
+    return own

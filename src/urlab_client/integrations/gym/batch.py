@@ -10,14 +10,15 @@ from typing import Any
 import mujoco
 import numpy as np
 from gymnasium.vector import AutoresetMode
-from mujoco.batch import Batch
 from numpy.typing import NDArray
 
+from urlab_client._mujoco import batch_class
 from urlab_client.aio.model.layout import ArticulationLayout
 from urlab_client.aio.model.mirror import model_names
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn
 from urlab_client.integrations.gym.episode import fields_of
 from urlab_client.integrations.gym.spaces import Field, Observation, SpaceMapping, SpaceMode
+from urlab_client.integrations.gym.threaded_batch import ThreadedBatch
 from urlab_client.integrations.gym.vectorized import Floats, Indices, Vectorized
 from urlab_client.protocol.enums import ControllerKind
 from urlab_client.protocol.errors import UnknownKeyframe, URLabError
@@ -29,6 +30,8 @@ __all__ = ["URLabBatchEnv"]
 
 class URLabBatchEnv(Vectorized):
     """Many copies of one scene in this process, stepped by `mujoco.batch` on a thread pool.
+
+    MuJoCo before 3.17 has no such module; there Python's threads step the copies, with the same results.
 
     The scene is what a server compiles: it is fetched once, and the server is not needed any more. Observations,
     rewards and autoreset are those of `URLabVectorEnv`, bit for bit for the same seeds and actions, as long as no
@@ -88,7 +91,7 @@ class URLabBatchEnv(Vectorized):
         self.model = model
         self._n_substeps = n_substeps
         self._noise = reset_noise
-        self._batch = Batch(model, num_envs, n_threads)
+        self._batch = (batch_class() or ThreadedBatch)(model, num_envs, n_threads)
         # Bound before the first call: a derived field is computed only where somebody looks at it.
         self._arrays = {name: self._batch.bind(name) for name in ("qpos", "qvel", "ctrl", "act", "sensordata", "time")}
         self._keyframes = {name: i for i, name in enumerate(model_names(model, "key"))}
@@ -167,7 +170,7 @@ class URLabBatchEnv(Vectorized):
         found = [full for full in self._keyframes if full in {name, *(f"{key}_{name}" for key in self.mapping.keys)}]
         if len(found) != 1:
             raise UnknownKeyframe(
-                "unknown_keyframe", f"{name!r} is none of, or several of, {', '.join(self._keyframes) or 'none'}"
+                "unknown_keyframe", f"{name!r} does not name exactly one of {', '.join(self._keyframes) or 'none'}"
             )
         return self._keyframes[found[0]]
 

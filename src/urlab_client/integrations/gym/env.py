@@ -89,9 +89,9 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
             ValueError: An option out of range, or rendering of a scene without a camera.
         """
         if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(f"render_mode is None or 'rgb_array', not {render_mode!r}")
+            raise ValueError(f"render_mode must be None or 'rgb_array', not {render_mode!r}")
         if max_episode_steps is not None and max_episode_steps < 1:
-            raise ValueError(f"max_episode_steps is at least 1 or None, not {max_episode_steps}")
+            raise ValueError(f"max_episode_steps must be at least 1 or None, not {max_episode_steps}")
         self.client = client
         self.render_mode = render_mode
         self._rendered = () if render_mode is None else (render_camera or _first_camera(client),)

@@ -72,9 +72,9 @@ class EnvEpisode:
             ValueError: An option out of range.
         """
         if n_substeps < 1:
-            raise ValueError(f"n_substeps is at least 1, not {n_substeps}")
+            raise ValueError(f"n_substeps must be at least 1, not {n_substeps}")
         if not 0 <= reset_noise < np.inf:
-            raise ValueError(f"reset_noise is 0 or more, not {reset_noise}")
+            raise ValueError(f"reset_noise must be 0 or more, not {reset_noise}")
         model = client.model
         if model is None or not client.articulations:
             raise URLabError(

@@ -64,9 +64,9 @@ class SpaceMapping:
         """
         unknown = [field for field in fields if field not in FIELDS]
         if unknown or not fields:
-            raise ValueError(f"observations are one or more of {', '.join(FIELDS)}, not {list(fields)!r}")
+            raise ValueError(f"observations must be one or more of {', '.join(FIELDS)}, not {list(fields)!r}")
         if mode not in get_args(SpaceMode):
-            raise ValueError(f"space_mode is 'flat' or 'dict', not {mode!r}")
+            raise ValueError(f"space_mode must be 'flat' or 'dict', not {mode!r}")
         self.keys = tuple(keys)
         self.fields = tuple(fields)
         self.mode: SpaceMode = mode

@@ -142,7 +142,7 @@ def make_vec(
         URLabError: A server cannot be started.
     """
     if backend not in ("servers", "batch"):
-        raise ValueError(f"backend is 'servers' or 'batch', not {backend!r}")
+        raise ValueError(f"backend must be 'servers' or 'batch', not {backend!r}")
     task = TASKS[task_id]
     options = {
         "n_substeps": task.n_substeps,

@@ -125,7 +125,7 @@ class URLabVectorEnv(Vectorized):
         if num_envs not in (None, len(addresses)) or not addresses:
             raise ValueError(f"num_envs is {num_envs}, but there are {len(addresses)} addresses")
         if step_timeout <= 0:
-            raise ValueError(f"step_timeout is above 0 seconds, not {step_timeout}")
+            raise ValueError(f"step_timeout must be above 0 seconds, not {step_timeout}")
         episode_options = {
             "space_mode": space_mode,
             "observations": observations,

@@ -299,7 +299,7 @@ class PolicySpec(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
 
     def __post_init__(self) -> None:
         if bad := [str(mode) for mode in self.step_modes if mode not in (StepMode.DIRECT, StepMode.LIVE)]:
-            raise ValueError(f"step_modes are 'direct' and 'live', not {bad[0]!r}")
+            raise ValueError(f"step_modes must be 'direct' and 'live', not {bad[0]!r}")
         if self.action.via == "client" and StepMode.LIVE in self.step_modes:
             raise ValueError(
                 "step_modes cannot have 'live' with action.via = 'client': only a controller keeps pace with physics"
@@ -323,7 +323,7 @@ def read_spec(path: Path) -> PolicySpec:
     """Read a policy's TOML file.
 
     Raises:
-        PolicyFileError: It cannot be read, is no TOML, or does not declare a policy.
+        PolicyFileError: It cannot be read, is not TOML, or does not declare a policy.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -339,7 +339,7 @@ def parse_spec(text: str, source: str) -> PolicySpec:
     """Read a declaration; `source` names it in errors.
 
     Raises:
-        PolicyFileError: It is no TOML, or does not declare a policy.
+        PolicyFileError: It is not TOML, or does not declare a policy.
     """
     try:
         raw = tomllib.loads(text)

@@ -232,7 +232,7 @@ class Run:
             progress: Told now and then how many bytes have been read.
 
         Raises:
-            RecordingError: The file is no recording.
+            RecordingError: The file is not a recording.
         """
         times: dict[str, list[int]] = {}
         schemas: dict[str, str] = {}
@@ -276,7 +276,7 @@ class Run:
             progress: Told now and then how many bytes have been read.
 
         Raises:
-            RecordingError: The file is no recording, or holds two scenes, whose values do not fit one table.
+            RecordingError: The file is not a recording, or holds two scenes, whose values do not fit one table.
         """
         rows: dict[int, tuple[float, float, int, int, int]] = {}
         builders: dict[str, _Builder] = {}
@@ -314,7 +314,7 @@ class Run:
 
         Raises:
             KeyError: There are no pictures of it.
-            RecordingError: The file is no recording.
+            RecordingError: The file is not a recording.
         """
         found = False
         for record, entry in self._records(progress):
@@ -423,7 +423,7 @@ def read_run(path: str | os.PathLike[str]) -> Run:
 
     Raises:
         OSError: The file cannot be read.
-        RecordingError: It is no MCAP file.
+        RecordingError: It is not an MCAP file.
     """
     run = Run(Path(path))
     for _ in run._records(None):  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]

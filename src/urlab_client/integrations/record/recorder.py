@@ -185,7 +185,7 @@ def record(
     """
     _check(camera_hz=camera_hz, pose_hz=pose_hz, jpeg_quality=jpeg_quality, buffer_mib=buffer_mib)
     if image_format not in ("jpeg", "png"):
-        raise ValueError(f"image_format is 'jpeg' or 'png', not {image_format!r}")
+        raise ValueError(f"image_format must be 'jpeg' or 'png', not {image_format!r}")
     if contacts and pose_hz == 0:
         raise ValueError("contacts come with the poses: pose_hz must be above 0")
     core = aio_of(client) if isinstance(client, URLabClient) else client
@@ -216,10 +216,10 @@ def record(
 
 def _check(*, camera_hz: float, pose_hz: float, jpeg_quality: int, buffer_mib: float) -> None:
     if not 0 < camera_hz <= 1e6:
-        raise ValueError(f"camera_hz is above 0, not {camera_hz}")
+        raise ValueError(f"camera_hz must be above 0, not {camera_hz}")
     if not 0 <= pose_hz <= 1e6:
-        raise ValueError(f"pose_hz is 0 or more, not {pose_hz}")
+        raise ValueError(f"pose_hz must be 0 or more, not {pose_hz}")
     if not 1 <= jpeg_quality <= 95:
-        raise ValueError(f"jpeg_quality is 1 to 95, not {jpeg_quality}")
+        raise ValueError(f"jpeg_quality must be 1 to 95, not {jpeg_quality}")
     if not 0 < buffer_mib < 1e6:
-        raise ValueError(f"buffer_mib is above 0, not {buffer_mib}")
+        raise ValueError(f"buffer_mib must be above 0, not {buffer_mib}")

@@ -178,7 +178,7 @@ class WriterThread:
                 f"{self.path}: the recording broke off: {self.error.strerror or self.error}"
                 if isinstance(self.error, OSError)
                 else str(self.error),
-                hint=f"{stats.states} states were taken over before; what was written of them can be read.",
+                hint=f"{stats.states} states were received before; what was written of them can be read.",
             ) from self.error
 
     def _run(self) -> None:

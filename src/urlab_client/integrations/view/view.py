@@ -238,14 +238,14 @@ class AsyncView:
             self._drain()
         except Exception as error:  # noqa: BLE001  # whatever it was, the simulation goes on
             self._error = error
-            log.warning("%s: the view has ended: %s", self._name, error)
+            log.warning("%s: the view ended: %s", self._name, error)
         finally:
             self._gone.set()
             try:
                 self._backend.close()
             except Exception as error:  # noqa: BLE001
                 self._error = self._error or error
-                log.warning("%s: the view could not be closed well: %s", self._name, error)
+                log.warning("%s: closing the view failed: %s", self._name, error)
 
     def _drain(self) -> None:
         if self._states:
@@ -325,7 +325,7 @@ def make_view(
     """
     for key, value in (("max_hz", options.max_hz), ("camera_hz", options.camera_hz)):
         if not 0 < value <= 1000:
-            raise ValueError(f"{key} is above 0 and at most 1000, not {value}")
+            raise ValueError(f"{key} must be above 0 and at most 1000, not {value}")
     core = aio_of(client) if isinstance(client, URLabClient) else client
     view = AsyncView(core, backend, options, name)
     if isinstance(client, URLabClient):

@@ -328,7 +328,7 @@ class EntityInfo(Struct, kw_only=True, omit_defaults=True):
 class RobotEntry(ArticulationInfo, kw_only=True, omit_defaults=True):
     """One entry of `entities` where a server lists robots there; those without `prefix` are none."""
 
-    prefix: Annotated[str, doc("Articulation key; empty for what is no robot.")] = ""
+    prefix: Annotated[str, doc("Articulation key; empty for what is not a robot.")] = ""
     actor_id: Annotated[str, doc("Stable id; empty when unset.")] = ""
 
 

@@ -6,6 +6,7 @@ are metres and rotations quaternions (x, y, z, w), both in MuJoCo's world frame.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final, Literal
@@ -15,8 +16,9 @@ from msgspec import Struct
 from urlab_client.protocol.base import Quat, Vec3
 from urlab_client.protocol.rotation import IDENTITY
 from urlab_client.server.assets.content import PARENT_CLASS, Blueprint
+from urlab_client.server.limits import Limits
 
-__all__ = ["ORIGIN", "UNIT_SCALE", "Actor", "ActorKind", "ConversionSettings", "Light", "Mesh"]
+__all__ = ["ORIGIN", "UNIT_SCALE", "Actor", "ActorKind", "ConversionSettings", "Light", "Mesh", "scene_problem"]
 
 ORIGIN: Final[Vec3] = (0.0, 0.0, 0.0)
 UNIT_SCALE: Final[Vec3] = (1.0, 1.0, 1.0)
@@ -166,3 +168,21 @@ class Actor:
         if self.kind is ActorKind.ARTICULATION:
             return self.actor_id == actor_id
         return self.actor_id.casefold() == actor_id.casefold()
+
+
+def scene_problem(actors: Iterable[Actor], limits: Limits) -> str:
+    """Return which limit of a level these actors exceed together, or nothing."""
+    blueprints = [actor.blueprint for actor in actors if actor.blueprint is not None]
+    n_bytes = sum(blueprint.n_bytes + blueprint.n_data_bytes for blueprint in blueprints)
+    if n_bytes > limits.scene_bytes:
+        return (
+            f"the models of the level take {n_bytes} bytes together, more than the limit scene_bytes, "
+            f"{limits.scene_bytes}"
+        )
+    n_values = sum(blueprint.n_sensor_values for blueprint in blueprints)
+    if n_values > limits.sensor_values:
+        return (
+            f"the sensors of the level give {n_values} numbers together, more than the limit sensor_values, "
+            f"{limits.sensor_values}"
+        )
+    return ""

@@ -34,6 +34,7 @@ import mujoco
 
 from urlab_client._mujoco import actuator_count, actuator_kind, check_copy, write_model
 from urlab_client.server.assets.bundled_robots import BUNDLED_PREFIX, bundled_models, bundled_root
+from urlab_client.server.assets.option_ranges import options_problem
 from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.system.temporary_folder import sweep, working_in
@@ -151,6 +152,8 @@ class _Record(msgspec.Struct, frozen=True, kw_only=True):
     sensors: tuple[str, ...]
     cameras: tuple[str, ...]
     n_bytes: int = 0
+    n_data_bytes: int = 0
+    n_sensor_values: int = 0
 
 
 _RECORD: Final = msgspec.json.Decoder(_Record)
@@ -163,6 +166,10 @@ class Compiled(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         messages: MuJoCo's warnings.
         n_bytes: Size of the compiled model.
+        n_data_bytes: Memory of its simulation, without an arena of MuJoCo's own choice.
+        n_arena_bytes: Memory of its arena.
+        n_sensor_values: Numbers that its sensors give.
+        options_problem: What is wrong with its `<option>`, if anything.
         largest_image: Largest width or height of its cameras, pixels.
     """
 
@@ -174,6 +181,10 @@ class Compiled(msgspec.Struct, frozen=True, kw_only=True):
     cameras: tuple[str, ...]
     messages: tuple[str, ...]
     n_bytes: int
+    n_data_bytes: int
+    n_arena_bytes: int
+    n_sensor_values: int
+    options_problem: str
     largest_image: int
 
 
@@ -194,7 +205,9 @@ class Blueprint:
         actuator_types: Actuator name to MJCF element; `motor` for `<general>`.
         sensors: Sensor names in compiled order.
         cameras: Camera names in compiled order.
-        n_bytes: Memory of the compiled model; 0 where an older import did not note it.
+        n_bytes: Memory of the compiled model; this and what follows is 0 where an older import did not note it.
+        n_data_bytes: Memory of its simulation, without an arena of MuJoCo's own choice.
+        n_sensor_values: Numbers that its sensors give.
     """
 
     stem: str
@@ -210,6 +223,8 @@ class Blueprint:
     sensors: tuple[str, ...]
     cameras: tuple[str, ...]
     n_bytes: int = 0
+    n_data_bytes: int = 0
+    n_sensor_values: int = 0
 
     @property
     def short_name(self) -> str:
@@ -402,7 +417,7 @@ class ContentRoot:
             candidates = self._candidates(path, trusted=trusted)
             file = next((candidate for candidate in candidates if candidate.is_file()), None)
         except (OSError, ValueError) as error:  # too long, a null byte, a loop of links
-            raise Refusal("import_failed", f"{path!r} is no usable path: {error}") from None
+            raise Refusal("import_failed", f"{path!r} is not a usable path: {error}") from None
         if file is not None:
             packaged = {location.resolve(): name for name, location in bundled.items()}
             return file, f"{BUNDLED_PREFIX}{packaged[file]}" if file in packaged else str(file)
@@ -459,6 +474,8 @@ class ContentRoot:
             sensors=compiled.sensors,
             cameras=compiled.cameras,
             n_bytes=compiled.n_bytes,
+            n_data_bytes=compiled.n_data_bytes,
+            n_sensor_values=compiled.n_sensor_values,
         )
         try:
             return self._register(home, folder, record)
@@ -470,7 +487,7 @@ class ContentRoot:
     def _build(self, file: Path, snapshot: Path, *, trusted: bool) -> Compiled:
         if trusted or file.is_relative_to(bundled_root()):
             try:
-                return build_snapshot(file, snapshot)
+                return build_snapshot(file, snapshot, self.limits)[0]
             except (ValueError, mujoco.FatalError) as error:
                 raise Refusal("import_failed", f"MuJoCo rejects {file}: {one_line(error)}") from None
         from urlab_client.server.assets.sandbox import build_confined  # noqa: PLC0415 - it imports this module
@@ -490,12 +507,13 @@ class ContentRoot:
         return blueprint
 
 
-def build_snapshot(file: Path, snapshot: Path) -> Compiled:
-    """Compile an MJCF file and write what is kept of it.
+def build_snapshot(file: Path, snapshot: Path, limits: Limits) -> tuple[Compiled, mujoco.MjModel]:
+    """Compile an MJCF file, write what is kept of it, and return what was learnt and the model.
 
     Args:
         file: The file.
         snapshot: Folder to write, which must not exist.
+        limits: For the ranges of its options; nothing is refused here.
 
     Raises:
         ValueError, mujoco.FatalError: MuJoCo rejects it.
@@ -508,8 +526,9 @@ def build_snapshot(file: Path, snapshot: Path) -> Compiled:
         kinds = {actuator.name: _actuator_kind(actuator) for actuator in prepared.actuators}
         _write_snapshot(prepared, snapshot, messages)
         model = mujoco.MjModel.from_xml_path(str(snapshot / "model.xml"))
+        data = mujoco.MjData(model)
         check_copy(original, model)
-    return Compiled(
+    compiled = Compiled(
         model_name="" if spec.modelname in DEFAULT_MODEL_NAMES else spec.modelname,
         joints=_names(model.njnt, model.joint),
         actuators=_names(actuator_count(model), model.actuator),
@@ -518,8 +537,13 @@ def build_snapshot(file: Path, snapshot: Path) -> Compiled:
         cameras=_names(model.ncam, model.camera),
         messages=tuple(dict.fromkeys(messages)),
         n_bytes=mujoco.mj_sizeModel(model),
+        n_data_bytes=data.nbuffer + max(prepared.memory, 0),
+        n_arena_bytes=data.narena,
+        n_sensor_values=model.nsensordata,
+        options_problem=options_problem(model.opt, limits),
         largest_image=int(model.cam_resolution.max(initial=0)),
     )
+    return compiled, model
 
 
 _hook_lock = threading.Lock()
@@ -577,6 +601,8 @@ def _blueprint(folder: Path, record: _Record) -> Blueprint:
         sensors=record.sensors,
         cameras=record.cameras,
         n_bytes=record.n_bytes,
+        n_data_bytes=record.n_data_bytes,
+        n_sensor_values=record.n_sensor_values,
     )
 
 
@@ -594,6 +620,8 @@ def _record(blueprint: Blueprint) -> _Record:
         sensors=blueprint.sensors,
         cameras=blueprint.cameras,
         n_bytes=blueprint.n_bytes,
+        n_data_bytes=blueprint.n_data_bytes,
+        n_sensor_values=blueprint.n_sensor_values,
     )
 
 

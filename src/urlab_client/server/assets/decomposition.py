@@ -36,7 +36,7 @@ def convex_parts(file: Path, threshold: float) -> tuple[Part, ...]:
         threshold: Concavity that a part may keep; CoACD takes 0.01 to 1.
 
     Raises:
-        ValueError: The file is no mesh, CoACD is not installed, or it finds no parts.
+        ValueError: The file is not a mesh, CoACD is not installed, or it finds no parts.
         OSError: The file cannot be read.
     """
     if not is_available():

@@ -148,12 +148,12 @@ def read_level(path: Path, content: ContentRoot, *, trusted: bool = False) -> di
     try:
         header = _HEADER.decode(data)
         if header.format != FORMAT:
-            raise LevelError(f'{path} is no level: it lacks "format": "{FORMAT}"')
+            raise LevelError(f'{path} is not a level: it lacks "format": "{FORMAT}"')
         if header.version != VERSION:
             raise LevelError(f"{path} has version {header.version} of the level format; this server reads {VERSION}")
         level = _LEVEL.decode(data)
     except msgspec.DecodeError as error:
-        raise LevelError(f"{path} is no level: {error}") from None
+        raise LevelError(f"{path} is not a level: {error}") from None
     folder = path.parent.resolve()
     blueprints: dict[str, Blueprint] = {}
     for stem in dict.fromkeys(entry.blueprint for entry in level.actors if entry.blueprint):

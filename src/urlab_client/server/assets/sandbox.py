@@ -22,12 +22,13 @@ from pathlib import Path
 from typing import Final
 
 import msgspec
+import mujoco
 
 from urlab_client._children import APART
 from urlab_client._confined import limit_process
 from urlab_client._landlock import confine_files
 from urlab_client.server.assets.confinement import Outside, check_references
-from urlab_client.server.assets.content import Compiled, build_snapshot, one_line
+from urlab_client.server.assets.content import Compiled, build_snapshot, mujoco_messages, one_line
 from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
 
@@ -148,7 +149,7 @@ def build_confined(file: Path, snapshot: Path, roots: tuple[Path, ...], limits: 
 def _serve() -> None:
     """Take orders from standard input until it ends."""
     answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what libraries print is no answer
+    os.dup2(2, 1)  # what libraries print is not an answer
     for signum in (signal.SIGINT, signal.SIGTERM):
         signal.signal(signum, signal.SIG_IGN)  # they are for the server, which ends this process
     for line in sys.stdin.buffer:
@@ -207,29 +208,42 @@ def _work(order: _SandboxJob) -> _Outcome:
     try:
         check_references(Path(order.file), tuple(map(Path, order.roots)), limits)
         snapshot, stage = Path(order.snapshot), f"cannot store the snapshot of {order.file}"
-        compiled = build_snapshot(Path(order.file), snapshot)
+        compiled, model = build_snapshot(Path(order.file), snapshot, limits)
         check_references(snapshot / "model.xml", (snapshot,), limits)  # the server reads it with nothing in its way
+        exceeded = _exceeded(compiled, limits)
+        if not exceeded:
+            _simulate(model)
+        return _Outcome(refused=exceeded) if exceeded else _Outcome(done=compiled)
     except (Outside, Refusal) as refusal:
         return _Outcome(refused=refusal.message)
-    except MemoryError:
-        return _Outcome(
-            refused=f"compilation needs more than the limit model_memory_bytes, {limits.model_memory_bytes}"
-        )
     except OSError as error:
         return _Outcome(refused=one_line(error), subject=stage)
     except Exception as error:  # noqa: BLE001 - whatever it was, the server must hear of it
+        if isinstance(error, MemoryError) or "allocate memory" in str(error):
+            return _Outcome(
+                refused=f"it needs more memory than the limit model_memory_bytes, {limits.model_memory_bytes}"
+            )
         return _Outcome(refused=one_line(error), subject=f"MuJoCo rejects {order.file}")
-    exceeded = _exceeded(compiled, limits)
-    return _Outcome(refused=exceeded) if exceeded else _Outcome(done=compiled)
+
+
+def _simulate(model: mujoco.MjModel) -> None:
+    """Step once: what crashes MuJoCo, or takes for ever, does so here and not in the server."""
+    with mujoco_messages(), contextlib.suppress(mujoco.FatalError):  # play has other options, and its own errors
+        mujoco.mj_step(model, mujoco.MjData(model))
 
 
 def _exceeded(compiled: Compiled, limits: Limits) -> str:
     """Return which limit a compiled model exceeds, or nothing."""
-    if compiled.n_bytes > limits.model_bytes:
-        return f"compiled it takes {compiled.n_bytes} bytes, more than the limit model_bytes, {limits.model_bytes}"
-    if compiled.largest_image > limits.camera_side:
-        return f"a camera of {compiled.largest_image} pixels exceeds the limit camera_side, {limits.camera_side}"
-    return ""
+    n_data_bytes = max(compiled.n_data_bytes, compiled.n_arena_bytes)
+    for what, value, name, limit in (
+        ("compiled it takes {} bytes", compiled.n_bytes, "model_bytes", limits.model_bytes),
+        ("simulating it takes {} bytes", n_data_bytes, "data_bytes", limits.data_bytes),
+        ("its sensors give {} numbers", compiled.n_sensor_values, "sensor_values", limits.sensor_values),
+        ("it has a camera of {} pixels", compiled.largest_image, "camera_side", limits.camera_side),
+    ):
+        if value > limit:
+            return f"{what.format(value)}, more than the limit {name}, {limit}"
+    return compiled.options_problem
 
 
 if __name__ == "__main__":

@@ -30,9 +30,11 @@ from urlab_client._mujoco import (
 from urlab_client.protocol.base import Vec3
 from urlab_client.protocol.controller_text import CUSTOM_TEXT, ControllerText
 from urlab_client.protocol.rotation import rotate, wxyz
-from urlab_client.server.assets.actors import Actor, Mesh
+from urlab_client.server.assets.actors import Actor, Mesh, scene_problem
 from urlab_client.server.assets.content import Blueprint, mujoco_messages, one_line
 from urlab_client.server.assets.decomposition import convex_parts
+from urlab_client.server.assets.option_ranges import options_problem
+from urlab_client.server.limits import Limits
 
 __all__ = [
     "ArticulationIndex",
@@ -58,6 +60,7 @@ _SPOT_CUTOFF: Final = 44.0
 """Unreal's default outer cone angle, degrees."""
 
 _SAME: Final = 1e-6
+_DEFAULT_LIMITS: Final = Limits()
 
 
 class CompileFailed(Exception):
@@ -219,7 +222,11 @@ class CompiledScene:
 
 
 def compile_scene(
-    actors: Sequence[Actor], *, honour_mjcf_options: bool = False, camera_size: tuple[int, int] | None = None
+    actors: Sequence[Actor],
+    *,
+    honour_mjcf_options: bool = False,
+    camera_size: tuple[int, int] | None = None,
+    limits: Limits = _DEFAULT_LIMITS,
 ) -> CompiledScene:
     """Compile the actors of a level into one model.
 
@@ -233,22 +240,26 @@ def compile_scene(
         actors: In spawn order.
         honour_mjcf_options: Take the `<option>` of the first articulation instead, integrator included.
         camera_size: Width and height of cameras whose MJCF gives no resolution.
+        limits: Memory and sensors of the scene, and the ranges of its options; checked before it is simulated.
 
     Returns:
         The scene, stepped once and reset.
 
     Raises:
-        CompileFailed: MuJoCo rejects it.
+        CompileFailed: MuJoCo rejects it, or it exceeds a limit.
     """
+    _refuse(scene_problem(actors, limits))
     articulations = [(actor, actor.blueprint) for actor in actors if actor.blueprint is not None]
     warnings: list[str] = []
     try:
         spec, entities = _compose(actors, articulations, warnings, honour_mjcf_options=honour_mjcf_options)
+        _refuse(options_problem(spec.option, limits))
         model = spec.compile()
         memory = sum(max(blueprint.spec.memory, 0) for _, blueprint in articulations)
         if memory > model.narena:  # somebody found MuJoCo's own estimate too small
             spec.memory = memory
             model = spec.compile()
+        _refuse(_size_problem(model, limits))
         if not honour_mjcf_options:
             model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         with mujoco_messages() as messages:
@@ -272,6 +283,23 @@ def compile_scene(
     return CompiledScene(
         model, data, spec, indices, tuple(_entity(model, *names) for names in entities), tuple(warnings)
     )
+
+
+def _refuse(problem: str) -> None:
+    if problem:
+        raise CompileFailed(problem)
+
+
+def _size_problem(model: mujoco.MjModel, limits: Limits) -> str:
+    """Return which limit the compiled scene exceeds where its parts gave no number, or nothing."""
+    n_bytes = mujoco.mj_sizeModel(model) + model.narena
+    if n_bytes > limits.scene_bytes:
+        return f"the scene takes {n_bytes} bytes, more than the limit scene_bytes, {limits.scene_bytes}"
+    if model.nsensordata > limits.sensor_values:
+        return (
+            f"its sensors give {model.nsensordata} numbers, more than the limit sensor_values, {limits.sensor_values}"
+        )
+    return ""
 
 
 def actor_bounds(actor: Actor, *, every_geom: bool = False) -> tuple[Vec3, Vec3] | None:

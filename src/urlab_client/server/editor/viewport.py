@@ -182,7 +182,7 @@ def rotator(quat: Quat | None, euler: Vec3 | None) -> Vec3 | None:
     if quat is not None:
         return quat_to_euler(normalized(quat))
     if euler is not None and not all(map(math.isfinite, euler)):
-        raise ValueError(f"angles are finite numbers, not {list(euler)}")
+        raise ValueError(f"angles must be finite numbers, not {list(euler)}")
     return euler
 
 

@@ -18,7 +18,16 @@ from typing import Final, Literal, NamedTuple
 from urlab_client.protocol.base import Quat, Vec3
 from urlab_client.protocol.rotation import IDENTITY, euler_to_quat, swap_frame
 from urlab_client.protocol.types import ActorBounds, ActorHierarchyNode, BlueprintInfo
-from urlab_client.server.assets.actors import ORIGIN, UNIT_SCALE, Actor, ActorKind, ConversionSettings, Light, Mesh
+from urlab_client.server.assets.actors import (
+    ORIGIN,
+    UNIT_SCALE,
+    Actor,
+    ActorKind,
+    ConversionSettings,
+    Light,
+    Mesh,
+    scene_problem,
+)
 from urlab_client.server.assets.content import PARENT_CLASS, Blueprint, ContentRoot, level_package, sanitized
 from urlab_client.server.assets.decomposition import ADVICE, is_available
 from urlab_client.server.assets.level import LevelError, read_level, write_level
@@ -256,7 +265,7 @@ class EditorWorld:
             scale: Must be 1.
 
         Raises:
-            Refusal: `missing_field`; `spawn_failed` for an unknown blueprint, a scale, a pose that is none, or an id
+            Refusal: `missing_field`; `spawn_failed` for an unknown blueprint, a scale, an invalid pose, or an id
                 that belongs to an actor of another class.
         """
         checks.require(blueprint, "blueprint")
@@ -266,7 +275,7 @@ class EditorWorld:
         understood = checks.rotation(rotation_quat, rotation_euler, code)
         pose = checks.pose(location, understood if understood is not None else IDENTITY, code)
         existing = self._of_class(actor_id, found.class_name, code)
-        self._make_room(existing is None, found.n_bytes, code)
+        self._make_room(existing is None, found, code)
         return self._place(found, actor_id, existing, understood=understood or IDENTITY, pose=pose)
 
     def spawn_grid(
@@ -316,7 +325,7 @@ class EditorWorld:
                 location = (origin[0] + i * spacing[0], origin[1] + j * spacing[1], origin[2])
                 existing = self._of_class(actor_id, found.class_name, code)
                 cells.append((actor_id, existing, checks.pose(location, understood, code)))
-        self._make_room(sum(existing is None for _, existing, _ in cells), found.n_bytes, code)
+        self._make_room(sum(existing is None for _, existing, _ in cells), found, code)
         return [
             self._place(found, actor_id, existing, understood=understood, pose=pose)
             for actor_id, existing, pose in cells
@@ -351,7 +360,7 @@ class EditorWorld:
             raise Refusal(code, f"no kind of light is called '{kind}': use directional, point or spot")
         checks.refuse_infinite((*rotation_euler, intensity, *color), "rotation_euler, intensity and color", code)
         at, rotation = checks.pose(location, swap_frame(euler_to_quat(rotation_euler)), code)
-        self._make_room(1, 0, code)
+        self._make_room(1, None, code)
         red, green, blue = (checks.float32(channel) for channel in color)
         light = Light(kind=name, intensity=checks.float32(intensity), color=(red, green, blue))
         draft = Actor(name="", label="", kind=ActorKind.LIGHT, actor_id=actor_id, light=light)
@@ -388,7 +397,7 @@ class EditorWorld:
             rotation_euler: (roll, pitch, yaw), degrees, as `spawn_actor`.
 
         Raises:
-            Refusal: `missing_field`; `set_actor_transform_failed` for an unknown actor or a pose that is none.
+            Refusal: `missing_field`; `set_actor_transform_failed` for an unknown actor or an invalid pose.
         """
         code = "set_actor_transform_failed"
         actor = self._find(target, code)
@@ -419,7 +428,7 @@ class EditorWorld:
         x, y, z = source.location
         at, rotation = checks.pose(location if location is not None else (x + 1.0, y, z), source.rotation, code)
         existing = self._of_class(new_actor_id, source.class_name, code)
-        self._make_room(existing is None, 0 if source.blueprint is None else source.blueprint.n_bytes, code)
+        self._make_room(existing is None, source.blueprint, code)
         if existing is not None:
             copy = self._put(replace(existing, location=at, rotation=rotation, scale=source.scale))
         else:
@@ -595,16 +604,17 @@ class EditorWorld:
 
     # Internal
 
-    def _make_room(self, count: int, n_bytes: int, code: str) -> None:
-        """Refuse with `code` when `count` more actors, each with a model of `n_bytes`, would be too many."""
+    def _make_room(self, count: int, blueprint: Blueprint | None, code: str) -> None:
+        """Refuse with `code` when `count` more actors of a blueprint would be too many."""
+        if not count:
+            return
         limits = self.content.limits
-        if count and len(self._actors) + count > limits.actors:
+        if len(self._actors) + count > limits.actors:
             raise Refusal(code, f"a level has at most {limits.actors} actors (limit actors)")
-        held = sum(actor.blueprint.n_bytes for actor in self._actors.values() if actor.blueprint is not None)
-        if count and held + count * n_bytes > limits.scene_bytes:
-            raise Refusal(
-                code, f"the models of a level take at most {limits.scene_bytes} bytes together (limit scene_bytes)"
-            )
+        more = [Actor(name="", label="", kind=ActorKind.ARTICULATION, blueprint=blueprint)] * count
+        problem = scene_problem((*self._actors.values(), *more), limits)
+        if problem:
+            raise Refusal(code, problem)
 
     def _shown(self) -> Iterable[Actor]:
         return self._frozen if self.pie_running else self._actors.values()

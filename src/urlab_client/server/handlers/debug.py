@@ -33,7 +33,7 @@ from urlab_client.server.rpc.dispatch import handles
 from urlab_client.server.rpc.requests import usable
 
 YELLOW: Final[Vec3] = (1.0, 1.0, 0.0)
-"""In place of a colour that is none."""
+"""In place of an invalid colour."""
 
 _RED: Final[Vec3] = (1.0, 0.0, 0.0)
 _GREEN: Final[Vec3] = (0.0, 1.0, 0.0)

@@ -176,7 +176,7 @@ def _mocap_id(model: mujoco.MjModel, body: str) -> int:
         raise Refusal("unknown_body", body)
     mocap = int(model.body_mocapid[number])
     if mocap < 0:
-        raise Refusal("not_mocap_body", f"body '{body}' is no mocap body: its MJCF does not say mocap=\"true\"")
+        raise Refusal("not_mocap_body", f"body '{body}' is not a mocap body: its MJCF does not say mocap=\"true\"")
     return mocap
 
 
@@ -229,7 +229,7 @@ def _contact(model: mujoco.MjModel, data: mujoco.MjData, number: int, wanted: Co
 
 
 def _side(model: mujoco.MjModel, geom: int) -> tuple[str, str]:
-    """Return the names of a contact's geom and its body; both empty for what is no geom, such as a flex."""
+    """Return the names of a contact's geom and its body; both empty for what is not a geom, such as a flex."""
     if geom < 0:
         return "", ""
     body = int(model.geom_bodyid[geom])

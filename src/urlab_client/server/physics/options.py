@@ -1,6 +1,7 @@
 """What `set_sim_options` remembers of a play session and does to `mjOption`.
 
-For the handler, which holds the engine's lock. The numbers are not validated, as in the plugin.
+For the handler, which holds the engine's lock. Unlike the plugin, which takes any number, it refuses those that stop
+time, spoil the state or keep the solver busy for good: the server may have other users.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ from msgspec import Struct
 from urlab_client._mujoco import set_threads, thread_limit
 from urlab_client.protocol.base import Vec3
 from urlab_client.protocol.types import SimOptions
+from urlab_client.server.assets.option_ranges import option_problem
+from urlab_client.server.limits import Limits
 from urlab_client.server.physics.controllers import float32
 from urlab_client.server.refusal import Refusal
 
@@ -110,12 +113,14 @@ class OptionOverrides:
     only once they have been used, so that raw masks stay as they were sent.
     """
 
-    def __init__(self, model: mujoco.MjModel) -> None:
+    def __init__(self, model: mujoco.MjModel, limits: Limits) -> None:
         """Start with the integrator the scene was compiled with.
 
         Args:
             model: The model of the play session.
+            limits: For the iterations.
         """
+        self._limits = limits
         self._kept: dict[str, Any] = {"integrator": int(model.opt.integrator), "sleep_tolerance": float32(1e-4)}
         self._threads = 0
 
@@ -123,13 +128,16 @@ class OptionOverrides:
         """Take over the options that are not None, write all remembered ones and return what is in force.
 
         Raises:
-            Refusal: `bad_value` for an unknown integrator, cone or solver. Nothing is written, but options that come
-                earlier in the order are remembered and take effect with the next successful call.
+            Refusal: `bad_value`. For a number out of range nothing is changed. For an unknown integrator, cone or
+                solver nothing is written, but options that come earlier in the order are remembered and take effect
+                with the next successful call.
         """
-        for name in IN_ORDER:
-            value = getattr(options, name)
-            if value is not None:
-                self._kept[name] = _stored(name, value)
+        given = [(name, value) for name in IN_ORDER if (value := getattr(options, name)) is not None]
+        for name, value in given:
+            if name not in CHOICES and (problem := option_problem(name, _stored(name, value), self._limits)):
+                raise Refusal("bad_value", problem)
+        for name, value in given:
+            self._kept[name] = _stored(name, value)
         opt, kept = model.opt, self._kept
         for name in ("disableflags", "enableflags"):
             mask = getattr(options, name)

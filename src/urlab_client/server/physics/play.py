@@ -62,7 +62,7 @@ class Running:
     @cached_property
     def options(self) -> OptionOverrides:
         """What `set_sim_options` remembers."""
-        return OptionOverrides(self.scene.model)
+        return OptionOverrides(self.scene.model, self.limits)
 
     @cached_property
     def sessions(self) -> ReplaySessions:

@@ -206,7 +206,7 @@ def decode_json(content: bytes) -> list[Frame]:
         except msgspec.ValidationError:
             frames = _read_loosely(msgspec.json.decode(text))
     except (RecursionError, OverflowError) as error:
-        raise ValueError(f"it is no recording: {error}") from None
+        raise ValueError(f"it is not a recording: {error}") from None
     made: dict[tuple[tuple[str, int, int], ...], JointLayout] = {}
     return [_from_file(frame, made) for frame in frames]
 
@@ -265,12 +265,12 @@ def decode_csv(content: bytes) -> list[Frame]:
     Without a time column the rows are 0.002 s apart. There are no velocities. Camera columns are ignored.
 
     Raises:
-        ValueError: It has no header, or a cell is no number.
+        ValueError: It has no header, or a cell is not a number.
     """
     try:
         rows = [row for row in csv.reader(io.StringIO(_text(content))) if row]
     except csv.Error as error:
-        raise ValueError(f"it is no table: {error}") from None
+        raise ValueError(f"it is not a table: {error}") from None
     if not rows:
         raise ValueError("the table is empty")
     header = [name.strip() for name in rows[0]]

@@ -223,13 +223,13 @@ class ReplaySessions:
             try:
                 self._loaded[file.stem] = read_frames(file, self._most)
             except (OSError, ValueError) as error:
-                logger.warning("%s is no recording and left out: %s", file, error)
+                logger.warning("%s is not a recording and is left out: %s", file, error)
 
     def load(self, file: Path) -> str:
         """Load a file as a session of its stem, make it active and return the name.
 
         Raises:
-            OSError, ValueError: It cannot be read, or is no recording.
+            OSError, ValueError: It cannot be read, or is not a recording.
         """
         name = file.stem
         frames = read_frames(file, self._most)
@@ -261,10 +261,10 @@ def read_frames(file: Path, most: int) -> list[Frame]:
     """Read a recording of at most `most` bytes.
 
     Raises:
-        OSError, ValueError: It cannot be read, or is no recording.
+        OSError, ValueError: It cannot be read, or is not a recording.
     """
     if file.exists() and not file.is_file():
-        raise ValueError("it is no regular file")
+        raise ValueError("it is not a regular file")
     size = file.stat().st_size
     if size > most:
         raise ValueError(f"{size} bytes are more than the limit recording_file_bytes, {most}")

@@ -383,7 +383,7 @@ class CameraRenderer:
             job: What `capture` returned.
         """
         if job is not None and self._submit(job) and not job.done.wait(FRAMES_DEADLINE_S):
-            logger.warning("no camera images within %g s; they are left out", FRAMES_DEADLINE_S)
+            logger.warning("no camera images within %g s; continuing without them", FRAMES_DEADLINE_S)
         frames = {
             shot.key: shot.camera.frame
             for shot in shots

@@ -56,7 +56,7 @@ class HandlerTable:
         """
         op = OPS.get(str(request.__struct_config__.tag))
         if op is None or not issubclass(request, op.request):
-            raise TypeError(f"{request.__name__} is no op's request")
+            raise TypeError(f"{request.__name__} is not the request of an op")
 
         def register(handler: Callable[[ServerCore, Q], A]) -> Callable[[ServerCore, Q], A]:
             annotation = get_type_hints(handler)["return"]

@@ -106,7 +106,7 @@ class CameraStreams:
 
         Raises:
             PortInUse: Somebody has the port.
-            OSError: The address is none of this machine.
+            OSError: The address is not one of this machine.
         """
         self.filter: Callable[[bytes, bytes], bytes | None] | None = None
         self._host = host

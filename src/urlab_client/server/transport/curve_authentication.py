@@ -52,7 +52,7 @@ class CurveServer:
 
     def __post_init__(self) -> None:
         if bool(self.allow) == self.allow_any:
-            raise ValueError("say whom to let in: either key files of clients (allow), or anybody (allow_any)")
+            raise ValueError("state who may connect: key files of clients (allow), or anyone (allow_any)")
 
 
 class CurveKeys:

@@ -263,7 +263,7 @@ class RpcEndpoint:
         """Answer one request; return False when it is time to end."""
         socket = self._socket
         frame = socket.recv()
-        # A request of several frames is none: to execute the first one would be a guess.
+        # A request of several frames is invalid: executing the first one would be a guess.
         while socket.getsockopt(zmq.RCVMORE):
             socket.recv()
             frame = b""

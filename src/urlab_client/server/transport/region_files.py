@@ -186,7 +186,7 @@ class RegionFile:
         intact = os.fstat(self._fd).st_size >= self._size
         if intact and _pread(self._fd, _FIXED.size, 0) == self._fixed():
             return
-        logger.warning("%s was damaged by somebody and is laid out anew", self.path)
+        logger.warning("%s was damaged and is laid out again", self.path)
         self._lay_out()
 
     def _lay_out(self) -> None:

@@ -410,7 +410,7 @@ class _Bell:
         except BlockingIOError:
             return
         except OSError as error:  # no descriptor left: asking again at once would be a busy loop
-            logger.warning("a client cannot be let in at the doorbell: %s", error)
+            logger.warning("a client could not be accepted at the doorbell: %s", error)
             self._selector.unregister(door)
             self._door_shut_until = time.monotonic() + DOOR_SHUT_S
             return

@@ -126,6 +126,8 @@ class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
     def forward(self, *, timeout: Timeout = DEFAULT) -> ForwardOk:
         """Run `mj_forward` on the server and take over the state: kinematics and dynamics, no integration.
 
+        In puppet mode `client.data` stays as it is: there it is yours, and what the server has was pushed from it.
+
         Returns:
             The state; time and step counter are unchanged.
         """

@@ -1,0 +1,85 @@
+"""What `mujoco.batch` does for environments, for MuJoCo releases that are older than it.
+
+One `MjData` per simulation and Python's own threads: `mj_step` runs without the interpreter lock. Not `mujoco.rollout`,
+which does not return what warm-starts the next step, so that its results would differ from those of a server.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["ThreadedBatch"]
+
+Indices = NDArray[np.intp]
+
+_STATE = ("qpos", "qvel", "act", "ctrl")
+
+
+class ThreadedBatch:
+    """Many simulations of one model.
+
+    Args:
+        model: The model, shared by all.
+        nsim: Number of simulations.
+        nthread: Threads that step; 0 for one per processor.
+    """
+
+    def __init__(self, model: mujoco.MjModel, nsim: int, nthread: int = 0) -> None:
+        self._model = model
+        self._data = [mujoco.MjData(model) for _ in range(nsim)]
+        self._bound: dict[str, NDArray[Any]] = {}
+        self._threads = max(1, min(nsim, nthread or os.cpu_count() or 1))
+        self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="urlab-batch") if self._threads > 1 else None
+        for data in self._data:
+            mujoco.mj_forward(model, data)
+        for name in _STATE:
+            self.bind(name)
+
+    def bind(self, name: str) -> NDArray[Any]:
+        """Return an `MjData` field of all simulations, shape (nsim, …). Writing to a part of the state has effect."""
+        if name not in self._bound:
+            self._bound[name] = np.array([np.copy(getattr(data, name)) for data in self._data])
+        return self._bound[name]
+
+    def reset(self, ids: Indices, keyframe: int = -1) -> None:
+        """Reset some simulations to the model's defaults or a keyframe, and compute what follows from that."""
+
+        def reset(data: mujoco.MjData) -> None:
+            if keyframe < 0:
+                mujoco.mj_resetData(self._model, data)
+            else:
+                mujoco.mj_resetDataKeyframe(self._model, data, keyframe)
+            mujoco.mj_forward(self._model, data)
+
+        self._run(ids, reset, write=False)
+
+    def forward(self, ids: Indices) -> None:
+        """Compute what follows from the state of some simulations."""
+        self._run(ids, lambda data: mujoco.mj_forward(self._model, data))
+
+    def step(self, ids: Indices, nstep: int = 1) -> None:
+        """Advance some simulations."""
+        self._run(ids, lambda data: mujoco.mj_step(self._model, data, nstep))
+
+    def _run(self, ids: Indices, act: Callable[[mujoco.MjData], object], *, write: bool = True) -> None:
+        def some(part: Indices) -> None:
+            for i in map(int, part):
+                data = self._data[i]
+                if write:
+                    for name in _STATE:
+                        getattr(data, name)[:] = self._bound[name][i]
+                act(data)
+                for name, values in self._bound.items():
+                    values[i] = getattr(data, name)
+
+        if self._pool is None:
+            some(ids)
+        else:
+            list(self._pool.map(some, np.array_split(ids, self._threads)))

@@ -1,0 +1,149 @@
+"""What older releases of MuJoCo lack is done in another way; here with the installed one, made to look older."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from urlab_client import _mujoco
+
+OBJ = "v 0 0 0\nv {0} 0 0\nv 0 {0} 0\nv 0 0 {0}\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+
+SHORTCUTS = {
+    "motor": "",
+    "position": 'kp="3"',
+    "velocity": 'kv="2"',
+    "intvelocity": 'kp="2" actrange="-1 1"',
+    "damper": 'kv="2" ctrlrange="0 1"',
+    "cylinder": 'area="2"',
+    "muscle": "",
+    "dcmotor": 'motorconst="1 1" resistance="1"',
+}
+
+
+@pytest.fixture
+def old(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A MuJoCo whose archives cannot be relied on, as before 3.16."""
+    monkeypatch.setattr(_mujoco, "_writes_archives", lambda _: False)
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Path:
+    """A model with a mesh and a texture in folders of their own."""
+    folder = tmp_path / "robot"
+    for part in ("meshes", "textures"):
+        (folder / part).mkdir(parents=True)
+    (folder / "meshes" / "part.obj").write_text(OBJ.format(0.5))
+    (folder / "textures" / "t.png").write_bytes(PNG)
+    file = folder / "robot.xml"
+    file.write_text(
+        '<mujoco model="robot"><compiler meshdir="meshes" texturedir="textures"/>'
+        '<asset><mesh name="part" file="part.obj"/><texture name="t" type="2d" file="t.png"/></asset>'
+        '<worldbody><body><joint name="j"/><geom type="mesh" mesh="part"/></body></worldbody></mujoco>'
+    )
+    return file
+
+
+PNG = bytes.fromhex(
+    "89504e470d0a1a0a0000000d4948445200000001000000010802000000907753de"
+    "0000000c49444154789c63f8cfc0000003010100c9fe92ef0000000049454e44ae426082"
+)
+
+
+@pytest.mark.usefixtures("old")
+def test_a_model_is_written_with_its_files(robot: Path, tmp_path: Path) -> None:
+    spec = mujoco.MjSpec.from_file(str(robot))
+    spec.compile()
+
+    _mujoco.write_model(spec, tmp_path / "copy")
+
+    original = mujoco.MjModel.from_xml_path(str(robot))
+    robot.parent.rename(tmp_path / "gone")
+    copy = mujoco.MjModel.from_xml_path(str(tmp_path / "copy" / "model.xml"))
+    _mujoco.check_copy(original, copy)
+    np.testing.assert_allclose(copy.body_mass, original.body_mass)
+    assert copy.ntex == 1
+
+
+@pytest.mark.usefixtures("old")
+def test_a_scene_is_exported_with_the_files_of_all_its_robots(robot: Path, tmp_path: Path) -> None:
+    robots = []
+    for name, size in (("small", 0.1), ("large", 0.9)):  # files of one name, with different content
+        source = tmp_path / f"source-{name}"
+        shutil.copytree(robot.parent, source)
+        (source / "meshes" / "part.obj").write_text(OBJ.format(size))
+        child = mujoco.MjSpec.from_file(str(source / "robot.xml"))
+        child.compile()
+        _mujoco.write_model(child, tmp_path / name)
+        robots.append(tmp_path / name)
+    scene = mujoco.MjSpec()
+    for folder in robots:
+        child = mujoco.MjSpec.from_file(str(folder / "model.xml"))
+        scene.attach(child, frame=scene.worldbody.add_frame(), prefix=f"{folder.name}_")
+    _mujoco.merge_assets(scene, robots)
+    model = scene.compile()
+
+    xml, files = _mujoco.export_model(scene)
+
+    again = mujoco.MjModel.from_xml_string(xml, files)
+    np.testing.assert_allclose(again.mesh_vert, model.mesh_vert, atol=1e-6)
+    assert np.ptp(model.mesh_vert) > 0.5
+
+
+def test_a_copy_with_the_wrong_files_is_refused(robot: Path) -> None:
+    original = mujoco.MjModel.from_xml_path(str(robot))
+    (robot.parent / "meshes" / "other.obj").write_text(OBJ.format(0.9))
+    robot.write_text(robot.read_text().replace("part.obj", "other.obj"))
+    with pytest.raises(ValueError, match="files in folders of their own"):
+        _mujoco.check_copy(original, mujoco.MjModel.from_xml_path(str(robot)))
+
+
+@pytest.mark.usefixtures("old")
+def test_a_file_that_is_elsewhere_is_refused(robot: Path, tmp_path: Path) -> None:
+    spec = mujoco.MjSpec.from_file(str(robot))
+    spec.compile()
+    spec.meshes[0].file = "nowhere.obj"
+    with pytest.raises(ValueError, match=r"nowhere|files in folders of their own"):
+        _mujoco.write_model(spec, tmp_path / "copy")
+
+
+@pytest.mark.parametrize("shortcut", SHORTCUTS)
+def test_the_kind_of_an_actuator_is_known_by_its_parameters(shortcut: str) -> None:
+    spec = mujoco.MjSpec.from_string(
+        '<mujoco><worldbody><body><joint name="j"/><geom size="0.1"/></body></worldbody>'
+        f'<actuator><{shortcut} joint="j" {SHORTCUTS[shortcut]}/></actuator></mujoco>'
+    )
+
+    class Older:
+        """The actuator without `type`."""
+
+        def __getattr__(self, name: str) -> object:
+            if name == "type":
+                raise AttributeError(name)
+            return getattr(spec.actuators[0], name)
+
+    assert _mujoco.actuator_kind(Older()) == shortcut
+    assert _mujoco.actuator_kind(spec.actuators[0]) == shortcut
+
+
+def test_attributes_of_a_newer_release_are_left_out_and_named() -> None:
+    xml = (
+        '<mujoco><worldbody><body><joint name="j" novelty="1 2"/><geom size="0.1" glow="3" name="g"/></body>'
+        '<body><joint name="k" novelty="4"/><geom size="0.2"/></body></worldbody></mujoco>'
+    )
+    model, left_out = _mujoco.without_newer_attributes(xml, mujoco.MjModel.from_xml_string)
+    assert left_out == ["joint.novelty", "geom.glow"]
+    assert (model.njnt, model.ngeom) == (2, 2)
+    assert model.geom("g").size[0] == 0.1
+
+
+@pytest.mark.parametrize("body", ["<novelty/>", '<geom size="-1"/>'])
+def test_whatever_else_a_newer_release_writes_is_an_error(body: str) -> None:
+    with pytest.raises(ValueError, match=r"novelty|size"):
+        _mujoco.without_newer_attributes(
+            f"<mujoco><worldbody>{body}</worldbody></mujoco>", mujoco.MjModel.from_xml_string
+        )
