@@ -104,12 +104,13 @@ def urlab_aio_client(request: pytest.FixtureRequest) -> AsyncURLabClient:
     For tests that pytest-asyncio or anyio's plugin runs.
     """
     config = request.config
-    if "anyio_backend" in request.fixturenames:
+    marked_anyio = "anyio_backend" in request.fixturenames
+    asyncio_fixtures: Any = config.pluginmanager.get_plugin("urlab_asyncio_fixtures")
+    if asyncio_fixtures is not None and (asyncio_fixtures.runs(request.node) or not marked_anyio):
+        # In its auto mode pytest-asyncio runs what is marked with anyio, too, but not the fixtures of that.
+        runner = "beside_anyio" if marked_anyio else asyncio_fixtures.loop_scope(request)
+    elif marked_anyio:
         runner = "anyio"
-    elif config.pluginmanager.hasplugin("urlab_asyncio_fixtures"):
-        mark = request.node.get_closest_marker("asyncio")
-        chosen = None if mark is None else mark.kwargs.get("loop_scope")
-        runner = chosen or config.getini("asyncio_default_test_loop_scope") or "function"
     else:
         pytest.fail(
             "urlab_aio_client needs somebody who runs async tests: install pytest-asyncio, or mark the test with anyio",

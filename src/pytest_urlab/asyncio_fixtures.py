@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+import asyncio
+from collections.abc import AsyncIterator, Iterator
 from typing import TYPE_CHECKING, Any, Literal
 
+import pytest
 import pytest_asyncio
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabClient
+
+
+def runs(item: pytest.Item) -> bool:
+    """Whether pytest-asyncio runs a test."""
+    return pytest_asyncio.is_async_test(item)
+
+
+def loop_scope(request: pytest.FixtureRequest) -> str:
+    """Return whose loop a test runs on: that of the function, the class, ..."""
+    mark = request.node.get_closest_marker("asyncio")
+    chosen = None if mark is None else mark.kwargs.get("loop_scope")
+    return chosen or request.config.getini("asyncio_default_test_loop_scope") or "function"
 
 
 def _on_loop_of(scope: Literal["function", "class", "module", "package", "session"]) -> Any:
@@ -28,3 +42,19 @@ class_client = _on_loop_of("class")
 module_client = _on_loop_of("module")
 package_client = _on_loop_of("package")
 session_client = _on_loop_of("session")
+
+
+@pytest.fixture
+def _urlab_aio_client_beside_anyio(
+    request: pytest.FixtureRequest, _urlab_client_options: dict[str, Any]
+) -> Iterator[URLabClient]:
+    """The client on the loop of the test, where an async fixture would be run by anyio's plugin, on another one."""
+    from urlab_client.aio import URLabClient  # noqa: PLC0415
+
+    runner: asyncio.Runner = request.getfixturevalue(f"_{loop_scope(request)}_scoped_runner")
+    client = URLabClient(**_urlab_client_options)
+    try:
+        runner.run(client.discover())
+        yield client
+    finally:
+        runner.run(client.close())

@@ -17,23 +17,63 @@ from urlab_client.protocol.messages.streams import PlayEnded
 from urlab_client.server import Drop, Faults, SimulatedServer
 
 
+class SlowLoading:
+    """Models take until `go_on` to load."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.begun, self.go_on = asyncio.Event(), threading.Event()
+        loop, load = asyncio.get_running_loop(), Mirror.load
+
+        def slowly(*args: Any, **options: Any) -> Any:
+            loop.call_soon_threadsafe(self.begun.set)
+            assert self.go_on.wait(DEADLINE_S)
+            return load(*args, **options)
+
+        monkeypatch.setattr(Mirror, "load", staticmethod(slowly))
+
+
+async def test_loading_the_model_counts_for_no_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with SimulatedServer("ball", play=True) as server, URLabClient(**server.client_options()) as client:
+        loading = SlowLoading(monkeypatch)
+        call = asyncio.create_task(client.discover(timeout=DEADLINE_S))
+        await loading.begun.wait()
+        pass_time(DEADLINE_S - 1)
+        loading.go_on.set()
+        await call
+        assert client.model is not None
+
+
+async def test_a_handshake_that_is_cancelled_leaves_model_and_wrappers_as_they_were(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async with (
+        SimulatedServer("ball", play=True) as server,
+        URLabClient(**server.client_options(), step_mode="direct") as client,
+    ):
+        await client.discover()
+        model, data, ball = client.model, client.data, client.articulations["ball"]
+        with monkeypatch.context() as patch:
+            loading = SlowLoading(patch)
+            call = asyncio.create_task(client.discover())
+            await loading.begun.wait()
+            call.cancel()
+            await asyncio.wait((call,))  # it does not wait for the thread
+            assert (client.model, client.data, client.articulations["ball"]) == (model, data, ball)
+            loading.go_on.set()
+        await client.discover()
+        assert client.articulations["ball"] is ball
+        assert (await client.step()).step == 1
+
+
 @pytest.mark.parametrize("play", [True, False])
 async def test_closing_while_the_model_loads(monkeypatch: pytest.MonkeyPatch, play: bool) -> None:
-    loading, go_on = asyncio.Event(), threading.Event()
-    loop, load = asyncio.get_running_loop(), Mirror.load
-
-    def slowly(*args: Any, **options: Any) -> Any:
-        loop.call_soon_threadsafe(loading.set)
-        assert go_on.wait(DEADLINE_S)
-        return load(*args, **options)
-
-    monkeypatch.setattr(Mirror, "load", staticmethod(slowly))
+    loading = SlowLoading(monkeypatch)
     async with SimulatedServer("ball", play=play) as server:
         client = URLabClient(**server.client_options())
         call = asyncio.create_task(client.discover())
-        await loading.wait()
+        await loading.begun.wait()
         await client.close()
-        go_on.set()
+        loading.go_on.set()
         with pytest.raises(ClientClosed):
             await call
         assert client.model is None

@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 import pytest
 from samples import sample
+from scripted import meta_ok
 from waiting import DEADLINE_S
 
 import urlab_client
@@ -49,6 +50,7 @@ def result(op: Op, reply: Any) -> Any:
 @pytest.mark.parametrize("name", GENERATED)
 async def test_generated_method(scripted: Any, name: str) -> None:
     op = OPS[name]
+    scripted.on("meta", meta_ok(op.dialects[0]))
     reply = sample(op.reply)
     scripted.on(name, encode_reply(sample(op.reply)))
     given, expected = arguments(op)
@@ -64,6 +66,7 @@ async def test_generated_method(scripted: Any, name: str) -> None:
 @pytest.mark.parametrize("name", GENERATED)
 def test_generated_method_of_the_facade(scripted: Any, name: str) -> None:
     op = OPS[name]
+    scripted.on("meta", meta_ok(op.dialects[0]))
     scripted.on(name, encode_reply(sample(op.reply)))
     given, _ = arguments(op)
     with urlab_client.URLabClient(f"tcp://127.0.0.1:{scripted.port}", local_model=False) as client:
@@ -75,6 +78,7 @@ def test_generated_method_of_the_facade(scripted: Any, name: str) -> None:
 @pytest.mark.parametrize("name", GENERATED)
 async def test_cancelled_and_timed_out_ops_leave_the_client_usable(scripted: Any, name: str) -> None:
     op = OPS[name]
+    scripted.on("meta", meta_ok(op.dialects[0]))
     given, _ = arguments(op)
     scripted.on(name, None)
     async with URLabClient(f"tcp://127.0.0.1:{scripted.port}", local_model=False) as client:

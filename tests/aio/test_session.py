@@ -157,6 +157,20 @@ async def test_default_timeout_comes_from_the_client(scripted: Any) -> None:
             await call
 
 
+async def test_one_timeout_covers_all_requests_of_a_handshake(client: Any, scripted: Any) -> None:
+    hello = scripted.answers["hello"]
+    scripted.on("hello", None)
+    scripted.on("meta", None)
+    call = asyncio.create_task(client.discover(timeout=DEADLINE_S))
+    await until(scripted.held.qsize)
+    pass_time(0.9 * DEADLINE_S)
+    scripted.release(hello({}))
+    await until(scripted.held.qsize)  # the second request, with what the first has left
+    pass_time(0.2 * DEADLINE_S)
+    with pytest.raises(URLabTimeoutError, match="meta: no reply"):
+        await call
+
+
 async def test_cancelled_call_leaves_the_client_usable(client: Any, scripted: Any) -> None:
     await client.discover()
     call = asyncio.create_task(client.runtime.set_paused(True))
@@ -350,13 +364,6 @@ async def test_many_clients_share_a_loop(scripted: Any) -> None:
 def test_malformed_addresses_are_refused(address: str) -> None:
     with pytest.raises(ValueError, match=r"tcp://HOST|names no model"):
         URLabClient(address)
-
-
-async def test_a_client_stays_with_its_loop(scripted: Any) -> None:
-    async with URLabClient("tcp://127.0.0.1", step_port=scripted.port, local_model=False) as client:
-        await client.discover()
-        with pytest.raises(Exception, match="another event loop"):
-            await asyncio.to_thread(asyncio.run, client.discover())
 
 
 @pytest.mark.parametrize(

@@ -301,3 +301,39 @@ async def test_state_belongs_together_under_the_lock(connect: Any, bot: str) -> 
         stop.set()
         watcher.join(60)
         assert torn == []
+
+
+async def test_without_a_local_model_none_is_loaded(connect: Any) -> None:
+    with SimulatedServer("ball", play=True) as server:
+        client = connect(server, step_mode="direct", local_model=False)
+        await client.discover()
+        assert (client.model, client.data) == (None, None)
+        reply = await client.step()
+        (ball,) = client.articulations.values()
+        assert ball.qpos_array.tolist() == reply.per_articulation[ball.prefix].qpos.tolist()
+
+
+async def test_a_step_is_one_request_and_its_state_is_one_instant(connect: Any) -> None:
+    with SimulatedServer("quadruped", play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        (robot,) = client.articulations.values()
+        sent, received = client.transport_stats.sent, client.transport_stats.received
+        for _ in range(3):
+            reply = await client.step()
+            state = reply.per_articulation[robot.prefix]
+            assert (client.sim_time, client.step_count, client.data.time) == (reply.time, reply.step, reply.time)
+            assert (robot.qpos_array.tolist(), robot.qvel_array.tolist()) == (state.qpos.tolist(), state.qvel.tolist())
+            assert client.data.qpos.tolist() == state.qpos.tolist()
+            assert {name: list(reading) for name, reading in robot.get_sensors().items()} == state.sensors
+        assert (client.transport_stats.sent, client.transport_stats.received) == (sent + 3, received + 3)
+
+
+async def test_play_that_runs_is_left_alone_by_start(connect: Any) -> None:
+    with SimulatedServer("ball", play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        time = (await client.step(5)).time
+        assert (await client.sim.start()).is_ready
+        assert client.sim_time == time
+        assert (await client.step()).time > time

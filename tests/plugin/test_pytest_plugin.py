@@ -213,6 +213,26 @@ def test_anyio_runs_the_async_client(pytester: pytest.Pytester) -> None:
     pytester.runpytest_inprocess(*PLUGINS, "-p", "no:asyncio").assert_outcomes(passed=1)
 
 
+@pytest.mark.parametrize("scope", ["function", "module"])
+def test_in_its_auto_mode_pytest_asyncio_runs_what_is_marked_with_anyio(pytester: pytest.Pytester, scope: str) -> None:
+    text = """
+        import pytest
+
+        @pytest.fixture
+        def anyio_backend():
+            return "asyncio"
+
+        @pytest.mark.anyio
+        async def test_marked(urlab_aio_client):
+            await urlab_aio_client.runtime.forward()
+
+        async def test_not_marked(urlab_aio_client):
+            await urlab_aio_client.runtime.forward()
+        """
+    result = run(pytester, text, "-o", "asyncio_mode=auto", "-o", f"asyncio_default_test_loop_scope={scope}")
+    result.assert_outcomes(passed=2)
+
+
 def test_without_a_runner_the_async_fixture_says_what_is_missing(pytester: pytest.Pytester) -> None:
     text = """
         def test_blocking(urlab_client):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pickle
+import socket
 import stat
 from collections.abc import Iterator
 from pathlib import Path
@@ -127,6 +128,16 @@ def test_any_client_with_the_servers_key(keys: Path) -> None:
         with URLabClient(**server.client_options()) as client:
             client.discover()
             assert client.session_id
+
+
+def test_every_socket_is_bound_to_loopback_by_default() -> None:
+    with SimulatedServer("arm", play=True) as server:
+        ports = [server.step_port, server.state_port, server.ctrl_port, server.info_port, server.camera_port]
+        for port in ports:
+            with socket.socket() as beside:
+                beside.bind(("127.0.0.2", port))  # which is refused where somebody listens on all addresses
+            with socket.socket() as instead, pytest.raises(OSError, match="in use"):
+                instead.bind(("127.0.0.1", port))
 
 
 def test_a_wider_interface_needs_protection_or_the_word(keys: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -19,11 +19,13 @@ import warnings
 import weakref
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from waiting import DEADLINE_S
 
+from urlab_client import URLabClient
 from urlab_client.protocol.errors import ClientClosed, ForkedError, URLabError, URLabRPCError
 from urlab_client.protocol.names import NameMap
 from urlab_client.sync import _loop
@@ -203,6 +205,24 @@ class TestCall:
                 return portal.next(self.get)
 
         assert list(Numbers()) == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("module", "asked", "patched", "who"),
+    [
+        ("gevent.monkey", "is_module_patched", "threading", "gevent"),
+        ("gevent.monkey", "is_module_patched", "select", "gevent"),
+        ("eventlet.patcher", "is_monkey_patched", "thread", "Eventlet"),
+    ],
+)
+def test_among_greenlets_a_client_says_at_once_that_it_cannot_be(
+    monkeypatch: pytest.MonkeyPatch, module: str, asked: str, patched: str, who: str
+) -> None:
+    monkeypatch.setitem(sys.modules, module, SimpleNamespace(**{asked: lambda name: name == patched}))
+    with pytest.raises(URLabError, match=rf"{who} has replaced in this process\. Use it in a process of its own"):
+        URLabClient()
+    monkeypatch.setitem(sys.modules, module, SimpleNamespace(**{asked: lambda name: False}))
+    URLabClient().close()
 
 
 class TestTracebacks:

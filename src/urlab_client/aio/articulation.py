@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from urlab_client.aio.cameras import URLabCameraView
+from urlab_client.aio.control import CLAIM_S
 from urlab_client.aio.controllers import URLabController, make_controller
+from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.live.publishers import Publishers
 from urlab_client.aio.model.articulation_state import MirroredArticulation, MirroredEntity
 from urlab_client.aio.model.elements import Actuator, ArticulationElements, Body, Joint, Sensor, make_elements
@@ -165,8 +168,18 @@ class URLabArticulation(URLabEntity):
 
     @property
     def prefix(self) -> str:
-        """Articulation key: what its compiled names start with, before an underscore."""
+        """Articulation key."""
         return self._record.name
+
+    @property
+    def compiled_prefix(self) -> str:
+        """What its compiled names start with, before an underscore: the key, or the engine's name of the actor."""
+        return self._record.info.compiled_prefix
+
+    @property
+    def user(self) -> dict[str, Any]:
+        """Values of the user channels that the level declares for it, by name; empty on servers without them."""
+        return dict(self._record.user)
 
     @property
     def actor_id(self) -> str:
@@ -196,7 +209,7 @@ class URLabArticulation(URLabEntity):
     @property
     def cameras(self) -> NameMap[URLabCameraView]:
         """Cameras by name."""
-        topics = self._record.info.camera_topics
+        topics = {name.removeprefix(f"{self.prefix}/"): info for name, info in self._record.info.camera_topics.items()}
         if any(name not in self._cameras or self._cameras[name].info is not info for name, info in topics.items()):
             views = {
                 name: self._cameras.get(name) or URLabCameraView(name, info, self._publishers)
@@ -229,14 +242,17 @@ class URLabArticulation(URLabEntity):
     @control_mode.setter
     def control_mode(self, mode: ControlMode | str) -> None:
         self._record.control_mode = ControlMode(mode)
+        self._record.drive()
 
     @property
     def ctrl_array(self) -> Floats:
         """Set-points that the next step sends, shape (n_actuators,). A live view: write to it in place."""
+        self._record.drive()  # whoever takes the view may write to it at any time
         return self._record.ctrl
 
     @ctrl_array.setter
     def ctrl_array(self, values: Sequence[float] | Floats) -> None:
+        self._record.drive()
         self._record.ctrl[:] = values
 
     @property
@@ -356,6 +372,42 @@ class URLabArticulation(URLabEntity):
         if not body:
             raise ValueError(f"{self.prefix}: name the body: without a local model its root is not known")
         self._record.apply_wrench(body, _wrench(force, torque))
+        self._record.drive()
+
+    async def claim(self, *, force: bool = False, ttl: float = CLAIM_S, timeout: Timeout = DEFAULT) -> None:
+        """Become the one client that controls the articulation, before the first write does it by itself.
+
+        A claim is renewed for as long as the client lives, and given up by `release()` and by closing the client. On a
+        server whose robots have no owner this does nothing.
+
+        Args:
+            force: Take it from the client that controls it; that one's next write is refused.
+            ttl: Seconds after which the claim ends when this process is gone; 0 for never.
+            timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            ControlClaimed: Another client controls it; `.owner` says which.
+            ValueError: `ttl` is negative or not a number.
+        """
+        await self._session.control.claim(self.prefix, force=force, ttl=ttl, timeout=timeout)
+        self._record.drive()
+
+    async def release(self, *, timeout: Timeout = DEFAULT) -> None:
+        """Let others control the articulation. The next write claims it again.
+
+        Args:
+            timeout: Seconds to wait; None waits without limit.
+        """
+        self._record.leave()
+        await self._session.control.release(self.prefix, timeout=timeout)
+
+    @property
+    def control_owner(self) -> str | None:
+        """Who controls it, as far as this client knows: `HOST/PROCESS/…` for this process, else the other's name.
+
+        None when nobody does, when it is not known, and on servers whose robots have no owner.
+        """
+        return self._session.control.owner_of(self.prefix)
 
     def _made(self) -> ArticulationElements:
         layout = self._record.layout

@@ -11,11 +11,13 @@ import re
 from collections.abc import Collection, Mapping
 from threading import RLock
 from types import TracebackType
-from typing import TYPE_CHECKING, NoReturn, Self, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, Self, TypeVar
 
 from urlab_client.aio.articulation import URLabArticulation, URLabEntity
 from urlab_client.aio.cameras import URLabCameraView
+from urlab_client.aio.control import Control
 from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.explain import diagnose
 from urlab_client.aio.launch import SCHEME, LaunchedTransport
 from urlab_client.aio.live.publishers import Publishers
@@ -47,7 +49,7 @@ from urlab_client.protocol.messages.session import Meta as MetaRequest
 from urlab_client.protocol.messages.streams import ClientEvent, RowSample, StateSnapshot, StreamPolicy
 from urlab_client.protocol.names import NameMap
 from urlab_client.protocol.rows import TopicKind
-from urlab_client.protocol.types import ClientConfig, Diagnosis, Resync
+from urlab_client.protocol.types import ClientConfig, Diagnosis, Resync, ServerInfo
 
 if TYPE_CHECKING:
     import mujoco
@@ -84,7 +86,7 @@ class URLabClient:
             itself. `sim://MODEL` starts a simulated server of its own in a child process and stops it on close.
         step_mode: `auto`, `direct`, `puppet` or `live`.
         step_port: RPC port.
-        state_port: State stream, used in live mode.
+        state_port: State stream, used in live mode. A server that tells another port than the default is followed.
         ctrl_port: Streaming control.
         info_port: Actuator and camera descriptions.
         mujoco_version_check: Raise `URLabVersionMismatch` when server and client MuJoCo builds differ; False warns and
@@ -103,6 +105,8 @@ class URLabClient:
             the model is compiled here from XML, in a child process with limits.
         live_pictures: Receive the pictures of all cameras by themselves in live mode, for `latest_frame`. False spares
             server and network those that nobody looks at; `frames()` is received all the same.
+        claim_control: Take control of a robot with the first write to it, where robots have one owner. False is for
+            those who look on, and for those who say `articulation.claim()`.
 
     Raises:
         KeyFileError: A key file cannot be used.
@@ -129,6 +133,7 @@ class URLabClient:
         client_key: str | os.PathLike[str] | None = None,
         trust_server: bool = False,
         live_pictures: bool = True,
+        claim_control: bool = True,
     ) -> None:
         self._config = ClientConfig(
             address=address,
@@ -148,6 +153,7 @@ class URLabClient:
             client_key=None if client_key is None else os.fspath(client_key),
             trust_server=trust_server,
             live_pictures=live_pictures,
+            claim_control=claim_control,
         )
         if encoding not in {"msgpack", "json"}:
             raise ValueError(f"encoding must be msgpack or json, not {encoding!r}")
@@ -160,9 +166,10 @@ class URLabClient:
         plain = _transport(address, step_port, keys, shm=memory is not None)
         self._transport = plain if memory is None else ShmTransport(plain, memory)
         self._session = Session(self._transport, default_timeout=rcv_timeout_ms / 1000, json=encoding == "json")
+        self._session.control = Control(self._session, wanted=claim_control)
         self._publishers = Publishers(
             lambda: self._transport.endpoint,
-            lambda: self._transport.state_port or state_port,
+            self._state_port,
             default_timeout=rcv_timeout_ms / 1000,
             live=lambda: self._state.mode is StepMode.LIVE,
             keys=keys,
@@ -274,6 +281,22 @@ class URLabClient:
     def mujoco_version(self) -> str:
         """MuJoCo version of the server; empty before `discover()`."""
         return "" if self._state.hello is None else self._state.hello.mujoco_version
+
+    @property
+    def server(self) -> ServerInfo:
+        """What the server is and can do, as far as its answers have shown."""
+        hello = self._state.hello
+        return ServerInfo(
+            features=self._session.features,
+            instance=None if hello is None else hello.instance,
+            urlab_version=self.urlab_version,
+            mujoco_version=self.mujoco_version,
+        )
+
+    @property
+    def user(self) -> dict[str, Any]:
+        """Values of the user channels that the level declares for the scene, by name, from the last snapshot."""
+        return dict(self._state.user)
 
     @property
     def manager_present(self) -> bool:
@@ -596,15 +619,18 @@ class URLabClient:
         promoted_from = self._state.promoted_from
         self._publishers.close()
         try:
+            await self._session.control.aclose(connected=self.connected and self.manager_present)
             await self._watch.aclose()
             await asyncio.sleep(0)  # a blocking client notices only now that the server has gone meanwhile
             if promoted_from is not None and self.connected and self.manager_present:
                 with contextlib.suppress(URLabError):  # a courtesy: the server may have moved on
-                    await self._session.call(SetMode(mode=promoted_from), timeout=_REVERT_S)
+                    async with self._session.turn(SetMode, timeout=_REVERT_S) as turn:
+                        await self._state.ask_mode(turn, promoted_from)
         finally:
             await self._session.aclose()
 
     async def __aenter__(self) -> Self:
+        running_loop()
         return self
 
     async def __aexit__(
@@ -622,6 +648,13 @@ class URLabClient:
             "Send client.config, and make a client from it: URLabClient(**config.options())."
         )
 
+    def _state_port(self) -> int:
+        hello = self._state.hello
+        told = None if hello is None or hello.instance is None else hello.instance.state_port
+        # What the user has chosen goes before what the server says: there may be a tunnel between.
+        chosen = self._config.state_port
+        return self._transport.state_port or (told if told and chosen == ClientConfig().state_port else chosen)
+
     def _joint_values(self, key: str, values: Mapping[str, float]) -> dict[str, float]:
         joints = self.articulations[key].joints
         return {(joints[name].name if joints else name): float(value) for name, value in values.items()}
@@ -633,7 +666,8 @@ class URLabClient:
         compiled = [key for key in model_names(self.model, "key") if key]
         if name in compiled:
             return name
-        matches = [key for key in compiled if key in {f"{prefix}_{name}" for prefix in self.articulations}]
+        wanted = {f"{art.compiled_prefix}_{name}" for art in self.articulations.values()}
+        matches = [key for key in compiled if key in wanted]
         if len(matches) == 1:
             return matches[0]
         problem = (

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import asyncio
 import enum
 from collections.abc import Callable
 from typing import Final, Literal, TypeAlias
+
+from urlab_client.aio.event_loop import running_loop
 
 __all__ = ["DEFAULT", "Default", "Timeout", "shared"]
 
@@ -30,6 +31,6 @@ def shared(timeout: Timeout) -> Callable[[], Timeout]:
     """
     if timeout is DEFAULT or timeout is None:
         return lambda: timeout
-    loop = asyncio.get_running_loop()
+    loop = running_loop()
     end = loop.time() + timeout
     return lambda: max(0.0, end - loop.time())

@@ -13,6 +13,7 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
+from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.session import Session
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.protocol.enums import ControlMode, PIEState, StepMode
@@ -56,9 +57,9 @@ async def diagnose(config: ClientConfig, session: Session, state: SimState) -> D
 
 
 async def _examine(config: ClientConfig, session: Session, state: SimState) -> AsyncIterator[Finding]:
+    loop = running_loop()
     async for finding in _reachability(config, session):
         yield finding
-    loop = asyncio.get_running_loop()
     before = loop.time()
     try:
         ops = (await session.call(Meta())).ops

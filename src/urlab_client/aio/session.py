@@ -8,13 +8,17 @@ from collections.abc import Awaitable, Callable
 from types import TracebackType
 from typing import Any, NamedTuple, Self, TypeVar
 
+from urlab_client.aio.control import Control
 from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.event_loop import running_loop
+from urlab_client.aio.jobs import OnProgress, finish
 from urlab_client.aio.transport.base import RequestTransport
-from urlab_client.protocol.base import Needs, Op, Reply, Request
-from urlab_client.protocol.codec import check_request, decode_reply, encode_request, op_of
+from urlab_client.protocol.base import ControlRequest, Needs, Op, Reply, Request
+from urlab_client.protocol.codec import check_request, decode_answer, decode_reply, encode_request, op_of
 from urlab_client.protocol.errors import (
     ConnectionLost,
     NoSession,
+    ProtocolError,
     ServerUnreachable,
     SessionTakenOver,
     UnknownOp,
@@ -23,7 +27,8 @@ from urlab_client.protocol.errors import (
     URLabTimeoutError,
 )
 from urlab_client.protocol.features import Features
-from urlab_client.protocol.messages.session import Hello, HelloOk, Meta
+from urlab_client.protocol.messages.jobs import OpStarted, OpStatus
+from urlab_client.protocol.messages.session import Hello, HelloOk, Meta, StateReply
 
 __all__ = ["Session", "Turn"]
 
@@ -33,14 +38,14 @@ R = TypeVar("R", bound=Reply)
 T = TypeVar("T")
 
 
+_UNLISTED = frozenset({"hello", "meta"})  # every server has them, none lists them
+
+
 class Limits(NamedTuple):
     """Loop times by which a request must have been answered, and a connection must stand; None waits."""
 
     deadline: float | None
     connect_by: float | None
-
-
-_UNLISTED = frozenset({"hello", "meta"})  # every server has them, none lists them
 
 
 class Session:
@@ -54,12 +59,14 @@ class Session:
         session_id: Id of the open session; empty without one.
         greeted: Whether a handshake was sent, with whatever outcome.
         features: What the server can do, as far as its answers have shown.
+        control: The robots that this client owns.
         on_opened: Told of each session that was opened, also by a handshake that its caller had given up.
         on_refusal: Told of each refusal before it is raised.
         confirmed: Whether the server has answered within this session since the connection was made. It may be another
             server after that was lost, which only a refused or accepted session id shows.
         line: Held while a request is under way, from encoding it to its reply.
         turns: Held by the `Turn` under way.
+        editing: Held while the editor has a job.
     """
 
     def __init__(self, transport: RequestTransport, *, default_timeout: float | None, json: bool = False) -> None:
@@ -72,8 +79,11 @@ class Session:
         self._transport = transport
         self._default_timeout = default_timeout
         self._json = json
+        self.control = Control(self)
         self.line = asyncio.Lock()
         self.turns = asyncio.Lock()
+        self.editing = asyncio.Lock()
+        self._loop: asyncio.AbstractEventLoop | None = None
         self._queued = 0
         self._aside: asyncio.Task[Reply] | None = None
         # A handshake that was given up after it was sent opens a session all the same.
@@ -85,12 +95,15 @@ class Session:
         """What carries the requests."""
         return self._transport
 
-    async def call(self, request: Request[R], *, timeout: Timeout = DEFAULT) -> R:
-        """Send a request that does not depend on the client's state, and return its reply.
+    async def call(
+        self, request: Request[R], *, timeout: Timeout = DEFAULT, on_progress: OnProgress | None = None
+    ) -> R:
+        """Send a request that does not depend on the client's state; return its reply, after the end of its job.
 
         Args:
             request: Any request struct of `urlab_client.protocol.messages`.
-            timeout: Seconds for queueing, sending and the reply; None waits.
+            timeout: Seconds for queueing, sending and the reply, of a job, too; None waits.
+            on_progress: Told how far a job is.
 
         Raises:
             URLabRPCError: The server refused.
@@ -101,10 +114,35 @@ class Session:
         """
         op = op_of(request)
         self.check_offered(op)
-        limits = self.limits(op, timeout, asyncio.get_running_loop().time())
+        limits = self.limits(op, timeout, self.bound_loop().time())
+        if op.needs is not Needs.EDITOR:
+            return await self._on_line(request, op, limits)
+        # One job at a time: the next op of the editor would wait for it anyway, and block the server meanwhile.
+        await self.acquire(self.editing, op, limits.deadline)
+        try:
+            await self.acquire(self.line, op, limits.deadline)
+            try:
+                answer = await self.exchange(request, op, limits)
+            finally:
+                self.line.release()
+            if not isinstance(answer, OpStarted):
+                return answer
+            status = op_of(OpStatus)
+            return await finish(
+                op,
+                op_reply(request, op),
+                answer,
+                lambda question: self._on_line(question, status, limits),
+                deadline=limits.deadline,
+                on_progress=on_progress,
+            )
+        finally:
+            self.editing.release()
+
+    async def _on_line(self, request: Request[R], op: Op, limits: Limits) -> R:
         await self.acquire(self.line, op, limits.deadline)
         try:
-            return await self.exchange(request, op, limits)
+            return at_once(op, await self.exchange(request, op, limits))
         finally:
             self.line.release()
 
@@ -154,6 +192,15 @@ class Session:
         """Release the transport; calls that wait fail with `ClientClosed`."""
         await self._transport.aclose()
 
+    def bound_loop(self) -> asyncio.AbstractEventLoop:
+        """Return the running loop, on which this session stays.
+
+        Raises:
+            URLabError: It is another one than before, or not asyncio's.
+        """
+        self._loop = running_loop(self._loop)
+        return self._loop
+
     def check_offered(self, op: Op) -> None:
         """Refuse an op that the server does not list.
 
@@ -182,16 +229,25 @@ class Session:
         seconds = op.timeout if takes is None else takes
         return Limits(since + max(seconds or 0.0, default), since + default)
 
-    async def exchange(self, request: Request[R], op: Op, limits: Limits) -> R:
-        """Send a request and return its reply; for whoever holds the line."""
+    async def exchange(self, request: Request[R], op: Op, limits: Limits) -> R | OpStarted:
+        """Send a request and return its answer; for whoever holds the line."""
+        if isinstance(request, ControlRequest):
+            return await self.control.send(request, self._ask, limits)
+        return await self._answer(request, op, limits)
+
+    async def _ask(self, request: Request[R], limits: Limits) -> R:
+        op = op_of(request)
+        return at_once(op, await self._answer(request, op, limits))
+
+    async def _answer(self, request: Request[R], op: Op, limits: Limits) -> R | OpStarted:
         stamped = self.session_id
         try:
-            return await self._ask(request, op, limits)
+            return await self._send(request, op, limits)
         except SessionTakenOver as refusal:
             # A handshake of our own that was given up opens a session all the same. What it made the server refuse
             # was not executed, and is sent once more in that session.
             if await self._settled(limits.deadline) and self.session_id != stamped:
-                return await self._ask(request, op, limits)
+                return await self._send(request, op, limits)
             if not stamped:
                 raise NoSession("no session is open.", op=op.name) from None
             if self.on_refusal is not None:
@@ -200,7 +256,7 @@ class Session:
                 raise _by_ourselves(refusal) from None
             raise
 
-    async def _ask(self, request: Request[R], op: Op, limits: Limits) -> R:
+    async def _send(self, request: Request[R], op: Op, limits: Limits) -> R | OpStarted:
         hello = op.request is Hello
         loop = asyncio.get_running_loop()
         began = loop.time()
@@ -228,13 +284,15 @@ class Session:
                 "%s: %d bytes out, %d back in %.3f ms", op.name, len(frame), len(answer), 1e3 * (loop.time() - began)
             )
         try:
-            reply = decode_reply(op, op_reply(request, op), answer)
+            reply = decode_answer(op, op_reply(request, op), answer)
         except URLabRPCError as refusal:
             # A refusal of what was sent before the latest hello says nothing about the session of now.
             taken_over = isinstance(refusal, SessionTakenOver)
             if self.on_refusal is not None and stamped == self.session_id and not taken_over:
                 self.on_refusal(refusal)
             raise
+        if isinstance(reply, StateReply):
+            self.features = self.features.with_reply(reply)
         if isinstance(reply, HelloOk):
             self._open(reply)
         elif not self.confirmed:
@@ -289,7 +347,7 @@ class Session:
                 raise lost from unreachable
 
     async def acquire(self, lock: asyncio.Lock, op: Op, deadline: float | None) -> None:
-        """Wait for `line` or `turns`.
+        """Wait for `line`, `turns` or `editing`.
 
         Raises:
             URLabTimeoutError: Another call held it until the deadline; nothing was sent.
@@ -323,7 +381,7 @@ class Turn:
         sent: Whether the request of the latest `call` left, so that the server may have executed it.
     """
 
-    __slots__ = ("_began", "_each", "_first", "_holds_line", "_op", "_session", "_timeout", "sent")
+    __slots__ = ("_began", "_each", "_first", "_op", "_ready", "_session", "_timeout", "sent")
 
     def __init__(self, session: Session, op: Op, timeout: Timeout, *, each: bool) -> None:
         self.sent = False
@@ -333,27 +391,25 @@ class Turn:
         self._each = each
         self._began = 0.0
         self._first = True
-        self._holds_line = False
+        self._ready = False
 
     async def __aenter__(self) -> Self:
         session, op = self._session, self._op
-        self._began = asyncio.get_running_loop().time()
+        self._began = session.bound_loop().time()
         deadline = session.limits(op, self._timeout, self._began).deadline
         await session.acquire(session.turns, op, deadline)
         try:
-            await session.acquire(session.line, op, deadline)
+            await self._take_line(deadline)
         except BaseException:
             session.turns.release()
             raise
-        self._holds_line = True
         return self
 
     async def __aexit__(
         self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        if self._holds_line:
-            self._holds_line = False
-            self._session.line.release()
+        if self._ready:
+            self._give_line()
         self._session.turns.release()
 
     async def call(self, request: Request[R], *, takes: float | None = None) -> R:
@@ -374,25 +430,52 @@ class Turn:
         before = stats.sent
         self.sent = False
         try:
-            return await session.exchange(request, op, limits)
+            return at_once(op, await session.exchange(request, op, limits))
         finally:
             self.sent = stats.sent > before
 
     async def aside(self, work: Awaitable[T]) -> T:
         """Let requests that do not depend on the client's state pass while `work`, which sends nothing, is done."""
-        session = self._session
-        self._holds_line = False
-        session.line.release()
+        self._give_line()
         result = await work
-        await session.acquire(session.line, self._op, self._limits(self._op).deadline)
-        self._holds_line = True
+        await self._take_line(self._limits(self._op).deadline)
         return result
+
+    async def _take_line(self, deadline: float | None) -> None:
+        session, op = self._session, self._op
+        editing = op.needs is Needs.EDITOR
+        if editing:
+            await session.acquire(session.editing, op, deadline)
+        try:
+            await session.acquire(session.line, op, deadline)
+        except BaseException:
+            if editing:
+                session.editing.release()
+            raise
+        self._ready = True
+
+    def _give_line(self) -> None:
+        self._ready = False
+        self._session.line.release()
+        if self._op.needs is Needs.EDITOR:
+            self._session.editing.release()
 
     def _limits(self, op: Op, takes: float | None = None) -> Limits:
         # What is waited for the turn counts for the first request, and for all where one timeout covers them.
         counted = self._first or (self._timeout is not DEFAULT and not self._each)
         since = self._began if counted else asyncio.get_running_loop().time()
         return self._session.limits(op, self._timeout, since, takes)
+
+
+def at_once(op: Op, answer: R | OpStarted) -> R:
+    """Return the answer to an op that is none of the editor's jobs.
+
+    Raises:
+        ProtocolError: The server has made a job of it.
+    """
+    if isinstance(answer, OpStarted):
+        raise ProtocolError(f"{op.name}: the server has started {answer.job_id} instead of answering.", op=op.name)
+    return answer
 
 
 def op_reply(request: Request[R], op: Op) -> type[R]:

@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import Generic, Protocol, Self, TypeVar
 
 from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.stream_buffer import BufferedMessage, StreamBuffer
 from urlab_client.aio.transport.subscriber import MessageGone, MessageHandler
 from urlab_client.protocol.errors import (
@@ -135,13 +136,7 @@ class _StreamChannel(MessageHandler, Generic[T]):
         """Begin to receive, if that has not been done yet."""
         if self.closed:
             raise StopAsyncIteration
-        loop = asyncio.get_running_loop()
-        if self._loop is None:
-            self._loop = loop
-        elif self._loop is not loop:
-            raise URLabError(
-                f"{self._source.name}: this stream belongs to another event loop.", hint="Open one per loop."
-            )
+        self._loop = running_loop(self._loop, f"{self._source.name}: this stream")
         self.attach()
 
     def attach(self) -> None:

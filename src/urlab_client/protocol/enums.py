@@ -6,10 +6,12 @@ A server may send a value that no enum knows; such a value stays a plain `str` w
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import StrEnum
-from typing import TypeVar
+from typing import Final, TypeVar
 
 __all__ = [
+    "LATER_MODE_NAMES",
     "ActuatorType",
     "CameraMode",
     "CameraTiming",
@@ -32,6 +34,18 @@ class StepMode(StrEnum):
     DIRECT = "direct"
     PUPPET = "puppet"
     LIVE = "live"
+
+    @classmethod
+    def _missing_(cls, value: object) -> StepMode | None:
+        return next((mode for mode, later in LATER_MODE_NAMES.items() if later == value), None)
+
+
+LATER_MODE_NAMES: Final[Mapping[StepMode, str]] = {
+    StepMode.LIVE: "freerun",
+    StepMode.DIRECT: "stepped",
+    StepMode.PUPPET: "statepushed",
+}
+"""What servers after the beta call the modes."""
 
 
 class ControlMode(StrEnum):

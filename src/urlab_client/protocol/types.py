@@ -10,6 +10,8 @@ from msgspec import Struct
 from msgspec.structs import asdict
 
 from urlab_client.protocol.enums import PIEState, StepMode, Transport
+from urlab_client.protocol.features import Features
+from urlab_client.protocol.messages.session import InstanceInfo
 
 __all__ = [
     "ActorBounds",
@@ -22,6 +24,7 @@ __all__ = [
     "ContactsResult",
     "Diagnosis",
     "Finding",
+    "JobStatus",
     "KeyframeInfo",
     "MocapPose",
     "PIEStartResult",
@@ -33,6 +36,7 @@ __all__ = [
     "Resync",
     "SceneActor",
     "SceneSnapshot",
+    "ServerInfo",
     "SimOptions",
     "URLabAsset",
     "URLabBlueprint",
@@ -143,10 +147,32 @@ class ClientConfig(Struct, frozen=True, kw_only=True):
     client_key: str | None = None
     trust_server: bool = False
     live_pictures: bool = True
+    claim_control: bool = True
 
     def options(self) -> dict[str, Any]:
         """Return the constructor's arguments: `URLabClient(**config.options())`."""
         return asdict(self)
+
+
+class ServerInfo(Struct, frozen=True, kw_only=True):
+    """What a server is and can do; see `client.server`.
+
+    Attributes:
+        features: What it can do. Its `generation` is a name for people.
+        instance: Which of several servers it is; None before play, and from servers that do not tell.
+        urlab_version: Its version; not to be relied on.
+        mujoco_version: Version of its MuJoCo.
+    """
+
+    features: Features
+    instance: InstanceInfo | None = None
+    urlab_version: str = ""
+    mujoco_version: str = ""
+
+    @property
+    def generation(self) -> str:
+        """`alpha`, `june`, `beta`, `3`, or empty before `discover()`."""
+        return self.features.generation
 
 
 class URLabAsset(Struct):
@@ -525,6 +551,22 @@ class Contact(Struct, frozen=True):
     normal: Vec3
     dist: float
     force: tuple[float, float, float, float, float, float]
+
+
+class JobStatus(Struct, frozen=True):
+    """How far an editor's job is.
+
+    Attributes:
+        job_id: Its id.
+        state: `running`, `done` or `failed`; a newer server may say something else, which counts as running.
+        progress: Text for people; None from servers that say nothing.
+        elapsed_s: Seconds since it began, as this client counts.
+    """
+
+    job_id: str
+    state: str
+    progress: str | None
+    elapsed_s: float
 
 
 class ContactsResult(Struct, frozen=True):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import inspect
 import os
+import sys
 import threading
 import warnings
 import weakref
@@ -47,11 +48,15 @@ class Portal:
 
     Args:
         at_stop: Makes the coroutine that releases what lives on the loop. It must not refer to the portal.
+
+    Raises:
+        URLabError: gevent or Eventlet has replaced Python's threads or sockets.
     """
 
     __slots__ = ("__weakref__", "_at_stop", "_closed", "_finalizer", "_io", "_lock", "_pid", "_twins")
 
     def __init__(self, at_stop: Callable[[], Coroutine[Any, Any, object]] | None = None) -> None:
+        _refuse_greenlets()
         self._at_stop = at_stop
         self._pid = os.getpid()
         self._lock = threading.RLock()
@@ -188,6 +193,22 @@ class Portal:
         elif self._io.is_current:
             raise _on_io_thread()
         return self._io
+
+
+def _refuse_greenlets() -> None:
+    """Raise if what the loop and its thread stand on is not what it seems: calls would hang, or blame each other."""
+    gevent: Any = sys.modules.get("gevent.monkey")
+    eventlet: Any = sys.modules.get("eventlet.patcher")
+    if gevent is not None and any(map(gevent.is_module_patched, ("threading", "select"))):
+        who = "gevent"
+    elif eventlet is not None and any(map(eventlet.is_monkey_patched, ("thread", "select"))):
+        who = "Eventlet"
+    else:
+        return
+    raise URLabError(
+        f"The blocking client needs Python's own threads and sockets, which {who} has replaced in this process.",
+        hint="Use it in a process of its own, or urlab_client.aio with asyncio.run().",
+    )
 
 
 def _forked() -> ForkedError:

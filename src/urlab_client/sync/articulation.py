@@ -5,8 +5,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from urlab_client.aio import articulation as aio
+from urlab_client.aio.control import CLAIM_S
+from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.model.elements import Actuator, Body, Joint, Sensor
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.enums import ControlMode
@@ -115,8 +118,18 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
 
     @property
     def prefix(self) -> str:
-        """Articulation key: what its compiled names start with, before an underscore."""
+        """Articulation key."""
         return self._aio.prefix
+
+    @property
+    def compiled_prefix(self) -> str:
+        """What its compiled names start with, before an underscore: the key, or the engine's name of the actor."""
+        return self._aio.compiled_prefix
+
+    @property
+    def user(self) -> dict[str, Any]:
+        """Values of the user channels that the level declares for it, by name; empty on servers without them."""
+        return self._aio.user
 
     @property
     def actor_id(self) -> str:
@@ -274,3 +287,36 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
             ValueError: A vector does not have three components, or the body must be named.
         """
         self._aio.apply_xfrc(body, force=force, torque=torque)
+
+    def claim(self, *, force: bool = False, ttl: float = CLAIM_S, timeout: Timeout = DEFAULT) -> None:
+        """Become the one client that controls the articulation, before the first write does it by itself.
+
+        A claim is renewed for as long as the client lives, and given up by `release()` and by closing the client. On a
+        server whose robots have no owner this does nothing.
+
+        Args:
+            force: Take it from the client that controls it; that one's next write is refused.
+            ttl: Seconds after which the claim ends when this process is gone; 0 for never.
+            timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            ControlClaimed: Another client controls it; `.owner` says which.
+            ValueError: `ttl` is negative or not a number.
+        """
+        self._portal.call(self._aio.claim, force=force, ttl=ttl, timeout=timeout)
+
+    def release(self, *, timeout: Timeout = DEFAULT) -> None:
+        """Let others control the articulation. The next write claims it again.
+
+        Args:
+            timeout: Seconds to wait; None waits without limit.
+        """
+        self._portal.call(self._aio.release, timeout=timeout)
+
+    @property
+    def control_owner(self) -> str | None:
+        """Who controls it, as far as this client knows: `HOST/PROCESS/…` for this process, else the other's name.
+
+        None when nobody does, when it is not known, and on servers whose robots have no owner.
+        """
+        return self._aio.control_owner

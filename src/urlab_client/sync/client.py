@@ -8,7 +8,7 @@ import os
 from collections.abc import Collection, Mapping
 from threading import RLock
 from types import TracebackType
-from typing import TYPE_CHECKING, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from urlab_client.aio import client as aio
 from urlab_client.aio.client import SESSION_LEVEL, SessionLevel
@@ -21,7 +21,7 @@ from urlab_client.protocol.messages.session import OpInfo, ResetOk, StepOk
 from urlab_client.protocol.messages.streams import ClientEvent, RowSample, StateSnapshot, StreamPolicy
 from urlab_client.protocol.names import NameMap
 from urlab_client.protocol.rows import TopicKind
-from urlab_client.protocol.types import ClientConfig, Diagnosis, Resync
+from urlab_client.protocol.types import ClientConfig, Diagnosis, Resync, ServerInfo
 from urlab_client.sync._portal import FacadeRoot
 from urlab_client.sync.articulation import URLabArticulation, URLabEntity
 from urlab_client.sync.cameras import URLabCameraView
@@ -53,7 +53,7 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
             itself. `sim://MODEL` starts a simulated server of its own in a child process and stops it on close.
         step_mode: `auto`, `direct`, `puppet` or `live`.
         step_port: RPC port.
-        state_port: State stream, used in live mode.
+        state_port: State stream, used in live mode. A server that tells another port than the default is followed.
         ctrl_port: Streaming control.
         info_port: Actuator and camera descriptions.
         mujoco_version_check: Raise `URLabVersionMismatch` when server and client MuJoCo builds differ; False warns and
@@ -72,6 +72,8 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
             the model is compiled here from XML, in a child process with limits.
         live_pictures: Receive the pictures of all cameras by themselves in live mode, for `latest_frame`. False spares
             server and network those that nobody looks at; `frames()` is received all the same.
+        claim_control: Take control of a robot with the first write to it, where robots have one owner. False is for
+            those who look on, and for those who say `articulation.claim()`.
 
     Raises:
         KeyFileError: A key file cannot be used.
@@ -101,6 +103,7 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
         client_key: str | os.PathLike[str] | None = None,
         trust_server: bool = False,
         live_pictures: bool = True,
+        claim_control: bool = True,
     ) -> None:
         super().__init__(
             aio.URLabClient(
@@ -121,6 +124,7 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
                 client_key=client_key,
                 trust_server=trust_server,
                 live_pictures=live_pictures,
+                claim_control=claim_control,
             )
         )
 
@@ -203,6 +207,16 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
     def mujoco_version(self) -> str:
         """MuJoCo version of the server; empty before `discover()`."""
         return self._aio.mujoco_version
+
+    @property
+    def server(self) -> ServerInfo:
+        """What the server is and can do, as far as its answers have shown."""
+        return self._aio.server
+
+    @property
+    def user(self) -> dict[str, Any]:
+        """Values of the user channels that the level declares for the scene, by name, from the last snapshot."""
+        return self._aio.user
 
     @property
     def manager_present(self) -> bool:

@@ -6,6 +6,8 @@ its record to a new model.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from urlab_client.aio.model.layout import ArticulationLayout
@@ -132,13 +134,14 @@ class MirroredArticulation(MirroredEntity):
         info: The handshake's description.
         controller: The handshake's controller block, kept current.
         control_mode: Whether the controller is in force.
-        ctrl: Set-points that the next step sends, shape (n_ctrl,); written in place by users.
+        ctrl: Set-points that the next step sends, shape (n_ctrl,); written in place by users, who call `drive` before.
         qpos: Joint positions.
         qvel: Joint velocities.
         applied: `mjData.ctrl` as the server applied it.
         act: First activation per actuator.
         force: Actuator forces, at level `full`.
         sensors: Readings by short name.
+        user: Values of the user channels, by name.
         bodies: Poses by short name, at level `full`.
         twist: Commanded twist.
         actions: Bit field of pressed action keys.
@@ -153,6 +156,9 @@ class MirroredArticulation(MirroredEntity):
         self.control_mode = ControlMode.RAW
         self.ctrl: Floats = np.zeros(0)
         self._written_ctrl: Floats = np.zeros(0)
+        self._driven = False
+        self._left_ctrl: Floats = self.ctrl
+        self.user: dict[str, Any] = {}
         self.bind(info, layout)
 
     def bind(self, info: ArticulationInfo, layout: ArticulationLayout) -> None:
@@ -164,6 +170,7 @@ class MirroredArticulation(MirroredEntity):
         if len(self.ctrl) != n_ctrl:
             self.ctrl = np.zeros(n_ctrl)
             self._written_ctrl = np.zeros(n_ctrl)
+            self._left_ctrl = np.zeros(n_ctrl)
         self._bind_controller(info.controller)
         self._bind_root()
         data = self.mirror.data
@@ -173,6 +180,7 @@ class MirroredArticulation(MirroredEntity):
         self.act: Floats = np.zeros(n_ctrl)
         self.force: Floats | None = None
         self.sensors: dict[str, list[float]] = {}
+        self.user = {}
         self.bodies: dict[str, BodyPose] | None = None
         self.twist: TwistState | None = None
         self.actions = 0
@@ -195,7 +203,7 @@ class MirroredArticulation(MirroredEntity):
         self.free_joint = self.qpos_offset = self.qvel_offset = None
         if model is not None and self.has_free_base:
             name = next(name for name, i in layout.joints.items() if i == layout.free_joint)
-            self.free_joint = f"{self.name}_{name}"
+            self.free_joint = f"{self.info.compiled_prefix}_{name}"
             self.qpos_offset = int(model.jnt_qposadr[layout.free_joint])
             self.qvel_offset = int(model.jnt_dofadr[layout.free_joint])
 
@@ -256,6 +264,8 @@ class MirroredArticulation(MirroredEntity):
             self.act = state.act.copy()
         if state.sensors is not None:
             self.sensors = state.sensors
+        if state.user is not None:
+            self.user = state.user
         if state.twist is not None:
             self.twist = state.twist
         if state.actions is not None:
@@ -283,6 +293,20 @@ class MirroredArticulation(MirroredEntity):
             data.ctrl[self.layout.ctrl_adr] = self.ctrl
             self._written_ctrl = self.ctrl.copy()
 
+    def drive(self) -> None:
+        """Note that this client wants to control the articulation, from the next step on."""
+        self._driven = True
+
+    def leave(self) -> None:
+        """Note that it does not want to any more, until it writes again."""
+        self._driven = False
+        self._left_ctrl = self.ctrl.copy()
+
+    @property
+    def driven(self) -> bool:
+        """Whether this client wants to control the articulation: it said so, or wrote a set-point all the same."""
+        return self._driven or not np.array_equal(self.ctrl, self._left_ctrl)
+
     def live_command(self) -> ArticulationCommand:
         """Return what a live step tells the articulation: the server ignores anything but `ctrl`."""
         return ArticulationCommand(ctrl=self.ctrl.tolist())
@@ -293,8 +317,14 @@ class MirroredArticulation(MirroredEntity):
         return ArticulationCommand(
             ctrl=self.ctrl.tolist(),
             control_mode=str(ControlMode.RAW) if bypass else None,
-            xfrc_applied=wrenches,
+            xfrc_applied=self._compiled(wrenches or {}) or None,
         )
+
+    def _compiled(self, wrenches: Wrenches) -> Wrenches:
+        """Return wrenches by names that the server finds: where robots have public names, only compiled ones."""
+        if self.info.actor_name is None:
+            return wrenches
+        return {f"{self.info.compiled_prefix}_{body}": wrench for body, wrench in wrenches.items()}
 
     def body_pose(self, name: str, body_id: int) -> tuple[Floats, Floats] | None:
         """World position and orientation (w, x, y, z): as received at level `full`, else from the mirror, or None."""

@@ -97,6 +97,7 @@ class Actuator:
 
     def set_control(self, v: float | Sequence[float]) -> None:
         """Set the set-point that the next step sends; a sequence for actuators with several inputs."""
+        self._record.drive()
         self._record.ctrl[self.ctrl_local] = v
 
     def __repr__(self) -> str:
@@ -224,7 +225,7 @@ class ArticulationElements:
 def make_elements(record: MirroredArticulation) -> ArticulationElements:
     """Make the handles of an articulation; without a local model only its actuators are known, by name and type."""
     model, layout, original = record.mirror.model, record.layout, record.info.original_names
-    prefix = record.name
+    prefix = record.info.compiled_prefix
     return ArticulationElements(
         joints=_named(prefix, "joint", _joints(record, model), original.joints),
         actuators=_named(prefix, "actuator", _actuators(record, model), original.actuators),

@@ -8,6 +8,7 @@ from typing import Literal, TypeVar, overload
 from msgspec import Struct
 
 from urlab_client.aio.deadline import Timeout
+from urlab_client.aio.jobs import OnProgress
 from urlab_client.aio.session import Session
 from urlab_client.protocol.base import Quat, Reply, Request, Vec3
 
@@ -26,8 +27,8 @@ class Namespace:
     def __init__(self, session: Session) -> None:
         self._session = session
 
-    async def _call(self, request: Request[R], timeout: Timeout) -> R:
-        return await self._session.call(request, timeout=timeout)
+    async def _call(self, request: Request[R], timeout: Timeout, on_progress: OnProgress | None = None) -> R:
+        return await self._session.call(request, timeout=timeout, on_progress=on_progress)
 
 
 def fill(kind: type[S], reply: Reply) -> S:

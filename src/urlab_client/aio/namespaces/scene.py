@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.namespaces._base import Vector, as_quat, as_vec3, target_by
@@ -22,6 +22,7 @@ from urlab_client.protocol.messages.scene import (
 )
 from urlab_client.protocol.rotation import IDENTITY, euler_to_quat
 from urlab_client.protocol.types import (
+    JobStatus,
     SceneActor,
     SceneSnapshot,
     URLabAsset,
@@ -37,19 +38,26 @@ class SceneNamespace(SceneOps):
     """Editor-time authoring. Edits during play show after the next start of play."""
 
     async def import_xml(
-        self, xml_path: str, *, force_reimport: bool = False, timeout: Timeout = DEFAULT
+        self,
+        xml_path: str,
+        *,
+        force_reimport: bool = False,
+        on_progress: Callable[[JobStatus], object] | None = None,
+        timeout: Timeout = DEFAULT,
     ) -> URLabBlueprint:
         """Turn an MJCF file on the server's machine into a blueprint for `spawn_actor`.
 
         Args:
             xml_path: Absolute path of the MJCF file.
             force_reimport: Replace an existing blueprint of the same file stem.
+            on_progress: Told again and again how far the import is, by servers that say so.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
             ImportFailed: The file is missing or was rejected, or the old blueprint could not be removed.
         """
-        reply = await self._call(ImportXml(path=str(xml_path), force_reimport=force_reimport), timeout)
+        request = ImportXml(path=str(xml_path), force_reimport=force_reimport)
+        reply = await self._call(request, timeout, on_progress)
         return URLabBlueprint(
             class_path=reply.blueprint_class_path,
             short_name=reply.blueprint_short_name,
@@ -231,6 +239,7 @@ class SceneNamespace(SceneOps):
         rotation_quat: Vector | None = None,
         rotation_euler: Vector | None = None,
         scale: Vector = (1.0, 1.0, 1.0),
+        on_progress: Callable[[JobStatus], object] | None = None,
         timeout: Timeout = DEFAULT,
     ) -> dict[str, URLabSpawnHandle]:
         """Place a grid of actors in one request and return their handles by actor id.
@@ -247,6 +256,7 @@ class SceneNamespace(SceneOps):
             rotation_quat: Unit quaternion (x, y, z, w), MuJoCo's world frame; wins over `rotation_euler`.
             rotation_euler: (roll, pitch, yaw) in degrees: Rz(yaw) Ry(-pitch) Rx(-roll) in MuJoCo's frame.
             scale: Scale factors.
+            on_progress: Told again and again how far it is, by servers that say so.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
@@ -268,7 +278,7 @@ class SceneNamespace(SceneOps):
             rotation_euler=euler,
             scale=as_vec3("scale", scale),
         )
-        reply = await self._call(request, timeout)
+        reply = await self._call(request, timeout, on_progress)
         return {
             cell.actor_id: URLabSpawnHandle(
                 actor_id=cell.actor_id,

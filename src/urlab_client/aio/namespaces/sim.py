@@ -8,6 +8,7 @@ from collections.abc import Callable
 import msgspec
 
 from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.namespaces._base import Namespace
 from urlab_client.aio.session import Session, Turn
 from urlab_client.aio.state.recovery import leaves_open
@@ -76,7 +77,7 @@ class SimNamespace(Namespace):
         self, turn: Turn, level_path: str | None, timeout_s: float, on_progress: Callable[[PIEStatus], object] | None
     ) -> BeginPieOk:
         """Begin play and wait until its model is compiled, or has failed to, or time is up."""
-        loop = asyncio.get_running_loop()
+        loop = running_loop()
         deadline = loop.time() + timeout_s
         # In slices: while the server waits for the compile it answers nobody, this client included.
         reply = await self._begin(turn, level_path, min(timeout_s, _SLICE_S))
@@ -113,7 +114,7 @@ class SimNamespace(Namespace):
             GameThreadTimeout: The editor did not react; often a modal dialog is open.
             URLabTimeoutError: The editor agreed, but play has not ended after ten seconds.
         """
-        loop = asyncio.get_running_loop()
+        loop = running_loop()
         async with self._session.turn(StopPie, timeout=timeout, each=True) as turn:
             self._state.stopping = True
             # On Windows, what we have mapped the server could neither remove nor make anew.

@@ -12,7 +12,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import anyio.to_thread
 import numpy as np
@@ -27,8 +27,9 @@ from urlab_client.aio.session import Session, Turn
 from urlab_client.aio.state.handshake import Examined, examine
 from urlab_client.aio.state.recovery import PendingOutcomes, leaves_open
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.enums import CameraMode, CameraTiming, StepMode
+from urlab_client.protocol.enums import LATER_MODE_NAMES, CameraMode, CameraTiming, StepMode
 from urlab_client.protocol.errors import (
+    BadMode,
     ModeLocked,
     NoActiveManager,
     NoSession,
@@ -40,6 +41,7 @@ from urlab_client.protocol.errors import (
 from urlab_client.protocol.messages.runtime import SetMode, SetPaused
 from urlab_client.protocol.messages.session import (
     NOT_SENT,
+    ArticulationCommand,
     ArticulationState,
     CameraFrame,
     CameraInfo,
@@ -144,10 +146,13 @@ class SimState:
         self.sim_time_sec = self.sim_time_nsec = 0
         self.wall_time_sec = self.wall_time_nsec = 0
         self.recv_wall_time_ns = 0
+        self.user: dict[str, Any] = {}
         self._local_model = local_model
         self._check_version = check_version
+        self._mismatch_said = False
         session.on_opened = self._note_session
         session.on_refusal = self._note_refusal
+        session.control.resolve = self._articulation_key
         self._promote = promote
         self._trusted = trusted
         self._live_pictures = live_pictures
@@ -207,9 +212,42 @@ class SimState:
         """Simulation time of the local data, or without them of the last reply, seconds."""
         return self.sim_time if self.mirror.data is None else self.mirror.data.time
 
+    def _articulation_key(self, name: str) -> str | None:
+        articulation = self.articulations.get(name)
+        return None if articulation is None else articulation.prefix
+
+    def direct_commands(self, carried: Carried) -> dict[str, ArticulationCommand]:
+        """Return what a step tells the articulations and entities, with the wrenches that it carries."""
+        commands = {record.name: record.direct_command(carried.get(record)) for record in self._ours()}
+        for name, record in self._entity_records.items():
+            if record not in carried:
+                continue
+            if not self.session.features.claims:
+                # Under its own name: the server tries the body's name alone after `<key>_<body>`.
+                commands[name] = record.wrench_command(carried[record])
+            else:
+                # An entity has no owner, so one of the robots takes it along.
+                key = next(iter(commands or self._records))
+                carrier = commands.setdefault(key, ArticulationCommand())
+                carrier.xfrc_applied = {**(carrier.xfrc_applied or {}), **carried[record]}
+        return commands
+
+    def live_commands(self, carried: Carried) -> dict[str, ArticulationCommand]:
+        """Return what a step in live mode tells the articulations."""
+        if self.session.features.live_pictures_in_steps:
+            return self.direct_commands(carried)
+        return {record.name: record.live_command() for record in self._ours()}
+
+    def _ours(self) -> list[MirroredArticulation]:
+        # A server whose robots have owners refuses a step that writes to others' robots, so it hears of ours only.
+        claims = self.session.features.claims
+        return [record for record in self._records.values() if record.driven or not claims]
+
     def take_wrenches(self) -> Carried:
         """Take what the step that is being built carries out of its buffers."""
-        records: list[MirroredEntity] = [*self._records.values(), *self._entity_records.values()]
+        records: list[MirroredEntity] = [*self._ours()]
+        if self._records or not self.session.features.claims:
+            records.extend(self._entity_records.values())
         return {record: record.take_wrenches() for record in records if record.wrenches}
 
     def require_handshake(self, op: str) -> None:
@@ -231,19 +269,35 @@ class SimState:
         """Open a session and take over what the server says."""
         hello = await self.session.hello(turn, Hello(observations=observations))
         self.level = self.sent_level = observations
-        if self._local_model and hello.mjb is not None:
-            mismatch = self.mirror.check_version(hello)
-            if mismatch is not None:
-                if self._check_version:
-                    raise mismatch
+        await self.adopt(turn, hello)
+        return hello
+
+    async def _loadable(self, turn: Turn, hello: HelloOk) -> HelloOk:
+        """Return a handshake whose model this process can and may load.
+
+        Raises:
+            URLabVersionMismatch: It is another MuJoCo's, and the user wants to hear of that.
+            URLabError: The server is not trusted with binary models and offers no other.
+        """
+        mismatch = self.mirror.check_version(hello)
+        if mismatch is not None:
+            if self._check_version:
+                raise mismatch
+            if not self._mismatch_said:
+                self._mismatch_said = True
                 warnings.warn(
                     f"{mismatch.args[0]} The local model is compiled here from XML and only approximates the server's.",
                     stacklevel=2,
                 )
-                request = Hello(observations=observations, include_assets=True)
-                hello = await self.session.hello(turn, request)
-                self.sent_level = observations
-        await self.adopt(turn, hello)
+            if hello.mjcf_compiled is None:
+                hello = await self._hello_with_assets(turn)
+        if hello.mjb is not None and not self._trusted:
+            hello = await self._without_binary(turn, hello)
+        return hello
+
+    async def _hello_with_assets(self, turn: Turn) -> HelloOk:
+        hello = await self.session.hello(turn, Hello(observations=self.level, include_assets=True))
+        self.sent_level = self.level
         return hello
 
     def _note_session(self, hello: HelloOk) -> None:
@@ -265,8 +319,7 @@ class SimState:
         """
         if hello.mjcf_compiled is None:
             log.info("the server is not trusted with binary models: the local model is compiled here from XML")
-            hello = await self.session.hello(turn, Hello(observations=self.level, include_assets=True))
-            self.sent_level = self.level
+            hello = await self._hello_with_assets(turn)
         if hello.manager_present and hello.mjcf_compiled is None:
             raise URLabError(
                 "The server offers its model only in MuJoCo's binary format, which is loaded from servers on this "
@@ -284,8 +337,8 @@ class SimState:
         await self.session.transport.follow(hello)
         loaded = None
         if self._local_model:
-            if hello.mjb is not None and not self._trusted:
-                hello = await self._without_binary(turn, hello)
+            if hello.mjb is not None:
+                hello = await self._loadable(turn, hello)
             load = partial(self.mirror.load, hello, trusted=self._trusted)
             loaded = await turn.aside(anyio.to_thread.run_sync(load, abandon_on_cancel=True))
         examined = examine(hello, None if loaded is None else loaded.model)
@@ -347,7 +400,11 @@ class SimState:
         """
         try:
             with self.pending.about_mode(mode):
-                reply = await turn.call(SetMode(mode=mode))
+                try:
+                    reply = await turn.call(SetMode(mode=mode))
+                except BadMode:
+                    # Servers after the beta call the modes by other names.
+                    reply = await turn.call(SetMode(mode=LATER_MODE_NAMES.get(mode, mode)))
         except ModeLocked as locked:
             if locked.pinned is not None:
                 self.mode = locked.pinned
@@ -357,8 +414,19 @@ class SimState:
                 # Play starts paused, and no change of mode can resume it where the mode is pinned.
                 await turn.call(SetPaused(paused=False))
             return mode
-        self.mode = reply.current_mode
+        try:
+            if self.session.features.idles_in_puppet:
+                await self._still_puppet(turn, reply.previous_mode, reply.current_mode)
+        finally:
+            self.mode = reply.current_mode
         return reply.previous_mode
+
+    async def _still_puppet(self, turn: Turn, previous: StepMode, current: StepMode) -> None:
+        """Keep physics from taking steps of its own between the pushes of puppet mode, and undo that afterwards."""
+        if current is StepMode.PUPPET:
+            await turn.call(SetPaused(paused=True))
+        elif previous is StepMode.PUPPET and current is StepMode.LIVE:  # direct mode takes the pause back itself
+            await turn.call(SetPaused(paused=False))
 
     def _global_camera(self, name: str, info: CameraInfo) -> URLabCameraView:
         view = self.global_cameras.get(name)
@@ -383,8 +451,8 @@ class SimState:
             else:
                 record.bind(info, layout)
             wrappers[key] = self.articulations.get(key) or URLabArticulation(record, self.session, self.publishers)
-            found = _ENGINE_NAME.fullmatch(key)
-            for alias in {info.actor_id, found["stem"] if found else ""} - {""}:
+            found = _ENGINE_NAME.fullmatch(info.compiled_prefix)
+            for alias in {info.actor_id, info.compiled_prefix, found["stem"] if found else ""} - {"", key}:
                 aliases.setdefault(alias, []).append(key)
         self._records = {key: self._records[key] for key in wrappers}
         self.articulations = NameMap(wrappers, aliases, kind="articulation")
@@ -504,6 +572,8 @@ class SimState:
     def _absorb_clocks(self, reply: StateReply | StateSnapshot, received: int) -> None:
         self.step_count = reply.step
         self.sim_time = reply.time
+        if isinstance(reply, StateSnapshot):
+            self.user = reply.user
         self.recv_wall_time_ns = received
         if reply.sim_time is not None:
             self.sim_time_sec, self.sim_time_nsec = reply.sim_time.sec, reply.sim_time.nsec
@@ -511,14 +581,15 @@ class SimState:
             self.wall_time_sec, self.wall_time_nsec = reply.wall_time.sec, reply.wall_time.nsec
 
     def mirror_qpos(self, key: str, qpos: Floats) -> None:
-        """Take over the leading joint positions of an articulation that `set_qpos` wrote.
+        """Take over the leading joint positions of an articulation that `set_qpos` wrote, by any of its names.
 
         Raises:
             ProtocolError: They are neither all of its positions nor those of its free base.
         """
-        record = self._records.get(key)
-        if record is None:
+        articulation = self.articulations.get(key)
+        if articulation is None:
             return
+        record = self._records[articulation.prefix]
         record.check_written(qpos)
         with self.mirror.lock:
             record.qpos = np.concatenate([qpos, record.qpos[len(qpos) :]])
@@ -552,6 +623,7 @@ class SimState:
         if self.hello is not None:
             self.hello.manager_present = False
         self.publishers.release_regions()
+        self.session.control.forget()
         self.mode = StepMode.LIVE
         self.promoted_from = None
         if played:

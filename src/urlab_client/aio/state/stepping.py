@@ -80,23 +80,22 @@ async def _exchange(state: SimState, turn: Turn, request: Step, level: str) -> S
 
 
 async def _live_step(state: SimState, turn: Turn) -> StepOk:
-    state.take_wrenches()  # they are for the next step, and inert in this mode
-    commands = {key: record.live_command() for key, record in state.records.items()}
-    reply = await turn.call(Step(per_articulation=commands or None))
-    state.absorb(reply, "step")
+    carried = state.take_wrenches()  # of no effect on servers that do not take them in this mode
+    try:
+        reply = await turn.call(Step(per_articulation=state.live_commands(carried) or None))
+        state.absorb(reply, "step")
+    except BaseException as error:
+        if not (turn.sent and leaves_open(error)):
+            give_back(carried)
+        raise
     return reply
 
 
 def _direct_step(state: SimState, n_steps: int) -> tuple[Step, Carried]:
     carried = state.take_wrenches()
-    commands = {key: record.direct_command(carried.get(record)) for key, record in state.records.items()}
-    for name, record in state.entity_records.items():
-        if record in carried:
-            # Under its own name: the server tries the body's name alone after `<key>_<body>`.
-            commands[name] = record.wrench_command(carried[record])
     # A server in puppet mode, which it may be as long as the mode is only assumed, sets its clock to what a step says.
     time = state.local_time if state.mode_assumed else None
-    return Step(n_steps=n_steps, per_articulation=commands or None, time=time), carried
+    return Step(n_steps=n_steps, per_articulation=state.direct_commands(carried) or None, time=time), carried
 
 
 def _puppet_step(state: SimState, n_steps: int) -> tuple[Step, Carried]:

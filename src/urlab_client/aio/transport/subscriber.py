@@ -22,6 +22,7 @@ from msgspec import Struct
 from zmq.utils.monitor import recv_monitor_message
 
 from urlab_client._uninterrupted import uninterrupted
+from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.transport import connection_status
 from urlab_client.aio.transport.curve import SERVER_KEY_HINT, ClientKeys
 from urlab_client.aio.transport.readiness import Readiness, watch_socket
@@ -308,12 +309,7 @@ class Subscriptions:
         """
         if self.closed:
             raise client_closed()
-        loop = asyncio.get_running_loop()
-        if self._loop not in (None, loop):
-            raise URLabError(
-                "This client belongs to another event loop.", hint="Make one client per loop, or use the façade."
-            )
-        self._loop = loop
+        self._loop = running_loop(self._loop)
         subscription = wanted()
         self._connect(handler, subscription)
         self._attached[handler] = subscription, wanted

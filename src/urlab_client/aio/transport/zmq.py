@@ -18,6 +18,7 @@ from typing import Any, cast
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
+from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.transport import connection_status
 from urlab_client.aio.transport import context as shared_context
 from urlab_client.aio.transport.base import LateReply, TransportStats
@@ -203,12 +204,8 @@ class ZmqTransport:
     def _open(self) -> tuple[asyncio.AbstractEventLoop, zmq.Socket[bytes], Readiness]:
         if self._closed:
             raise ClientClosed(f"The client of {self._endpoint} is closed.", hint="Make a new client.")
-        loop = asyncio.get_running_loop()
+        loop = running_loop(self._loop)
         if self._socket is not None and self._replies is not None:
-            if loop is not self._loop:
-                raise URLabError(
-                    "This client belongs to another event loop.", hint="Make one client per loop, or use the façade."
-                )
             return loop, self._socket, self._replies
         context = shared_context.borrow()
         socket = context.socket(zmq.DEALER)

@@ -4,12 +4,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.namespaces import scene as aio
 from urlab_client.aio.namespaces._base import Vector
 from urlab_client.protocol.types import (
+    JobStatus,
     SceneSnapshot,
     URLabAsset,
     URLabBlueprint,
@@ -27,18 +28,28 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
     __slots__ = ()
     _aio: aio.SceneNamespace  # pyright: ignore[reportIncompatibleVariableOverride]  # never assigned after construction
 
-    def import_xml(self, xml_path: str, *, force_reimport: bool = False, timeout: Timeout = DEFAULT) -> URLabBlueprint:
+    def import_xml(
+        self,
+        xml_path: str,
+        *,
+        force_reimport: bool = False,
+        on_progress: Callable[[JobStatus], object] | None = None,
+        timeout: Timeout = DEFAULT,
+    ) -> URLabBlueprint:
         """Turn an MJCF file on the server's machine into a blueprint for `spawn_actor`.
 
         Args:
             xml_path: Absolute path of the MJCF file.
             force_reimport: Replace an existing blueprint of the same file stem.
+            on_progress: Told again and again how far the import is, by servers that say so.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
             ImportFailed: The file is missing or was rejected, or the old blueprint could not be removed.
         """
-        return self._portal.call(self._aio.import_xml, xml_path, force_reimport=force_reimport, timeout=timeout)
+        return self._portal.call(
+            self._aio.import_xml, xml_path, force_reimport=force_reimport, on_progress=on_progress, timeout=timeout
+        )
 
     def spawn_actor(
         self,
@@ -172,6 +183,7 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
         rotation_quat: Vector | None = None,
         rotation_euler: Vector | None = None,
         scale: Vector = (1.0, 1.0, 1.0),
+        on_progress: Callable[[JobStatus], object] | None = None,
         timeout: Timeout = DEFAULT,
     ) -> dict[str, URLabSpawnHandle]:
         """Place a grid of actors in one request and return their handles by actor id.
@@ -188,6 +200,7 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
             rotation_quat: Unit quaternion (x, y, z, w), MuJoCo's world frame; wins over `rotation_euler`.
             rotation_euler: (roll, pitch, yaw) in degrees: Rz(yaw) Ry(-pitch) Rx(-roll) in MuJoCo's frame.
             scale: Scale factors.
+            on_progress: Told again and again how far it is, by servers that say so.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
@@ -206,6 +219,7 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
             rotation_quat=rotation_quat,
             rotation_euler=rotation_euler,
             scale=scale,
+            on_progress=on_progress,
             timeout=timeout,
         )
 

@@ -1,0 +1,276 @@
+"""Who may write to a robot: claims, on servers where each robot has one owner.
+
+For the session, which sends every request that writes to a robot through `Control.send`. A server without claims never
+hears of any.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+import os
+import secrets
+import socket
+from collections.abc import Awaitable, Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Final, Protocol, TypeVar, cast
+
+from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.protocol.base import ControlRequest, Reply, Request
+from urlab_client.protocol.errors import ControlClaimed, NotControlOwner, URLabError
+from urlab_client.protocol.features import Features
+from urlab_client.protocol.messages.control import UNCLAIMED, ClaimControl, ClaimControlOk, ReleaseControl
+from urlab_client.protocol.messages.runtime import SetControlSource, SetQpos, SetTwist
+from urlab_client.protocol.messages.session import Step
+
+__all__ = ["CLAIM_S", "Control", "process_owner"]
+
+log = logging.getLogger("urlab_client.control")
+
+R = TypeVar("R", bound=Reply)
+
+CLAIM_S: Final = 30.0
+"""Seconds without a write after which a claim ends by itself, unless the user says otherwise."""
+
+_RELEASE_S: Final = 1.0
+_RENEWALS: Final = 3  # in the time of one claim
+
+
+L_contra = TypeVar("L_contra", contravariant=True)
+L = TypeVar("L")
+
+
+class Asks(Protocol[L_contra]):
+    """Sends one request within the turn of its caller and returns the reply."""
+
+    def __call__(self, request: Request[R], limits: L_contra, /) -> Awaitable[R]:
+        """See the class."""
+        ...
+
+
+class ControlledSession(Protocol):
+    """What `Control` needs of a session."""
+
+    session_id: str
+    features: Features
+
+    async def call(self, request: Request[R], *, timeout: Timeout = DEFAULT) -> R:
+        """Send a request in its own turn."""
+        ...
+
+    async def probe(self, request: Request[R], *, timeout: float) -> R | None:
+        """Send a request if nothing else is under way."""
+        ...
+
+
+@cache
+def _owner_of(process: int) -> str:
+    return f"{socket.gethostname()}/{process}/{secrets.token_hex(4)}"
+
+
+def process_owner() -> str:
+    """Return the name under which this process owns robots: the same for all its clients, and across reconnects."""
+    return _owner_of(os.getpid())
+
+
+@dataclass(slots=True)
+class _Claim:
+    ttl: float
+    until: float  # loop time
+
+
+class Control:
+    """The robots that one client owns.
+
+    Args:
+        session: What claims are sent over.
+        wanted: Whether to claim a robot with the first write to it; False leaves that to `claim`.
+
+    Attributes:
+        resolve: Returns the key of an articulation that a request names in any way; None for an unknown name.
+        owner: Name in which this client claims.
+    """
+
+    def __init__(self, session: ControlledSession, *, wanted: bool = True) -> None:
+        self.resolve: Callable[[str], str | None] = lambda name: name
+        self.owner = process_owner()
+        self._session = session
+        self._wanted = wanted
+        self._held: dict[str, _Claim] = {}
+        self._others: dict[str, str] = {}
+        # Owners that are ourselves: a server that does not read `control_owner` calls us by the session of the time.
+        self._names = {self.owner}
+        self._renewal: asyncio.Task[None] | None = None
+
+    def owner_of(self, key: str) -> str | None:
+        """Return who owns a robot as far as is known here, None for nobody or for not knowing."""
+        if key in self._held:
+            return self.owner
+        return self._others.get(key)
+
+    async def send(self, request: ControlRequest[R], ask: Asks[L], limits: L) -> R:
+        """Send a request that writes to robots, claiming them before it where that is needed.
+
+        Args:
+            request: The request.
+            ask: Sends one request within the caller's turn.
+            limits: The caller's, for `ask`.
+
+        Raises:
+            NotControlOwner: Another client owns one of the robots; nothing was written.
+        """
+        if not self._session.features.claims:
+            return await ask(request, limits)
+        request.control_owner = self.owner
+        if isinstance(request, ClaimControl):
+            return cast("R", await self._claim(request, ask, limits))
+        robots = self._robots(request)
+        if self._wanted and robots:
+            now = asyncio.get_running_loop().time()
+            for key in robots:
+                claim = self._held.get(key)
+                if claim is None or claim.until < now:
+                    await self._claim(self._asked(key), ask, limits)
+        try:
+            reply = await ask(request, limits)
+        except NotControlOwner as refusal:
+            if refusal.owner not in {UNCLAIMED, *self._names} or not self._wanted or not robots:
+                raise self._refused(robots, refusal) from None
+            # The claim ran out, play was started anew, or it was made in a session that is gone. Nothing was written,
+            # so once more is not twice.
+            for key in robots:
+                await self._claim(self._asked(key), ask, limits)
+            try:
+                reply = await ask(request, limits)
+            except NotControlOwner as again:
+                raise self._refused(robots, again) from None
+        self._note_write(robots)
+        return reply
+
+    async def claim(self, key: str, *, force: bool, ttl: float, timeout: Timeout) -> None:
+        """Own a robot from now on.
+
+        Raises:
+            ControlClaimed: Another client owns it.
+            ValueError: `ttl` is no length of time.
+        """
+        if not 0 <= ttl < math.inf:
+            raise ValueError(f"ttl is a number of seconds of at least 0, got {ttl}")
+        if self._session.features.claims:
+            await self._session.call(ClaimControl(articulation=key, ttl_s=ttl, force=force), timeout=timeout)
+
+    async def release(self, key: str, *, timeout: Timeout) -> None:
+        """Give a robot up, if it is owned."""
+        if self._held.pop(key, None) is None or not self._session.features.claims:
+            return
+        try:
+            await self._session.call(ReleaseControl(articulation=key), timeout=timeout)
+        except NotControlOwner as refusal:
+            self._learn([key], refusal)  # somebody took it, or it ran out: it is not ours, as was wanted
+
+    async def aclose(self, *, connected: bool) -> None:
+        """Give up whatever is owned, as far as the server listens. Idempotent."""
+        renewal, self._renewal = self._renewal, None
+        if renewal is not None:
+            renewal.cancel()
+            await asyncio.wait((renewal,))
+        held, self._held = list(self._held), {}
+        for key in held if connected else ():
+            try:
+                await self._session.call(ReleaseControl(articulation=key, control_owner=self.owner), timeout=_RELEASE_S)
+            except URLabError as error:  # a courtesy: the server may have moved on
+                log.debug("%s could not be released: %s", key, error)
+                break
+
+    def forget(self) -> None:
+        """Note that play ended, and every claim with it."""
+        self._held.clear()
+        self._others.clear()
+
+    def _robots(self, request: ControlRequest[Reply]) -> list[str]:
+        """Return the keys of the robots that a request writes to."""
+        match request:
+            case Step(per_articulation=commands):
+                return [
+                    key
+                    for key, command in (commands or {}).items()
+                    if not (command.ctrl is None and command.ctrl_map is None and command.xfrc_applied is None)
+                ]
+            case SetTwist(articulation=name) | SetQpos(target=name):
+                return self._known([name])
+            case SetControlSource(articulation=str(name)):
+                return self._known([name])
+            case _:
+                return []
+
+    def _known(self, names: Iterable[str]) -> list[str]:
+        return [key for name in names if (key := self.resolve(name)) is not None]
+
+    def _asked(self, key: str) -> ClaimControl:
+        claim = self._held.pop(key, None)
+        ttl = CLAIM_S if claim is None else claim.ttl
+        return ClaimControl(articulation=key, ttl_s=ttl, control_owner=self.owner)
+
+    async def _claim(self, request: ClaimControl, ask: Asks[L], limits: L) -> ClaimControlOk:
+        key = self.resolve(request.articulation) or request.articulation
+        try:
+            reply = await ask(request, limits)
+        except ControlClaimed as refusal:
+            if request.force or refusal.owner not in self._names:
+                raise self._refused([key], refusal) from None
+            # Our own, from a session that is gone: nobody else is robbed.
+            request.force = True
+            reply = await ask(request, limits)
+        self._note_claim(key, request.ttl_s, reply)
+        return reply
+
+    def _note_claim(self, key: str, ttl: float, reply: ClaimControlOk) -> None:
+        session = self._session
+        session.features = session.features.with_claim(self.owner, reply)
+        if reply.owner == session.session_id:
+            self._names.add(reply.owner)
+        now = asyncio.get_running_loop().time()
+        self._held[key] = _Claim(ttl, now + ttl if ttl > 0 else math.inf)
+        self._others.pop(key, None)
+        if ttl > 0 and (self._renewal is None or self._renewal.done()):
+            self._renewal = asyncio.create_task(self._renew(), name="urlab-claims")
+
+    def _note_write(self, robots: Iterable[str]) -> None:
+        now = asyncio.get_running_loop().time()
+        for key in robots:
+            claim = self._held.get(key)
+            if claim is not None and claim.ttl > 0:
+                claim.until = now + claim.ttl
+
+    def _refused(self, robots: Sequence[str], refusal: NotControlOwner) -> NotControlOwner:
+        self._learn(robots, refusal)
+        if refusal.owner == UNCLAIMED:
+            refusal.hint = "Call articulation.claim() first, or make the client with claim_control=True."
+        return refusal
+
+    def _learn(self, robots: Sequence[str], refusal: NotControlOwner) -> None:
+        """Note that these robots are not all ours; of several, the server does not say which one is not."""
+        for key in robots:
+            self._held.pop(key, None)
+        if len(robots) == 1 and refusal.owner not in {"", UNCLAIMED}:
+            self._others[robots[0]] = refusal.owner
+
+    async def _renew(self) -> None:
+        """Claim again what is owned and has not been written to for a while, as long as anything is."""
+        loop = asyncio.get_running_loop()
+        while timed := {key: claim for key, claim in self._held.items() if claim.ttl > 0}:
+            await asyncio.sleep(min(claim.ttl for claim in timed.values()) / _RENEWALS)
+            for key, claim in timed.items():
+                if self._held.get(key) is claim and claim.until - loop.time() < claim.ttl * (1 - 1 / _RENEWALS):
+                    await self._renew_one(key, claim)
+
+    async def _renew_one(self, key: str, claim: _Claim) -> None:
+        request = ClaimControl(articulation=key, ttl_s=claim.ttl)
+        try:
+            await self._session.probe(request, timeout=claim.ttl / _RENEWALS)
+        except NotControlOwner as refusal:
+            log.warning("%s is controlled by %s now", key, refusal.owner)
+        except URLabError as error:
+            log.debug("the claim of %s could not be renewed: %s", key, error)

@@ -1,0 +1,43 @@
+"""The event loop that asynchronous objects live on: asyncio's, and the same one for all their life."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from typing import Any
+
+from urlab_client.protocol.errors import URLabError
+
+__all__ = ["running_loop"]
+
+
+def running_loop(
+    bound: asyncio.AbstractEventLoop | None = None, owner: str = "This client"
+) -> asyncio.AbstractEventLoop:
+    """Return the event loop that runs here.
+
+    Args:
+        bound: The one that the caller has been used on before; None before its first use.
+        owner: What to call the caller.
+
+    Raises:
+        URLabError: None of asyncio's runs here, or it is another one.
+    """
+    loop = asyncio._get_running_loop()  # noqa: SLF001  # unlike get_running_loop, never raises
+    if loop is None:
+        here = "this code runs on trio" if _on_trio() else "no event loop runs here"
+        raise URLabError(
+            f"The async client runs on asyncio's event loop, but {here}.",
+            hint="Run it with asyncio.run() or anyio's asyncio backend. Elsewhere use the blocking client: under trio, "
+            "with trio.to_thread.run_sync().",
+        )
+    if bound is not None and bound is not loop:
+        raise URLabError(
+            f"{owner} belongs to another event loop.", hint="Make one per loop, or use the blocking client."
+        )
+    return loop
+
+
+def _on_trio() -> bool:
+    trio: Any = sys.modules.get("trio")
+    return trio is not None and trio.lowlevel.in_trio_run()

@@ -1,0 +1,585 @@
+"""The client against a server of the beta that is written from the description of its wire alone."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from hello import hello_ok
+from scripted import ScriptedServer, meta_ok
+from scripted_beta import BETA_OPS, ROBOT, ScriptedBeta, error
+from waiting import DEADLINE_S
+
+from urlab_client import (
+    ControlClaimed,
+    DestroyFailed,
+    NotControlOwner,
+    OutcomeUnknown,
+    ProtocolError,
+    StepMode,
+    UnknownArticulation,
+    URLabRPCError,
+    URLabTimeoutError,
+    URLabVersionMismatch,
+)
+from urlab_client.aio import URLabClient
+from urlab_client.aio.control import process_owner
+from urlab_client.protocol.types import JobStatus
+from urlab_client.server import SimulatedServer
+
+OURS = process_owner()
+
+
+@pytest.fixture
+def beta() -> Iterator[ScriptedBeta]:
+    server = ScriptedBeta()
+    yield server
+    server.close()
+
+
+def client_of(server: ScriptedServer, **options: Any) -> URLabClient:
+    return URLabClient("tcp://127.0.0.1", step_port=server.port, live_pictures=False, **options)
+
+
+@pytest.fixture
+async def client(beta: ScriptedBeta) -> AsyncIterator[URLabClient]:
+    async with client_of(beta, step_mode="direct") as made:
+        await made.discover()
+        beta.arrived()
+        yield made
+
+
+def names(requests: list[dict[str, Any]]) -> list[str]:
+    return [request["op"] for request in requests]
+
+
+# One program on both generations.
+
+
+@pytest.mark.parametrize("mode", ["live", "direct", "puppet"])
+@pytest.mark.parametrize("generation", ["alpha", "beta"])
+async def test_the_same_program_runs(generation: str, mode: str, tmp_path: Path) -> None:
+    """Beta statement 67."""
+    arm = tmp_path / "arm.xml"
+    arm.write_text(ROBOT)
+    server: Any = ScriptedBeta() if generation == "beta" else SimulatedServer(arm, play=True).start()
+    try:
+        options = {"step_port": server.port} if generation == "beta" else server.client_options()
+        async with URLabClient(**options, step_mode=mode, live_pictures=False) as client:
+            await client.discover()
+            robot = next(iter(client.articulations.values()))
+            actuator = next(iter(robot.actuators.values()))
+            actuator.set_control(0.25)
+            before = client.sim_time
+            await client.step()
+            assert client.step_mode is StepMode(mode)
+            assert robot.qpos_array.shape == (len(robot.joints),)
+            assert client.sim_time > before or mode == "live"
+            await client.reset()
+            assert client.server.generation == generation
+    finally:
+        server.close()
+
+
+async def test_what_the_server_is(client: URLabClient, beta: ScriptedBeta) -> None:
+    assert client.server.generation == "beta"
+    assert client.server.features.claims
+    assert client.server.instance is not None
+    assert client.server.instance.step_port == beta.port
+    assert client.server.features.renders_sync
+
+
+async def test_state_and_user_channels_arrive(client: URLabClient) -> None:
+    """Beta statement 73."""
+    reply = await client.step(5)
+    assert (reply.frame_id, client.sim_time, client.step_count) == (1, 0.01, 5)
+    robot = client.articulations["arm_a"]
+    assert (robot.qpos_array.tolist(), robot.user) == ([0.01], {"mode": "idle"})
+    assert client.entities["crate"].root_pos_w.tolist() == [0.0, 2.0, 0.0]
+    rejected = await client.runtime.set_user_channels({"arm a": {"nope": 1}}, scene={"door": True})
+    assert rejected == {"arm_a/nope": "undeclared_or_kind_mismatch"}
+
+
+async def test_a_robot_is_found_by_all_of_its_names(client: URLabClient, beta: ScriptedBeta) -> None:
+    """Beta statement 74."""
+    robot = client.articulations["arm_a"]
+    assert client.articulations["arm a"] is robot
+    assert client.articulations["arm_C_0"] is robot
+    assert client.articulations_by_id == {"arm a": robot}
+    assert (robot.prefix, robot.compiled_prefix, list(robot.joints)) == ("arm_a", "arm_C_0", ["j"])
+    assert robot.joints["arm_C_0_j"].name == "j"
+    await client.reset("arm_C_0_up")
+    await client.runtime.set_qpos("arm a", [0.5])
+    assert robot.qpos_array.tolist() == [0.5]
+    robot.apply_xfrc("hand", force=(0, 0, 9.81))
+    client.entities["crate"].apply_xfrc(force=(1, 0, 0))
+    await client.step()
+    arrived = beta.arrived()
+    assert next(r for r in arrived if r["op"] == "reset")["keyframe_name"] == "arm_C_0_up"
+    step = next(r for r in arrived if r["op"] == "step")
+    assert step["per_articulation"]["arm_a"]["xfrc_applied"] == {
+        "arm_C_0_hand": [0.0, 0.0, 9.81, 0.0, 0.0, 0.0],
+        "crate": [1.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+    }
+
+
+@pytest.mark.parametrize("instance", [None, {}, {"instance_id": "x", "capabilities": ["fly"], "colour": {"r": 1}}])
+async def test_an_instance_may_say_little_or_strange_things(beta: ScriptedBeta, instance: Any) -> None:
+    """Beta statement 77."""
+
+    def hello(request: dict[str, Any]) -> dict[str, Any]:
+        reply = {**ScriptedBeta.hello(beta, request), "favourite": {"colour": 1}}
+        del reply["instance"]
+        return reply if instance is None else {**reply, "instance": instance}
+
+    beta.on("hello", hello)
+    async with client_of(beta, step_mode="direct") as client:
+        await client.discover()
+        await client.step()
+
+
+async def test_robots_listed_as_entities(beta: ScriptedBeta) -> None:
+    """Beta statement 78."""
+
+    def hello(request: dict[str, Any]) -> dict[str, Any]:
+        reply = ScriptedBeta.hello(beta, request)
+        robots = [{**robot, "id": 1.0} for robot in reply.pop("articulations")]
+        for robot in robots:
+            del robot["default_control_mode"]
+        return {**reply, "entities": [*robots, {"id": 9.0, "has_free_base": True}]}
+
+    def set_mode(request: dict[str, Any]) -> dict[str, Any]:
+        if request["mode"] not in {"freerun", "stepped", "statepushed"}:
+            return error("bad_mode", request["mode"])
+        beta.mode = "direct"
+        return {"op": "set_mode_ok", "previous_mode": "freerun", "current_mode": request["mode"]}
+
+    beta.on("hello", hello)
+    beta.on("set_mode", set_mode)
+    async with client_of(beta, step_mode="direct") as client:
+        await client.discover()
+        assert client.step_mode is StepMode.DIRECT
+        assert list(client.articulations) == ["arm_a", "arm_C_1"]
+        client.articulations["arm_a"].set_ctrl({"m": 0.5})
+        await client.step()
+        assert beta.ctrl["arm_C_0"] == [0.5]
+
+
+async def test_further_fields_of_an_error_are_kept(client: URLabClient, beta: ScriptedBeta) -> None:
+    """Beta statement 79."""
+    beta.on("reset", error("brand_new", "because", owner="x", mood={"bad": True}))
+    with pytest.raises(URLabRPCError) as caught:
+        await client.reset()
+    assert caught.value.details == {"owner": "x", "mood": {"bad": True}}
+
+
+async def test_removing_an_actor_goes_by_the_servers_name(client: URLabClient, beta: ScriptedBeta) -> None:
+    """Generation 2 statement 52."""
+    await client.scene.destroy_actor("arm a")
+    assert names(beta.arrived())[0] == "remove_actor"
+
+
+# Claims.
+
+
+async def test_the_first_write_claims_once(client: URLabClient, beta: ScriptedBeta) -> None:
+    """Beta statement 69."""
+    robot = client.articulations["arm_a"]
+    await client.step()
+    assert "claim_control" not in names(beta.arrived())
+    assert robot.control_owner is None
+    robot.set_ctrl({"m": 0.5})
+    await client.step()
+    await client.step()
+    await client.runtime.set_twist("arm_a", linear=(0.1, 0, 0))
+    arrived = beta.arrived()
+    assert names(arrived) == ["claim_control", "step", "step", "set_twist"]
+    claim = arrived[0]
+    assert (claim["articulation"], claim["control_owner"], claim["ttl_s"]) == ("arm_a", OURS, 30.0)
+    assert all(request["control_owner"] == OURS for request in arrived)
+    assert arrived[1]["per_articulation"] == {"arm_a": {"ctrl": [0.5]}}
+    assert (beta.owners, robot.control_owner) == ({"arm_C_0": OURS}, OURS)
+
+
+async def test_writing_into_a_view_held_since_long_is_a_write(client: URLabClient, beta: ScriptedBeta) -> None:
+    robot = client.articulations["arm_a"]
+    view = robot.ctrl_array
+    await robot.claim()
+    await robot.release()
+    assert beta.owners == {}
+    await client.step()
+    assert beta.owners == {}
+    view[0] = 0.75
+    await client.step()
+    assert (beta.owners, beta.ctrl["arm_C_0"]) == ({"arm_C_0": OURS}, [0.75])
+
+
+@pytest.mark.parametrize("mode", ["live", "direct"])
+async def test_a_claim_that_ran_out_is_made_once_more(client: URLabClient, beta: ScriptedBeta, mode: str) -> None:
+    """Beta statement 70."""
+    await client.runtime.set_mode(mode)
+    client.articulations["arm_a"].set_ctrl({"m": 0.5})
+    await client.step()
+    beta.owners.clear()
+    beta.arrived()
+    await client.step()
+    assert names(beta.arrived()) == ["step", "claim_control", "step"]
+
+
+async def test_a_server_that_never_grants_what_it_claims_to_is_asked_twice(
+    client: URLabClient, beta: ScriptedBeta
+) -> None:
+    """Beta statement 70."""
+    beta.on("step", error("not_control_owner", "no", owner="(unclaimed)"))
+    client.articulations["arm_a"].set_ctrl({"m": 0.5})
+    with pytest.raises(NotControlOwner, match=r"claim\(\)") as caught:
+        await client.step()
+    assert caught.value.owner == "(unclaimed)"
+    assert names(beta.arrived()) == ["claim_control", "step", "claim_control", "step"]
+
+
+async def test_a_robot_of_somebody_else_is_not_fought_for(client: URLabClient, beta: ScriptedBeta) -> None:
+    """Beta statement 70."""
+    robot = client.articulations["arm_a"]
+    robot.set_ctrl({"m": 0.5})
+    await client.step()
+    beta.owners["arm_C_0"] = "dashboard"
+    beta.arrived()
+    with pytest.raises(NotControlOwner, match="force=True") as caught:
+        await client.step()
+    assert (caught.value.owner, robot.control_owner) == ("dashboard", "dashboard")
+    assert names(beta.arrived()) == ["step"]
+    with pytest.raises(ControlClaimed) as claimed:
+        await client.step()
+    assert claimed.value.owner == "dashboard"
+    assert names(beta.arrived()) == ["claim_control"]
+    await robot.release()
+    await client.step()  # it is only looked at, which needs no owner
+    assert beta.ctrl["arm_C_0"] == [0.5]
+    await robot.claim(force=True)
+    await client.step()
+    assert beta.owners["arm_C_0"] == OURS
+
+
+async def test_a_robot_that_is_somebody_elses_does_not_keep_from_driving_ours(
+    client: URLabClient, beta: ScriptedBeta
+) -> None:
+    beta.owners["arm_C_1"] = "dashboard"
+    client.articulations["arm_a"].set_ctrl({"m": 0.5})
+    await client.step()
+    assert beta.ctrl["arm_C_0"] == [0.5]
+
+
+@pytest.mark.parametrize("reads_owner", [True, False])
+async def test_control_survives_a_new_session(reads_owner: bool) -> None:
+    """Beta statement 71."""
+    beta = ScriptedBeta(reads_owner=reads_owner)
+    try:
+        async with client_of(beta, step_mode="direct") as client:
+            await client.discover()
+            client.articulations["arm_a"].set_ctrl({"m": 0.5})
+            await client.step()
+            await client.discover()
+            beta.owners["arm_C_1"] = "dashboard"
+            beta.arrived()
+            await client.step()
+            claims = beta.of("claim_control")
+            # The old session may still have it, and that was us.
+            assert [claim.get("force", False) for claim in claims] == ([] if reads_owner else [False, True])
+            client.articulations["arm_C_1"].set_ctrl({"m": 0.5})
+            with pytest.raises(ControlClaimed):
+                await client.step()
+            assert beta.owners["arm_C_1"] == "dashboard"
+    finally:
+        beta.close()
+
+
+async def test_closing_gives_up_what_is_owned(beta: ScriptedBeta) -> None:
+    """Beta statement 72."""
+    async with client_of(beta, step_mode="direct") as client:
+        await client.discover()
+        client.articulations["arm_a"].set_ctrl({"m": 0.5})
+        await client.articulations["arm_C_1"].claim(ttl=0)
+        await client.step()
+        assert set(beta.owners) == {"arm_C_0", "arm_C_1"}
+    assert beta.owners == {}
+
+
+async def test_an_idle_claim_is_renewed(client: URLabClient, beta: ScriptedBeta) -> None:
+    await client.articulations["arm_a"].claim(ttl=0.15)
+    beta.arrived()
+    again = await asyncio.to_thread(beta.seen.get, timeout=DEADLINE_S)
+    assert (again["op"], again["articulation"], again["ttl_s"]) == ("claim_control", "arm_a", 0.15)
+    assert not again.get("force")
+
+
+async def test_an_observer_claims_nothing_by_itself(beta: ScriptedBeta) -> None:
+    async with client_of(beta, step_mode="direct", claim_control=False) as client:
+        await client.discover()
+        robot = client.articulations["arm_a"]
+        await client.step()
+        robot.set_ctrl({"m": 0.5})
+        with pytest.raises(NotControlOwner, match="claim_control=True"):
+            await client.step()
+        assert beta.of("claim_control") == []
+        await robot.claim()
+        await client.step()
+        assert beta.ctrl["arm_C_0"] == [0.5]
+
+
+async def test_a_claim_of_a_robot_that_is_gone(client: URLabClient, beta: ScriptedBeta) -> None:
+    beta.on("claim_control", error("unknown_articulation", "arm_a"))
+    robot = client.articulations["arm_a"]
+    with pytest.raises(UnknownArticulation):
+        await robot.claim()
+    with pytest.raises(ValueError, match="ttl"):
+        await robot.claim(ttl=float("nan"))
+    await client.step()
+
+
+async def test_a_new_play_session_is_claimed_anew(client: URLabClient, beta: ScriptedBeta) -> None:
+    robot = client.articulations["arm_a"]
+    robot.set_ctrl({"m": 0.5})
+    await client.step()
+    await client.sim.stop()
+    assert robot.control_owner is None
+    await client.sim.start()
+    beta.arrived()
+    await client.step()
+    assert names(beta.arrived()) == ["claim_control", "step"]
+
+
+async def test_a_refusal_where_nothing_can_be_claimed() -> None:
+    """Beta statement 83."""
+    beta = ScriptedBeta(without=("claim_control", "release_control"))
+    try:
+        async with client_of(beta, step_mode="direct") as client:
+            await client.discover()
+            assert not client.server.features.claims
+            client.articulations["arm_a"].set_ctrl({"m": 0.5})
+            with pytest.raises(NotControlOwner):
+                await client.step()
+            assert len(beta.of("step")) == 1
+    finally:
+        beta.close()
+
+
+async def test_an_alpha_never_hears_of_claims(scripted: ScriptedServer) -> None:
+    """Beta statement 68."""
+    robot = ScriptedBeta.robot(scripted, "arm_C_0", "arm a", "arm_C_0")  # type: ignore[arg-type]  # needs a port
+    del robot["actor_name"]
+    scripted.on("hello", hello_ok(articulations=[robot]))
+    state = {"time": 0.1, "step": 1.0, "per_articulation": {"arm_C_0": {"qpos": [], "qvel": []}}}
+    scripted.on("step", {"op": "step_ok", **state})
+    scripted.on("set_mode", {"op": "set_mode_ok", "previous_mode": "live", "current_mode": "direct"})
+    async with client_of(scripted, step_mode="direct", local_model=False) as client:
+        await client.discover()
+        robot_of_ours = client.articulations["arm_C_0"]
+        robot_of_ours.set_ctrl({"m": 0.5})
+        await robot_of_ours.claim(force=True)
+        await client.step()
+        await robot_of_ours.release()
+        assert robot_of_ours.control_owner is None
+    seen = []
+    while not scripted.seen.empty():
+        seen.append(scripted.seen.get())
+    assert {"claim_control", "release_control"}.isdisjoint(names(seen))
+    assert all("control_owner" not in request for request in seen)
+
+
+# Puppet mode, and the pause that keeps its physics still.
+
+
+async def test_puppet_mode_is_paused_and_left_running(client: URLabClient, beta: ScriptedBeta) -> None:
+    """Beta statement 90."""
+    await client.runtime.set_mode("puppet")
+    assert beta.paused
+    await client.step(3)
+    assert beta.time == pytest.approx(0.006)
+    await client.runtime.set_mode("live")
+    assert not beta.paused
+
+
+async def test_puppet_mode_is_taken_back_on_close(beta: ScriptedBeta) -> None:
+    async with client_of(beta, step_mode="puppet") as client:
+        await client.discover()
+        assert (beta.mode, beta.paused) == ("puppet", True)
+    assert (beta.mode, beta.paused) == ("live", False)
+
+
+# Another MuJoCo.
+
+
+async def test_another_mujoco_is_refused_with_both_ways_out() -> None:
+    beta = ScriptedBeta(skew=True)
+    try:
+        async with client_of(beta) as client:
+            with pytest.raises(URLabVersionMismatch, match="mujoco_version_check=False") as caught:
+                await client.discover()
+            assert caught.value.server_version == "3.11.1"
+            beta.playing = False
+            await client.discover()
+            with pytest.raises(URLabVersionMismatch, match=r"mujoco==3\.11\.1"):
+                await client.sim.start()
+    finally:
+        beta.close()
+
+
+@pytest.mark.parametrize("mode", ["live", "direct", "puppet"])
+async def test_another_mujoco_is_worked_with(mode: str) -> None:
+    """Beta statements 80 and 84."""
+    beta = ScriptedBeta(skew=True)
+    try:
+        async with client_of(beta, step_mode=mode, mujoco_version_check=False) as client:
+            with pytest.warns(UserWarning, match=r"MuJoCo 3\.11\.1"):
+                await client.discover()
+            await client.sim.stop()
+            await client.sim.start()  # says nothing more: warnings are errors here
+            assert client.model_is_approximate
+            assert client.model is not None
+            assert client.model.nq == 9
+            client.articulations["arm_a"].set_ctrl({"m": 0.5})
+            await client.step(2)
+            assert client.entities["crate"].root_pos_w[:2].tolist() == [0.0, 2.0]
+    finally:
+        beta.close()
+
+
+async def test_a_version_string_decides_nothing(client: URLabClient, beta: ScriptedBeta) -> None:
+    """Beta statement 80."""
+    await client.sim.start()
+    assert client.urlab_version == "urlab/0.1"
+    assert client.server.features.claims
+
+
+# Jobs.
+
+
+def done(server: ScriptedServer, op: str, result: dict[str, Any], *, running: int = 0) -> None:
+    """Let an op be a job that ends with a result after some polls."""
+    states = [{"op": "op_status_ok", "job_id": "job_7", "state": "running"} for _ in range(running)]
+    state = "failed" if result["op"] == "error" else "done"
+    states.append({"op": "op_status_ok", "job_id": "job_7", "state": state, "result": result})
+    server.on(op, {"op": "op_started", "job_id": "job_7", "state": "running"})
+    server.on("op_status", lambda _: states.pop(0) if states else error("unknown_job", "job_7 is not known"))
+
+
+IMPORTED = {
+    "op": "import_xml_ok",
+    "blueprint_class_path": "/Game/MuJoCoImports/arm.arm_C",
+    "blueprint_short_name": "arm",
+    "imported_now": True,
+}
+
+
+@pytest.mark.parametrize("running", [None, 0, 3])
+@pytest.mark.parametrize("encoding", ["msgpack", "json"])
+async def test_a_job_returns_what_a_direct_answer_would(
+    scripted: ScriptedServer, running: int | None, encoding: str
+) -> None:
+    """Generation 2 statement 45."""
+    scripted.on("meta", meta_ok("beta"))
+    if running is None:
+        scripted.on("import_xml", IMPORTED)
+    else:
+        done(scripted, "import_xml", IMPORTED, running=running)
+    if encoding == "json":
+        for op, answer in list(scripted.answers.items()):
+            scripted.on(op, lambda request, answer=answer: msgspec.json.encode(answer(request)))
+    async with client_of(scripted, local_model=False, encoding=encoding) as client:
+        await client.discover()
+        told: list[JobStatus] = []
+        blueprint = await client.scene.import_xml("/robots/arm.xml", on_progress=told.append)
+        assert (blueprint.short_name, blueprint.imported_now) == ("arm", True)
+    assert [status.state for status in told] == ([] if running is None else ["running"] * running + ["done"])
+
+
+async def test_a_failed_job_raises_what_a_direct_refusal_would(client: URLabClient) -> None:
+    """Generation 2 statement 46."""
+    with pytest.raises(DestroyFailed) as caught:
+        await client.scene.destroy_actor("nobody")
+    assert (caught.value.op, caught.value.message) == ("remove_actor", "no such actor")
+
+
+async def test_a_job_whose_end_was_told_to_nobody(client: URLabClient, beta: ScriptedBeta) -> None:
+    """Generation 2 statement 47."""
+    beta.on("op_status", error("unknown_job", "job_1 is not known"))
+    with pytest.raises(OutcomeUnknown, match="job_1") as caught:
+        await client.scene.import_xml("/robots/arm.xml")
+    assert caught.value.job_id == "job_1"
+    assert names(beta.arrived()).count("import_xml") == 1
+
+
+async def test_a_job_that_takes_too_long(client: URLabClient, beta: ScriptedBeta) -> None:
+    """Generation 2 statement 48."""
+    beta.running = 10**9
+    with pytest.raises(URLabTimeoutError, match="goes on") as caught:
+        await client.scene.import_xml("/robots/arm.xml", timeout=0.1)
+    assert caught.value.job_id == "job_1"
+    assert await client.scene.current_level() == "/Game/Levels/lab"
+
+
+async def test_a_job_that_is_not_waited_for_any_more(client: URLabClient, beta: ScriptedBeta) -> None:
+    """Generation 2 statement 49."""
+    beta.running = 10**9
+    call = asyncio.create_task(client.scene.import_xml("/robots/arm.xml"))
+    while (await asyncio.to_thread(beta.seen.get, timeout=DEADLINE_S))["op"] != "op_status":
+        pass
+    call.cancel()
+    with pytest.raises(asyncio.CancelledError) as caught:
+        await call
+    assert "job_1" in caught.value.__notes__[0]
+    await client.step()
+    beta.arrived()
+    assert await client.scene.current_level() == "/Game/Levels/lab"
+    assert names(beta.arrived()) == ["current_level"]
+
+
+async def test_a_state_nobody_knows_counts_as_running(scripted: ScriptedServer) -> None:
+    """Generation 2 statements 50 and 60."""
+    # An odd mixture: jobs, and an `op_status` that the server does not list.
+    done(scripted, "import_xml", IMPORTED)
+    answers = [{"op": "op_status_ok", "job_id": "job_7", "state": "queued", "mood": 1}]
+    last = scripted.answers["op_status"]
+    scripted.on("op_status", lambda request: answers.pop() if answers else last(request))
+    async with client_of(scripted, local_model=False) as client:
+        await client.discover()
+        assert (await client.scene.import_xml("/robots/arm.xml")).short_name == "arm"
+
+
+async def test_steps_go_on_while_the_editor_works(client: URLabClient, beta: ScriptedBeta) -> None:
+    beta.running = 3
+    call = asyncio.create_task(client.scene.import_xml("/robots/arm.xml"))
+    while (await asyncio.to_thread(beta.seen.get, timeout=DEADLINE_S))["op"] != "op_status":
+        pass
+    await client.step()
+    level = asyncio.create_task(client.scene.current_level())
+    assert (await call).short_name == "arm"
+    assert await level == "/Game/Levels/lab"
+    arrived = names(beta.arrived())
+    assert arrived.index("step") < arrived.index("current_level")
+    assert arrived.index("current_level") > max(i for i, op in enumerate(arrived) if op == "op_status")
+
+
+async def test_a_server_that_starts_everything(beta: ScriptedBeta) -> None:
+    """Generation 2 statement 51."""
+    async with client_of(beta, step_mode="direct") as client:
+        await client.discover()
+        for op in BETA_OPS:
+            beta.on(op, {"op": "op_started", "job_id": "job_9", "state": "running"})
+        for call in (client.step, client.reset, client.runtime.forward, client.scene.save_level):
+            with pytest.raises(ProtocolError):
+                await call()
+
+
+async def test_unknown_fields_do_no_harm(client: URLabClient, beta: ScriptedBeta) -> None:
+    """Generation 2 statement 59."""
+    for op in ("step", "op_status"):
+        answer = beta.answers[op]
+        beta.on(op, lambda request, answer=answer: {**answer(request), "favourite": {"colour": 1}})
+    await client.step()
+    await client.scene.import_xml("/robots/arm.xml")
