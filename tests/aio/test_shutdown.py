@@ -58,7 +58,7 @@ def test_the_blocking_client_ends_without_a_word(end: str) -> None:
     threads = "assert not [t.name for t in threading.enumerate() if t.name == 'urlab-io'], threading.enumerate()"
     check = threads if "clos" in ENDS[end] else ""
     script = SERVED + ENDS[end] + "\n" + check
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=100, check=False)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=240, check=False)
     assert (done.returncode, done.stderr) == (0, "")
 
 

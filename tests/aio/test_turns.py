@@ -100,6 +100,10 @@ async def test_a_wrench_is_kept_when_its_step_was_not_sent_or_refused(client: UR
     arm.apply_xfrc(tip(client), force=(0, 0, 5))
     with pytest.raises(KeyError):
         await client.step(include_cameras={"nowhere": "latest"})
+    arm.ctrl_array[0] = np.nan
+    with pytest.raises(ValueError, match="nan"):
+        await client.step()
+    arm.ctrl_array[0] = 0.0
     holding = await sent(client, "list_actors", client.outliner.list_actors(), faults)
     await cancelled(asyncio.create_task(client.step()))
     await cancelled(holding)

@@ -15,7 +15,7 @@ from typing import Any
 
 import gymnasium
 
-DEADLINE_S = 100.0
+DEADLINE_S = 240.0
 FREE_PORTS = [f"--{name}-port=0" for name in ("step", "state", "ctrl", "info", "camera")]
 GYMNASIUM_MODELS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 

@@ -17,7 +17,7 @@ async def test_nobody_there(connect: Any) -> None:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    client = connect(address="tcp://127.0.0.1", step_port=port)
+    client = connect(address="tcp://127.0.0.1", step_port=port, rcv_timeout_ms=500)
     diagnosis = await client.explain()
     assert not diagnosis.healthy
     assert f"127.0.0.1:{port}" in problems(diagnosis)

@@ -16,7 +16,7 @@ from pathlib import Path
 from pages import ROOT, Block
 from ports import free_port
 
-DEADLINE_S = 100
+DEADLINE_S = 240
 
 NOT_RUN = {
     r"(python3 -m venv|uv run|\S*pip install|trial/bin/)": "sets an environment up from an index: .ci/run begins "

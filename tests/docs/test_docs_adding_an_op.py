@@ -27,7 +27,7 @@ def run(tree: Path, arguments: Sequence[str]) -> subprocess.CompletedProcess[str
         [sys.executable, *arguments],
         capture_output=True,
         text=True,
-        timeout=100,
+        timeout=240,
         check=False,
         cwd=tree,
         env={**os.environ, "PYTHONPATH": str(tree / "src"), "PYTHONDONTWRITEBYTECODE": "1"},

@@ -27,7 +27,7 @@ def test_example_runs(example: Path, tmp_path: Path) -> None:
         env={"RAY_AUTH_TOKEN": secrets.token_hex(32), **os.environ, "MPLBACKEND": "agg"},
         capture_output=True,
         text=True,
-        timeout=90,
+        timeout=240,
         check=False,
     )
     assert done.returncode == 0, done.stderr

@@ -181,6 +181,16 @@ def test_a_base_is_seen_as_mujoco_measures_it(quadruped: URLabClient) -> None:
         np.testing.assert_allclose(row, expected, atol=1e-12)
 
 
+def test_torques_are_those_of_the_pd_law_within_their_limit(quadruped: URLabClient) -> None:
+    mapping = policy_of(WALK).bind(quadruped.articulations["quadruped"])
+    model = quadruped.model
+    assert model is not None
+    state = RobotState(np.zeros((3, model.nq)), np.full((3, model.nv), 0.1))
+    torques = mapping.torques(np.array([[0.2, -0.2], [9.0, 9.0], [-9.0, -9.0]]), state)
+    at_rest = [60 * 0.2 - 1.5 * 0.1, 60 * -0.2 - 2.5 * 0.1]
+    assert torques == pytest.approx(np.array([at_rest, [30.0, 30.0], [-30.0, -30.0]]))
+
+
 def test_scales_clips_history_command_and_last_action_make_the_input(quadruped: URLabClient) -> None:
     text = WALK[: WALK.index("[[observation]]")] + (
         'history = 2\n[[observation]]\nterm = "command"\nscale = [2.0, 1.0, 1.0]\noffset = 0.1\nclip = [-0.5, 0.5]\n'

@@ -119,6 +119,7 @@ def script() -> ModuleType:
     return module
 
 
+@pytest.mark.long
 def test_eight_rounds_of_training_already_move_the_robot(script: ModuleType, tmp_path: Path) -> None:
     options = ["--iterations=8", "--pairs=12", "--commands=1", "--rate=0.05", "--seed=1", "--threads=1"]
     assert script.main([*options, "--seconds=1.2", "--evaluate=1.2", "-o", str(tmp_path)]) == 0

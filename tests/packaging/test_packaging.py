@@ -26,7 +26,7 @@ def run(command: Sequence[str | Path], cwd: Path) -> subprocess.CompletedProcess
         command,
         capture_output=True,
         text=True,
-        timeout=100,
+        timeout=240,
         check=False,
         cwd=cwd,
         env={**environment, "PYTHONUTF8": "1"},

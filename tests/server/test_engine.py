@@ -221,7 +221,6 @@ class PacedSim:
     costs=st.tuples(st.floats(0.0, 0.001), st.floats(0.0, 0.0015)) | st.tuples(st.just(0.0156), st.floats(0.0, 0.0003)),
     speed=st.sampled_from([5.0, 30.0, 50.0, 100.0]),
 )
-@settings(max_examples=25)
 def test_live_keeps_the_wanted_speed_whatever_sleep_and_step_take(costs: tuple[float, float], speed: float) -> None:
     overshoot, step_cost = costs
     with pytest.MonkeyPatch.context() as patch:
@@ -232,7 +231,6 @@ def test_live_keeps_the_wanted_speed_whatever_sleep_and_step_take(costs: tuple[f
 
 
 @given(st.floats(0.03, 5.0))
-@settings(max_examples=25)
 def test_live_does_not_catch_up_after_a_stall(stall: float) -> None:
     with pytest.MonkeyPatch.context() as patch:
         sim = PacedSim(patch, FakeClock())

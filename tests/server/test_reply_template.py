@@ -77,7 +77,7 @@ def test_every_level_is_the_reply_as_it_is_encoded(
         assert frame == encoded(engine, level, wall_time)
 
 
-@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(
     level=st.sampled_from(ObservationLevel),
     state=arrays(np.float64, 8, elements=st.floats(allow_subnormal=True)),

@@ -411,7 +411,7 @@ positions = st.tuples(numbers, numbers, numbers)
     st.lists(st.tuples(identifiers, positions, st.tuples(*[st.floats(-360, 360)] * 3)), max_size=5),
     st.lists(st.tuples(st.sampled_from(["directional", "POINT", "Spot"]), st.text(max_size=8), positions), max_size=3),
 )
-@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 def test_any_level_comes_back_as_it_was(
     workspace: Workspace, robots: list[tuple[str, Any, Any]], lights: list[tuple[str, str, Any]]
 ) -> None:

@@ -10,7 +10,7 @@ from typing import TypeVar
 
 T = TypeVar("T")
 
-DEADLINE_S = 30.0
+DEADLINE_S = 60.0
 """Only there so that nothing hangs: a busy machine may need long for what an idle one does at once."""
 
 LOOK_S = 0.002

@@ -14,7 +14,14 @@ from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.jobs import OnProgress, finish
 from urlab_client.aio.transport.base import RequestTransport
 from urlab_client.protocol.base import ControlRequest, Needs, Op, Reply, Request
-from urlab_client.protocol.codec import check_request, decode_answer, decode_reply, encode_request, op_of
+from urlab_client.protocol.codec import (
+    check_finite,
+    check_request,
+    decode_answer,
+    decode_reply,
+    encode_request,
+    op_of,
+)
 from urlab_client.protocol.errors import (
     ConnectionLost,
     NoSession,
@@ -262,8 +269,10 @@ class Session:
         began = loop.time()
         stamped = self.session_id
         frame = encode_request(request, stamped, json=self._json)
-        if not op.hot and not self._json:
-            check_request(request, frame)
+        if not op.hot:
+            check_finite(request)
+            if not self._json:
+                check_request(request, frame)
         sent = self._transport.stats.sent
         try:
             try:

@@ -350,6 +350,7 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
             OutcomeUnknown: The connection broke: the steps may or may not have been taken. `resync()` finds out.
             ValueError: Fewer steps than the mode allows; nothing was sent.
             KeyError: Unknown camera; nothing was sent.
+            ValueError: A set-point is NaN or infinite, or in puppet mode something in `data`; nothing was sent.
             NoSession: `discover()` was not called, or was broken off; nothing was sent.
         """
         return self._portal.call(
@@ -378,6 +379,8 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
         Raises:
             UnknownKeyframe: No keyframe, or more than one, has this name; nothing was reset.
             KeyError: Unknown articulation or joint; nothing was sent.
+            TypeError: A position is not a number; nothing was sent.
+            ValueError: A position is NaN or infinite; nothing was sent.
         """
         return self._portal.call(self._aio.reset, keyframe_name, seed, per_articulation_qpos, timeout=timeout)
 

@@ -93,9 +93,14 @@ async def _live_step(state: SimState, turn: Turn) -> StepOk:
 
 def _direct_step(state: SimState, n_steps: int) -> tuple[Step, Carried]:
     carried = state.take_wrenches()
+    try:
+        commands = state.direct_commands(carried)
+    except ValueError:
+        give_back(carried)
+        raise
     # A server in puppet mode, which it may be as long as the mode is only assumed, sets its clock to what a step says.
     time = state.local_time if state.mode_assumed else None
-    return Step(n_steps=n_steps, per_articulation=state.direct_commands(carried) or None, time=time), carried
+    return Step(n_steps=n_steps, per_articulation=commands or None, time=time), carried
 
 
 def _puppet_step(state: SimState, n_steps: int) -> tuple[Step, Carried]:
@@ -112,6 +117,7 @@ def _puppet_step(state: SimState, n_steps: int) -> tuple[Step, Carried]:
     with mirror.lock:
         for record in state.records.values():
             record.write_set_points()
+        mirror.check_finite()
         if n_steps > 0:
             import mujoco  # noqa: PLC0415
 

@@ -13,7 +13,7 @@ import re
 import types
 from collections.abc import Callable, Iterable, Mapping
 from enum import Enum
-from functools import cache
+from functools import cache, cached_property
 from typing import Annotated, Any, Final, TypeAlias, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import msgspec
@@ -29,6 +29,9 @@ from urlab_client.server.refusal import Refusal
 __all__ = ["Incoming", "RequestReader", "need", "usable"]
 
 _DEFAULT_LIMITS: Final = Limits()
+
+_BINARY_SUFFIX: Final = "__b64__"
+"""Ends the key of what is binary, in JSON."""
 
 INT32_MIN: Final = -(2**31)
 INT32_MAX: Final = 2**31 - 1
@@ -115,7 +118,6 @@ class RequestReader:
                 Union[tuple(strict)],  # noqa: UP007 - a union of a run-time list
                 dec_hook=_strict_array,
             )
-        self._collides = {kind: _collision_test(_type_info(kind)) for kind in self._exact}
 
     def read(self, frame: bytes) -> Incoming:
         """Read one frame.
@@ -128,7 +130,7 @@ class RequestReader:
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
             return self._read_loosely(frame)
         kind = type(request)
-        collides = self._collides[kind]
+        collides = _collision_test_of(kind)
         if len(frame) > self._limits.request_bytes or (collides is not None and collides(request)):
             return self._read_loosely(frame)
         op = self._exact[kind]
@@ -190,13 +192,20 @@ def _session_id(fields: Mapping[str, Plain]) -> str:
 class _LooseOp:
     """What the field-by-field way needs to know of an op."""
 
-    __slots__ = ("convert", "declared", "exact", "op")
-
     def __init__(self, op: Op, struct: type[Request[Any]]) -> None:
         self.op = op
         self.exact = op.name in ("hello", "meta")
-        self.declared = op.declared_required
-        self.convert = _struct_converter(struct)
+        self._struct = struct
+
+    # Found out when first needed: a server that reads few kinds of requests starts the sooner.
+
+    @cached_property
+    def declared(self) -> tuple[str, ...]:
+        return self.op.declared_required
+
+    @cached_property
+    def convert(self) -> Callable[[dict[str, Plain]], Any]:
+        return _struct_converter(self._struct)
 
 
 # Bytes to plain data.
@@ -404,6 +413,11 @@ def _collision_test(info: inspect.Type) -> Callable[[Any], bool] | None:
             return None
 
 
+@cache
+def _collision_test_of(kind: type) -> Callable[[Any], bool] | None:
+    return _collision_test(_type_info(kind))
+
+
 def _map_collision_test(test: Callable[[Any], bool] | None) -> Callable[[Any], bool]:
     def collides(value: Any) -> bool:
         if not isinstance(value, dict):
@@ -513,12 +527,23 @@ def _converter(info: inspect.Type) -> Converter:
     return convert
 
 
+def _binary(value: Plain) -> Any:
+    """Return bytes; text, in which JSON carries them, is base64."""
+    if isinstance(value, str):
+        try:
+            return base64.b64decode(value, validate=True)
+        except ValueError:
+            return _ABSENT
+    return value if isinstance(value, bytes) else _ABSENT
+
+
 def _same(value: Plain) -> Plain:
     return value
 
 
 _SIMPLE: Final[Mapping[type[inspect.Type], Converter]] = {
     inspect.StrType: _text,
+    inspect.BytesType: _binary,
     inspect.BoolType: _flag,
     inspect.IntType: _whole,
     inspect.FloatType: _number,
@@ -616,15 +641,18 @@ def _nested_converter(struct: type[Struct]) -> Converter:
 @cache
 def _struct_converter(struct: type[Struct]) -> Callable[[dict[str, Plain]], Any]:
     """Return a function that fills a `struct` from a map with lower-case keys."""
-    plan: list[tuple[str, str, Converter, Callable[[], Any]]] = []
+    plan: list[tuple[str, str, str, Converter, Callable[[], Any]]] = []
     for field in msgspec.structs.fields(struct):
         info = inspect.type_info(field.type)
-        plan.append((field.name, field.encode_name.lower(), _converter(info), _default(field)))
+        key = field.encode_name.lower()
+        binary = isinstance(info.type if isinstance(info, inspect.Metadata) else info, inspect.BytesType)
+        plan.append((field.name, key, key + _BINARY_SUFFIX if binary else key, _converter(info), _default(field)))
 
     def convert(fields: dict[str, Plain]) -> Any:
         values: dict[str, Any] = {}
-        for name, key, of_field, default in plan:
-            value = of_field(fields[key]) if key in fields else _ABSENT
+        for name, key, other, of_field, default in plan:
+            sent = key if key in fields else other
+            value = of_field(fields[sent]) if sent in fields else _ABSENT
             values[name] = default() if value is _ABSENT else value
         return struct(**values)
 
