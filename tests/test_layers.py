@@ -103,6 +103,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "system",
         "limits",
         "refusal",
+        "lease",
         "assets",
         "compile",
         "editor",

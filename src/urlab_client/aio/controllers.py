@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
@@ -66,13 +67,13 @@ class URLabController:
         return await self._push({}, timeout)
 
     async def _push(self, params: dict[str, Any], timeout: Timeout) -> dict[str, Any]:
-        request = ConfigureController(articulation=self._prefix, params=params)
-        reply = await self._session.call(request, timeout=timeout)
-        _check_gains(self._prefix, self._info.kind, reply.params, "configure_controller")
-        # In place, so that views handed out before stay current.
-        self._info.params.clear()
-        self._info.params.update(reply.params)
-        return dict(self._info.params)
+        async with self._session.turn(ConfigureController, timeout=timeout) as turn:
+            reply = await turn.call(ConfigureController(articulation=self._prefix, params=params))
+            _check_gains(self._prefix, self._info.kind, reply.params, "configure_controller")
+            # In place, so that views handed out before stay current.
+            self._info.params.clear()
+            self._info.params.update(reply.params)
+            return dict(self._info.params)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.kind} of {self._prefix!r}>"
@@ -220,6 +221,8 @@ def _check_number(prefix: str, what: str, value: Any, rule: Mapping[str, Any]) -
     low = rule.get("min")
     if low is not None and not value >= low:
         raise _violation(prefix, f"{what} must be at least {low:g}, got {value!r}")
+    if math.isnan(value):
+        raise _violation(prefix, f"{what} takes a number, got {value!r}")
 
 
 def _violation(prefix: str, problem: str) -> ControllerSchemaViolation:

@@ -336,7 +336,7 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
         are handed over and the present state is read; physics runs by itself.
 
         Args:
-            n_steps: Physics steps.
+            n_steps: Physics steps, at least 1; at least 0 in `puppet`. Not used in `live`.
             include_cameras: True for the newest frame of every camera, or camera name to `sync` (rendered after the
                 step) or `latest`. Ignored in live mode.
             observations: Level of this reply alone; default the level of the session.
@@ -348,7 +348,10 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
         Raises:
             StepTimeout: The server did not finish within its 5 s; the steps are still queued there.
             OutcomeUnknown: The connection broke: the steps may or may not have been taken. `resync()` finds out.
+            ValueError: Fewer steps than the mode allows; nothing was sent.
             KeyError: Unknown camera; nothing was sent.
+            ValueError: A set-point is NaN or infinite, or in puppet mode something in `data`; nothing was sent.
+            NoSession: `discover()` was not called, or was broken off; nothing was sent.
         """
         return self._portal.call(
             self._aio.step, n_steps, include_cameras=include_cameras, observations=observations, timeout=timeout
@@ -376,6 +379,8 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
         Raises:
             UnknownKeyframe: No keyframe, or more than one, has this name; nothing was reset.
             KeyError: Unknown articulation or joint; nothing was sent.
+            TypeError: A position is not a number; nothing was sent.
+            ValueError: A position is NaN or infinite; nothing was sent.
         """
         return self._portal.call(self._aio.reset, keyframe_name, seed, per_articulation_qpos, timeout=timeout)
 

@@ -33,7 +33,7 @@ from urlab_client.protocol.shm import (
     state_stride,
 )
 from urlab_client.server.system.health import Health
-from urlab_client.server.system.thread_join import ended
+from urlab_client.server.system.serving_thread import ServingThread
 from urlab_client.server.transport.region_files import InstanceDirectory, RegionFile, RequestFile
 
 __all__ = ["MAX_REPLY_BYTES", "SharedMemoryServer"]
@@ -118,7 +118,9 @@ class SharedMemoryServer:
         self._stopping = False
         self._released = False
         self._given_up = False
-        self._thread: threading.Thread | None = None
+        self._seen = 0  # whoever was quicker than the thread is not forgotten
+        self._answer: Answer = bytes
+        self.serving = ServingThread("urlab-shm", self._run)
 
     def start(self, answer: Answer) -> None:
         """Start the thread that serves.
@@ -126,13 +128,13 @@ class SharedMemoryServer:
         Args:
             answer: Turns a request into its reply of at most `MAX_REPLY_BYTES`; must not raise.
         """
-        self._thread = threading.Thread(target=self._run, args=(answer,), name="urlab-shm", daemon=True)
-        self._thread.start()
+        self._answer = answer
+        self.serving.start()
 
     @property
     def alive(self) -> bool:
         """Whether requests are served."""
-        return self._thread is not None and self._thread.is_alive()
+        return self.serving.alive
 
     def stop(self) -> None:
         """Ask the thread to end after the request under way, without waiting."""
@@ -145,10 +147,10 @@ class SharedMemoryServer:
         Returns:
             False when the request under way took longer.
         """
-        if self._thread is not None:
-            ended(self._thread, timeout)
+        if self.serving.started:
+            ended = self.serving.join(timeout)
             with self._lock:
-                self._given_up = self._thread.is_alive()
+                self._given_up = not ended and self.serving.alive
             if self._given_up:
                 return False
         self._release()
@@ -232,18 +234,20 @@ class SharedMemoryServer:
 
     # The thread.
 
-    def _run(self, answer: Answer) -> None:
-        seen = 0  # whoever was quicker than this thread is not forgotten
+    def _run(self, owed: bytes | None) -> None:
         try:
+            if owed is not None:
+                self._reply(owed)
             while not self._stopping:
-                if self._requests.sequence() == seen and not (self._brisk and self._follows(seen)):
+                if self._requests.sequence() == self._seen and not (self._brisk and self._follows(self._seen)):
                     rung = self._bell.wait(self._pause())
-                    if self._requests.sequence() == seen:
+                    if self._requests.sequence() == self._seen:
                         continue
                     if not rung:
                         self._unrung_at = time.monotonic()
                 self._brisk = time.monotonic() - self._served_at < BRISK_S and not crowded()
-                seen = self._serve(answer)
+                if not self._serve():
+                    return
                 self._served_at = time.monotonic()
         except (OSError, ValueError):
             logger.exception("shared memory failed; the server answers over ZMQ alone")
@@ -254,7 +258,7 @@ class SharedMemoryServer:
         finally:
             with self._lock:
                 given_up = self._given_up
-            if given_up:  # nobody waits for this thread any more
+            if given_up and self.serving.is_current:  # nobody waits for this thread any more
                 self._release()
 
     def _give_up(self) -> None:
@@ -274,16 +278,23 @@ class SharedMemoryServer:
             return BUSY_POLL_S
         return RUNG_POLL_S if self._bell.listeners else IDLE_POLL_S
 
-    def _serve(self, answer: Answer) -> int:
-        sequence, request = self._requests.read()
+    def _serve(self) -> bool:
+        """Answer the request that is there; return False if another thread has done so and serves now."""
+        self._seen, request = self._requests.read()
         if request is None:
             logger.warning("a request in shared memory could not be read and stays unanswered")
-        else:
-            reply = answer(request)
-            if reply:
-                self._replies.publish(reply)
-                self._bell.ring(doorbell.REPLY)
-        return sequence
+            return True
+        self.serving.begin()
+        reply = self._answer(request)
+        if not self.serving.finish():
+            return False
+        if reply:
+            self._reply(reply)
+        return True
+
+    def _reply(self, reply: bytes) -> None:
+        self._replies.publish(reply)
+        self._bell.ring(doorbell.REPLY)
 
     def _release(self) -> None:
         with self._lock:
