@@ -23,6 +23,7 @@ ALLOWED: dict[str, frozenset[str]] = {
             "_mujoco",
             "_processors",
             "_uninterrupted",
+            "_windows",
             "keys",
             "protocol",
         }
@@ -37,6 +38,7 @@ ALLOWED: dict[str, frozenset[str]] = {
             "_mujoco",
             "_processors",
             "_uninterrupted",
+            "_windows",
             "keys",
             "protocol",
         }
@@ -50,12 +52,26 @@ ALLOWED: dict[str, frozenset[str]] = {
     "_installation": frozenset(),
     "_processors": frozenset(),
     "_uninterrupted": frozenset(),
+    "_windows": frozenset(),
     "": frozenset({"_installation", "sync", "enums", "protocol"}),
     "integrations": frozenset({"", "_mujoco", "aio", "enums", "keys", "protocol", "server", "sync"}),
     "cluster": frozenset({"integrations", "protocol", "sync"}),
     "web": frozenset({"aio", "protocol"}),
     "cli": frozenset(
-        {"", "_installation", "_mujoco", "aio", "enums", "integrations", "keys", "protocol", "server", "sync", "web"}
+        {
+            "",
+            "_installation",
+            "_mujoco",
+            "_windows",
+            "aio",
+            "enums",
+            "integrations",
+            "keys",
+            "protocol",
+            "server",
+            "sync",
+            "web",
+        }
     ),
     "__main__": frozenset({"cli"}),
 }
@@ -87,6 +103,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "system",
         "limits",
         "refusal",
+        "lease",
         "assets",
         "compile",
         "editor",

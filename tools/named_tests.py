@@ -13,13 +13,14 @@ __all__ = ["named_tests", "unnamed"]
 def named_tests(tests: Path) -> Mapping[str, Sequence[str]]:
     """Return pytest's ids, relative to the folder above `tests`, by name.
 
-    The names are those of modules and of test functions; where two functions share one, `module::function` tells them
-    apart.
+    The names are those of modules and of test functions. Where two share one, `folder/module` and `module::function`
+    tell them apart.
     """
     ids: dict[str, list[str]] = defaultdict(list)
     for path in sorted(tests.rglob("test_*.py")):
         module = path.relative_to(tests.parent).as_posix()
-        ids[path.stem].append(module)
+        for name in {path.stem, path.relative_to(tests).with_suffix("").as_posix()}:
+            ids[name].append(module)
         for node in ast.parse(path.read_text("utf-8")).body:
             in_class = isinstance(node, ast.ClassDef)
             prefix = f"{module}::{node.name}" if in_class else module

@@ -34,6 +34,8 @@ from urlab_client.protocol.rows import (
     decode_row,
 )
 
+pytestmark = pytest.mark.mujoco("3.12")  # one of its actuators is a `pid`
+
 XML = """
 <mujoco>
   <worldbody>

@@ -613,7 +613,7 @@ async def test_an_op_the_server_lacks_is_refused_before_sending(plugin: Any, scr
 
 async def test_a_newer_server_may_say_more(plugin: Any, scripted: Any, connect: Any) -> None:
     hello = plugin.hello({})
-    hello["shm_rpc"] = {"req": "/x"}
+    hello["weather"] = {"wind": "/x"}
     hello["articulations"][0]["tint"] = [1.0, 0.0, 0.0]
     scripted.on("hello", hello)
     async with connect() as client:

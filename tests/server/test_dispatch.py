@@ -141,7 +141,7 @@ def test_ops_in_another_case_need_a_manager_first(idle: Wire) -> None:
 
 
 def test_every_op_is_served() -> None:
-    assert set(HANDLERS.handlers) == set(ALPHA.ops)
+    assert set(HANDLERS.handlers) >= set(ALPHA.ops)
 
 
 # Sessions and encodings

@@ -14,7 +14,7 @@ from wire import Wire
 
 from urlab_client import InternalError, URLabClient
 from urlab_client.protocol.enums import PIEState
-from urlab_client.server import SimulatedServer
+from urlab_client.server import Drop, Faults, SimulatedServer
 from urlab_client.server.physics.play import Play
 
 
@@ -69,6 +69,26 @@ def test_a_thread_that_dies_is_told_to_everybody(server: SimulatedServer, name: 
     with URLabClient(**server.client_options(), step_mode="direct") as client:
         client.discover()
         assert client.step().step == 1
+
+
+class Deadly(Drop):
+    def concerns_request(self, op: str) -> bool:
+        raise SystemExit(op)
+
+
+def test_a_server_that_misbehaves_on_purpose_tells_as_well(models: Path) -> None:
+    faults = Faults()
+    with (
+        SimulatedServer(models / "bot.xml", play=True, faults=faults) as server,
+        URLabClient(**server.client_options(), rcv_timeout_ms=60_000) as client,
+    ):
+        client.discover()
+        faults.add(Deadly())
+        with pytest.raises(InternalError, match="'urlab-rpc' died of SystemExit: forward"):
+            client.runtime.forward()
+        faults.clear()
+        with pytest.raises(InternalError, match="'urlab-rpc' died of SystemExit: forward; start the server again"):
+            client.runtime.forward()
 
 
 def test_a_step_that_waits_for_physics_is_answered_when_physics_dies(server: SimulatedServer) -> None:

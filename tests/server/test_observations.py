@@ -19,6 +19,8 @@ from urlab_client.server.assets.actors import Actor, ActorKind, ConversionSettin
 from urlab_client.server.physics.engine import Engine
 from urlab_client.server.physics.observe import Observer, sim_clock, wall_clock
 
+pytestmark = pytest.mark.mujoco("3.11")  # one of its actuators has several inputs
+
 RICH = """
 <mujoco>
   <worldbody>

@@ -95,10 +95,10 @@ def test_the_limit_that_a_model_exceeds_is_named(folder: Path) -> None:
 BODY = '<worldbody><body name="b"><joint name="j"/><geom name="g" size=".1"/></body></worldbody>'
 LARGE = {
     "sensors": ('<sensor><contact geom1="g" num="2000000"/></sensor>', "2000000 numbers", "sensor_values"),
-    "more sensors": ('<sensor><contact geom1="g" num="40000000"/></sensor>', "bytes", "data_bytes"),
+    "more sensors": ('<sensor><contact geom1="g" num="34000000"/></sensor>', "bytes", "data_bytes"),
     "far more sensors": ('<sensor><contact geom1="g" num="1000000000"/></sensor>', "memory", "model_memory_bytes"),
-    "arena": ('<size memory="300M"/>', "314577", "data_bytes"),
-    "user data": ('<size nuserdata="40000000"/>', "320004", "data_bytes"),
+    "arena": ('<size memory="270M"/>', "283119", "data_bytes"),
+    "user data": ('<size nuserdata="34000000"/>', "272004", "data_bytes"),
     "constraints": ('<size njmax="2000000000"/>', "memory", "model_memory_bytes"),
     "iterations": ('<option iterations="2147483647" tolerance="0"/>', "2147483647", "solver_iterations"),
     "timestep": ('<option timestep="0"/>', "timestep must be a positive number", "timestep"),

@@ -709,6 +709,26 @@ class TestInterrupt:
         """)
         assert outcome(process) == (0, ["['handled', 'handled', 'handled']"], "")
 
+    def test_breaks_off_a_call_that_a_handler_makes_and_the_one_around_it(self) -> None:
+        process = child("""
+            async def hang(name):
+                os.kill(os.getpid(), signals.pop(0))  # for the main thread, whichever runs this
+                try:
+                    await asyncio.Event().wait()
+                finally:
+                    say(name, "cleaned up")
+
+            signals = [signal.SIGUSR1, signal.SIGINT]
+            portal = Portal()
+            signal.signal(signal.SIGUSR1, lambda *_: portal.call(hang, "inner"))
+            try:
+                portal.call(hang, "outer")
+            except KeyboardInterrupt:
+                say("interrupted", portal.call(answer))
+            portal.close()
+        """)
+        assert outcome(process) == (0, ["inner cleaned up", "outer cleaned up", "interrupted 42"], "")
+
     def test_before_the_coroutine_has_run_leaves_it_closed(self) -> None:
         process = child("""
             def interrupted_at_once():

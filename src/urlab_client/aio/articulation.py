@@ -15,9 +15,10 @@ from urlab_client.aio.live.publishers import Publishers
 from urlab_client.aio.model.articulation_state import MirroredArticulation, MirroredEntity
 from urlab_client.aio.model.elements import Actuator, ArticulationElements, Body, Joint, Sensor, make_elements
 from urlab_client.aio.model.layout import ArticulationLayout
+from urlab_client.aio.model.numbers import finite, finite_array
 from urlab_client.aio.session import Session
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.enums import ControlMode
+from urlab_client.protocol.enums import ControlMode, OutOfRange
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import ControllerInfo
 from urlab_client.protocol.names import NameMap
@@ -116,7 +117,8 @@ class URLabEntity:
             torque: (tx, ty, tz), N m, world frame.
 
         Raises:
-            ValueError: A vector does not have three components.
+            TypeError: A component is not a number.
+            ValueError: A vector does not have three finite components.
         """
         self._record.wrenches[self._record.name] = _wrench(force, torque)
 
@@ -246,14 +248,22 @@ class URLabArticulation(URLabEntity):
 
     @property
     def ctrl_array(self) -> Floats:
-        """Set-points that the next step sends, shape (n_actuators,). A live view: write to it in place."""
+        """Set-points that the next step sends, shape (n_actuators,). A live view: write to it in place.
+
+        Assigning to the property checks the values; `step()` refuses NaN and infinities that were written in place.
+
+        Raises:
+            TypeError: On assigning what is not numbers.
+            ValueError: On assigning NaN, infinities or another number of values.
+        """
         self._record.drive()  # whoever takes the view may write to it at any time
         return self._record.ctrl
 
     @ctrl_array.setter
     def ctrl_array(self, values: Sequence[float] | Floats) -> None:
+        checked = finite_array(f"ctrl_array of {self.prefix!r}", values)
         self._record.drive()
-        self._record.ctrl[:] = values
+        self._record.ctrl[:] = checked
 
     @property
     def last_applied_ctrl(self) -> Floats:
@@ -311,18 +321,25 @@ class URLabArticulation(URLabEntity):
             qvel = self._record.root_qvel()
             return qvel[3:6] if qvel is not None else _to_body(self.root_quat_w, self.root_ang_vel_w)
 
-    def set_ctrl(self, values: Mapping[str, float]) -> None:
+    def set_ctrl(self, values: Mapping[str, float], *, out_of_range: str | OutOfRange = "allow") -> None:
         """Set some set-points by actuator name; the others keep their last value.
 
         Args:
             values: Actuator name to set-point.
+            out_of_range: What becomes of a value outside its actuator's range; see `Actuator.set_control`.
 
         Raises:
             KeyError: A name is unknown; nothing was set.
+            TypeError: A value is not a number; nothing was set.
+            ValueError: A value is NaN, infinite, or, with `error`, out of range; nothing was set.
         """
-        writes = [(self.actuators[name], value) for name, value in values.items()]
-        for actuator, value in writes:
-            actuator.set_control(value)
+        rule = OutOfRange(out_of_range)
+        found = [(self.actuators[name], value) for name, value in values.items()]
+        checked = [(actuator.ctrl_local, actuator.checked(value, rule)) for actuator, value in found]
+        if checked:
+            self._record.drive()
+        for where, value in checked:
+            self._record.ctrl[where] = value
 
     def get_ctrl(self) -> dict[str, float]:
         """Return the set-points that the next step sends, by actuator name."""
@@ -362,7 +379,8 @@ class URLabArticulation(URLabEntity):
 
         Raises:
             KeyError: The articulation has no such body.
-            ValueError: A vector does not have three components, or the body must be named.
+            TypeError: A component is not a number.
+            ValueError: A vector does not have three finite components, or the body must be named.
         """
         bodies = self.bodies
         if body and bodies:
@@ -419,7 +437,8 @@ class URLabArticulation(URLabEntity):
 def _wrench(force: Sequence[float], torque: Sequence[float]) -> list[float]:
     if len(force) != 3 or len(torque) != 3:
         raise ValueError(f"force and torque need three components each, got {len(force)} and {len(torque)}")
-    return [float(v) for v in (*force, *torque)]
+    named = (("force", force), ("torque", torque))
+    return [finite(f"apply_xfrc: {what}[{i}]", v) for what, vector in named for i, v in enumerate(vector)]
 
 
 def _to_world(quat: Floats, vector: Floats) -> Floats:

@@ -22,6 +22,7 @@ from urlab_client.aio.explain import diagnose
 from urlab_client.aio.launch import SCHEME, LaunchedTransport
 from urlab_client.aio.live.publishers import Publishers
 from urlab_client.aio.model.mirror import model_names
+from urlab_client.aio.model.numbers import finite
 from urlab_client.aio.namespaces.debug import DebugNamespace
 from urlab_client.aio.namespaces.farm import FarmNamespace
 from urlab_client.aio.namespaces.outliner import OutlinerNamespace
@@ -432,6 +433,7 @@ class URLabClient:
             StepTimeout: The server did not finish within its 5 s; the steps are still queued there.
             OutcomeUnknown: The connection broke: the steps may or may not have been taken. `resync()` finds out.
             KeyError: Unknown camera; nothing was sent.
+            ValueError: A set-point is NaN or infinite, or in puppet mode something in `data`; nothing was sent.
         """
         state = self._state
         n_steps = operator.index(n_steps)  # a hot op: its request is not checked again before it is sent
@@ -497,6 +499,8 @@ class URLabClient:
         Raises:
             UnknownKeyframe: No keyframe, or more than one, has this name; nothing was reset.
             KeyError: Unknown articulation or joint; nothing was sent.
+            TypeError: A position is not a number; nothing was sent.
+            ValueError: A position is NaN or infinite; nothing was sent.
         """
         overrides = {
             self.articulations[key].prefix: self._joint_values(key, values)
@@ -693,6 +697,7 @@ class URLabClient:
         with mirror.lock:
             for record in self._state.records.values():
                 record.write_set_points()
+            mirror.check_finite()
             if n_steps > 0:
                 import mujoco  # noqa: PLC0415
 
@@ -717,7 +722,8 @@ class URLabClient:
 
     def _joint_values(self, key: str, values: Mapping[str, float]) -> dict[str, float]:
         joints = self.articulations[key].joints
-        return {(joints[name].name if joints else name): float(value) for name, value in values.items()}
+        live = {(joints[name].name if joints else name): value for name, value in values.items()}
+        return {name: finite(f"reset: joint {name!r} of {key!r}", value) for name, value in live.items()}
 
     def _keyframe(self, name: str) -> str:
         """Return the compiled name; only that is known to the server."""

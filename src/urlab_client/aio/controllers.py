@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
@@ -220,6 +221,8 @@ def _check_number(prefix: str, what: str, value: Any, rule: Mapping[str, Any]) -
     low = rule.get("min")
     if low is not None and not value >= low:
         raise _violation(prefix, f"{what} must be at least {low:g}, got {value!r}")
+    if math.isnan(value):
+        raise _violation(prefix, f"{what} takes a number, got {value!r}")
 
 
 def _violation(prefix: str, problem: str) -> ControllerSchemaViolation:

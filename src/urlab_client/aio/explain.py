@@ -178,6 +178,16 @@ def _articulations(state: SimState) -> Iterator[Finding]:
             if dead:
                 text = f"A torque limit of 0 means no torque at all: {', '.join(dead)}. Raise it with set_gains()."
                 yield Finding(Verdict.PROBLEM, key, text)
+        if not np.isfinite(record.qpos).all():
+            text = "Its positions are not finite: the simulation has diverged. Call reset(); try a shorter timestep."
+            yield Finding(Verdict.PROBLEM, key, text)
+        if strange := record.not_finite():
+            text = f"Set-points that are not finite, so that step() refuses them: {', '.join(strange)}."
+            yield Finding(Verdict.PROBLEM, key, text)
+            continue
+        if outside := record.out_of_range():
+            what = "targets beyond the limits of their joints" if controlled else "MuJoCo clamps them"
+            yield Finding(Verdict.NOTE, key, f"Set-points out of range: {', '.join(outside)}; {what}.")
         if not np.any(record.ctrl):
             text = "All set-points are 0. Set them with set_ctrl() or ctrl_array before step()."
             yield Finding(Verdict.NOTE, key, text)

@@ -13,7 +13,7 @@ from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.jobs import OnProgress, finish
 from urlab_client.aio.transport.base import RequestTransport
 from urlab_client.protocol.base import ControlRequest, Needs, Op, Reply, Request
-from urlab_client.protocol.codec import check_request, decode_answer, encode_request, op_of
+from urlab_client.protocol.codec import check_finite, check_request, decode_answer, encode_request, op_of
 from urlab_client.protocol.errors import (
     ConnectionLost,
     ProtocolError,
@@ -148,8 +148,10 @@ class Session:
         began = asyncio.get_running_loop().time()
         stamped = self.session_id
         frame = encode_request(request, stamped, json=self._json)
-        if not op.hot and not self._json:
-            check_request(request, frame)
+        if not op.hot:
+            check_finite(request)
+            if not self._json:
+                check_request(request, frame)
         try:
             answer = await self._transport.request(frame, op, deadline=limits.deadline, connect_by=limits.connect_by)
         except ConnectionLost as lost:

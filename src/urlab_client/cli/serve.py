@@ -15,6 +15,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, cast
 
+from urlab_client._windows import read_aside
 from urlab_client.cli._arguments import Commands, image_size, port
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._mujoco import import_mujoco
@@ -305,7 +306,7 @@ def _stop_on_signals(events: _Events, *, ignore_interrupt: bool) -> None:
 def _watch_input(events: _Events) -> None:
     # Not through sys.stdin, whose lock this thread would still hold when the interpreter ends.
     with contextlib.suppress(OSError):  # there is no standard input
-        while os.read(0, 4096):
+        while read_aside(0, 4096):
             pass
     events.put(_Event.STOP)
 

@@ -124,6 +124,7 @@ class Op:
         effect: Whether it may be sent again after a lost reply.
         timeout: Seconds to wait for the reply at least; None leaves it to the client's default.
         hot: Built by the client itself at kilohertz rates, so sent without checking the struct's field types again.
+        infinite: Request fields whose numbers may be infinite; all others are finite.
         errors: Codes the op itself can answer, besides the envelope's.
         generated: Whether `tools/gen_ops.py` writes the client's method. Ops that mirror state or build handles
             have theirs written by hand.
@@ -143,6 +144,7 @@ class Op:
     effect: Effect = Effect.WRITE
     timeout: float | None = None
     hot: bool = False
+    infinite: tuple[str, ...] = ()
     errors: tuple[str, ...] = ()
     generated: bool = False
     returns: str | type[Struct] | None = None

@@ -31,6 +31,7 @@ __all__ = [
     "MAX_REPLY_BYTES",
     "MAX_REQUEST_BYTES",
     "building",
+    "check_finite",
     "check_request",
     "decode_answer",
     "decode_job",
@@ -150,6 +151,36 @@ def check_request(request: Request[Any], frame: bytes) -> None:
         where = path.strip("`").removeprefix("$.") or "request"
         kind = ValueError if "length" in problem or "enum" in problem else TypeError
         raise kind(f"{op_of(request).name}: {where}: {problem[:1].lower()}{problem[1:]}") from None
+
+
+def check_finite(request: Request[Any]) -> None:
+    """Check the numbers of a request: NaN and infinities pass every other check, and in JSON there are none.
+
+    Raises:
+        ValueError: Names the first one that is not finite, unless the op takes infinities there.
+    """
+    op = op_of(request)
+    for name in request.__struct_fields__:
+        found = None if name in op.infinite else _not_finite(getattr(request, name), name)
+        if found is not None:
+            raise ValueError(f"{op.name}: {found}; it takes finite numbers. Nothing was sent.")
+
+
+def _not_finite(value: Any, path: str) -> str | None:
+    match value:
+        case float():
+            return None if math.isfinite(value) else f"{path} is {value}"
+        case np.ndarray():
+            inside: Any = ((item, f"{path}[{i}]") for i, item in enumerate(cast("list[Any]", value.tolist())))
+        case Struct():
+            inside = ((getattr(value, name), f"{path}.{name}") for name in value.__struct_fields__)
+        case dict():
+            inside = ((item, f"{path}.{key}") for key, item in cast("dict[str, Any]", value).items())
+        case list() | tuple():
+            inside = ((item, f"{path}[{i}]") for i, item in enumerate(cast("list[Any]", value)))
+        case _:
+            return None
+    return next(filter(None, (_not_finite(item, where) for item, where in inside)), None)
 
 
 # Which of the editor's ops are jobs shows in the answer alone. That of `op_status` is never another job.

@@ -98,7 +98,10 @@ class Dialect:
         steps_published: State is published in every step mode, else in live mode only.
         rows_published: Single joints, sensors and so on are published.
         live_commands: A live step applies all of its commands.
+        late_steps: A direct step that timed out before it began is done all the same.
         level_sticks: The observation level of a step holds for later replies, too.
+        auto_mode: `auto` is a step mode beside live, else another name of it.
+        controls_float32: Set-points are rounded to single precision.
         options_float32: Options are kept in single precision and keywords in lower case.
         options_merged: The `<option>` of imported robots reaches the scene.
         attached_documents: The scene's document attaches those of the robots, which are assets.
@@ -123,7 +126,10 @@ class Dialect:
     steps_published: bool
     rows_published: bool
     live_commands: bool
+    late_steps: bool
     level_sticks: bool
+    auto_mode: bool
+    controls_float32: bool
     options_float32: bool
     options_merged: bool
     attached_documents: bool
@@ -148,7 +154,11 @@ class Dialect:
 
     def camera_key(self, robot: str, camera: str) -> str:
         """Return what a camera is called in requests and replies, from the robot's key and its own name."""
-        return f"{robot}/{cleaned_name(camera)}" if self.qualified_cameras else camera
+        return f"{robot}/{self.camera_part(camera)}" if self.qualified_cameras else camera
+
+    def camera_part(self, camera: str) -> str:
+        """Return what stands for a camera behind its robot's key and a slash."""
+        return cleaned_name(camera) if self.qualified_cameras else camera
 
     def camera_topic(self, robot: str, camera: str) -> str:
         """Return the topic of a camera's stream, without the space that messages carry behind it."""
@@ -171,7 +181,10 @@ ALPHA: Final = Dialect(
     steps_published=True,
     rows_published=True,
     live_commands=False,
+    late_steps=True,
     level_sticks=True,
+    auto_mode=True,
+    controls_float32=True,
     options_float32=True,
     options_merged=False,
     attached_documents=False,
@@ -197,7 +210,10 @@ BETA: Final = Dialect(
     steps_published=False,
     rows_published=False,
     live_commands=True,
+    late_steps=False,
     level_sticks=False,
+    auto_mode=False,
+    controls_float32=False,
     options_float32=False,
     options_merged=True,
     attached_documents=True,

@@ -18,6 +18,7 @@ __all__ = [
     "ControlMode",
     "ControllerKind",
     "ObservationLevel",
+    "OutOfRange",
     "PIEState",
     "StepMode",
     "Transport",
@@ -103,6 +104,17 @@ class ObservationLevel(StrEnum):
     MINIMAL = "minimal"
     STANDARD = "standard"
     FULL = "full"
+
+
+class OutOfRange(StrEnum):
+    """What becomes of a set-point outside the range of its actuator. Not of the wire."""
+
+    ERROR = "error"
+    """It is refused."""
+    CLAMP = "clamp"
+    """The nearest value in the range takes its place."""
+    ALLOW = "allow"
+    """It is sent as it is; MuJoCo clamps controls that have a range."""
 
 
 class PIEState(StrEnum):

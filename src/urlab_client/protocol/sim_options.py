@@ -1,54 +1,78 @@
-"""Which values the options of a simulation can have. For the client, in what it sends and in what it is told, and for
-the simulated server. No I/O.
+"""Which numbers of `mjOption` make sense. For the client, in what it sends and in what it is told, and for the server.
+
+MuJoCo checks none of them: a timestep of 0 stops time, and one that is not a number spoils the state for good. No I/O.
 """
 
 from __future__ import annotations
 
-from typing import Final, cast
+import math
+from typing import Any, Final
+
+import numpy as np
 
 from urlab_client.protocol.types import SimOptions
 
-__all__ = ["check_sim_options"]
+__all__ = ["ITERATIONS", "RANGED_OPTIONS", "check_sim_options", "option_problem"]
 
-# They travel, and the server keeps them, as float32.
-_FLOAT32_MAX: Final = 3.4028234663852886e38
-_FLOAT32_MIN: Final = 1.1754943508222875e-38
-_INT32_MAX: Final = 2**31 - 1
-
-_ABOVE_ZERO: Final = ("timestep", "impratio")
-_NOT_BELOW_ZERO: Final = (
+_POSITIVE: Final = ("timestep", "impratio")
+_NOT_NEGATIVE: Final = (
     "density",
     "viscosity",
     "tolerance",
+    "ls_tolerance",
     "noslip_tolerance",
     "ccd_tolerance",
     "sleep_tolerance",
+)
+_VECTORS: Final = ("gravity", "wind", "magnetic")
+ITERATIONS: Final = (
     "iterations",
     "ls_iterations",
     "noslip_iterations",
     "ccd_iterations",
+    "sdf_iterations",
+    "sdf_initpoints",
 )
+"""Options that count how often a solver tries."""
+
+RANGED_OPTIONS: Final = (*_POSITIVE, *_NOT_NEGATIVE, *_VECTORS, *ITERATIONS)
+"""Options that may not have any value of their type."""
+
+_FLOATS: Final = (*_POSITIVE, *_NOT_NEGATIVE, *_VECTORS)
+_INT32: Final = np.iinfo(np.int32)
+
+
+def option_problem(name: str, value: Any) -> str:
+    """Return what is wrong with the value of an option, or nothing; options without a range may have any.
+
+    Args:
+        name: As in `mjOption`.
+        value: A number, or three.
+    """
+    if name in _POSITIVE and not 0.0 < value < math.inf:
+        return f"{name} must be a positive number, not {value}"
+    if name in _NOT_NEGATIVE and not 0.0 <= value < math.inf:
+        return f"{name} must not be negative, and be finite: {value} is not possible"
+    if name in _VECTORS and not all(map(math.isfinite, value)):
+        return f"{name} must be three finite numbers, not {', '.join(map(str, value))}"
+    if name in ITERATIONS and value < 0:
+        return f"{name} must not be negative: {value} is not possible"
+    return ""
 
 
 def check_sim_options(options: SimOptions) -> None:
-    """Refuse values with which a simulation cannot go on: its time would stand still or stop being a number.
+    """Refuse options with which a simulation cannot go on.
 
     Raises:
-        ValueError: Names the option, its value and the values it can have.
+        ValueError: Names the option, its value and what it can be.
     """
     for name in SimOptions.__struct_fields__:
-        value: object = getattr(options, name)
-        numbers = cast("tuple[object, ...]", value) if isinstance(value, tuple) else (value,)
-        for number in numbers:
-            if isinstance(number, float) and not abs(number) <= _FLOAT32_MAX:
-                raise ValueError(f"{name} takes finite numbers, got {value}")
-            if isinstance(number, int) and not isinstance(number, bool) and abs(number) > _INT32_MAX:
-                raise ValueError(f"{name} takes integers of 32 bits, got {value}")
-    for name in _ABOVE_ZERO:
-        positive: float | None = getattr(options, name)
-        if positive is not None and positive < _FLOAT32_MIN:
-            raise ValueError(f"{name} must be above 0, got {positive:g}")
-    for name in _NOT_BELOW_ZERO:
-        positive = getattr(options, name)
-        if positive is not None and positive < 0:
-            raise ValueError(f"{name} must not be below 0, got {positive:g}")
+        value = getattr(options, name)
+        if value is None:
+            continue
+        if isinstance(value, int) and not _INT32.min <= value <= _INT32.max:
+            raise ValueError(f"{name} must be an integer of 32 bits, not {value}")
+        with np.errstate(over="ignore"):  # the server keeps numbers as float32, in which very large ones are infinite
+            problem = option_problem(name, np.float32(value).tolist() if name in _FLOATS else value)
+        if problem:
+            raise ValueError(problem)

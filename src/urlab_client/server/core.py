@@ -19,13 +19,16 @@ from urlab_client.protocol.base import Request
 from urlab_client.protocol.codec import encode_reply
 from urlab_client.protocol.dialects import ALPHA, Dialect
 from urlab_client.protocol.enums import CameraMode, PIEState, StepMode
-from urlab_client.protocol.messages.session import ErrorReply, Hello, Step
+from urlab_client.protocol.messages.session import ErrorReply, Hello, InstanceInfo, Step
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.compile.scene import ArticulationIndex, CompiledScene, compile_scene
+from urlab_client.server.editor.jobs import EditorJobs
 from urlab_client.server.editor.markers import Drawings
 from urlab_client.server.editor.viewport import Viewport
 from urlab_client.server.editor.world import EditorWorld
+from urlab_client.server.lease import DriverLease
 from urlab_client.server.limits import Limits
+from urlab_client.server.physics.channels import UserChannels
 from urlab_client.server.physics.controllers import ControllerConfig
 from urlab_client.server.physics.engine import Engine
 from urlab_client.server.physics.observe import Observer
@@ -54,6 +57,7 @@ class PhysicsConfig:
         camera_size: Width and height of cameras whose MJCF gives none, pixels.
         mjcf_options: Honour the `<option>` of the first model.
         render_quality: How well cameras and the viewport are drawn.
+        user_channels: First value of the user channels that the level declares, by `ROBOT/CHANNEL` or `scene/CHANNEL`.
     """
 
     step_mode: StepMode = StepMode.AUTO
@@ -63,6 +67,7 @@ class PhysicsConfig:
     camera_size: tuple[int, int] | None = None
     mjcf_options: bool = False
     render_quality: RenderQuality = "auto"
+    user_channels: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
     def controller(self, index: ArticulationIndex) -> ControllerConfig | None:
         """Return the controller an articulation is to get: configured here, or else by the level or its MJCF."""
@@ -95,6 +100,9 @@ class ServerCore:
         drawings: Debug drawing.
         health: Whether the server's threads run.
         compiled: What the last play session was started with.
+        jobs: Editor ops that are carried out beside the requests.
+        lease: The driver lease.
+        instance: Which of several servers it is; None in dialects that do not tell.
     """
 
     world: EditorWorld
@@ -108,6 +116,9 @@ class ServerCore:
     drawings: Drawings = field(init=False)
     health: Health = field(default_factory=Health)
     compiled: _Compiled | None = None
+    jobs: EditorJobs = field(default_factory=EditorJobs)
+    lease: DriverLease = field(default_factory=DriverLease)
+    instance: Callable[[], InstanceInfo] | None = None
 
     def refuse(self, code: str, message: str) -> bytes:
         """Return the frame of an error reply."""
@@ -189,7 +200,9 @@ class ServerCore:
             paused=not physics.unpaused,
             controllers=controllers,
             health=self.health,
+            dialect=self.dialect,
         )
+        channels = UserChannels(physics.user_channels)
         modes = {
             (index.key, camera.name): physics.camera_mode(index, camera.name)
             for index in scene.articulations
@@ -198,10 +211,11 @@ class ServerCore:
         return Running(
             scene,
             engine.start(),
-            Observer(scene, engine.controls),
-            self._camera_renderer(scene, actors, modes),
+            Observer(scene, engine.controls, channels),
+            self._camera_renderer(scene, actors, modes, engine.names),
             files,
             self.limits,
+            channels,
         )
 
     def authored_renderer(self) -> CameraRenderer:
@@ -212,13 +226,19 @@ class ServerCore:
         """
         actors = self.world.freeze()
         scene = compile_scene(actors, honour_mjcf_options=self.physics.mjcf_options, limits=self.limits)
-        return self._camera_renderer(scene, actors, {})
+        return self._camera_renderer(scene, actors, {}, {})
 
     def _camera_renderer(
-        self, scene: CompiledScene, actors: Sequence[Actor], modes: Mapping[tuple[str, str], CameraMode]
+        self,
+        scene: CompiledScene,
+        actors: Sequence[Actor],
+        modes: Mapping[tuple[str, str], CameraMode],
+        names: Mapping[str, str],
     ) -> CameraRenderer:
         classes = {actor.name: _kind(actor) for actor in actors}
-        return CameraRenderer(scene, modes, classes, self.physics.render_quality, self.health)
+        return CameraRenderer(
+            scene, modes, classes, self.physics.render_quality, self.health, names=names, dialect=self.dialect
+        )
 
     def stop_play(self) -> None:
         """End play, if it runs."""

@@ -443,7 +443,10 @@ class FaultyEndpoint(RpcEndpoint):
             return True
         end = parts.index(b"", 1) + 1
         self._envelope = envelope = parts[:end]
+        self.serving.begin()
         reply = self._injector.answer(parts[end] if len(parts) == end + 1 else b"", self._answer)
+        if not self.serving.finish():
+            return False
         if reply is Loss.CUT:
             _shut(int(frames[end - 1].get(zmq.SRCFD)))
         elif reply is not Loss.DROP:

@@ -12,15 +12,29 @@ class Refusal(Exception):
         code: Stable wire code, for example `spawn_failed`.
         message: What was wrong, where, and what would be right; one line.
         absolute_path: The file that could not be written; `recording_save` only.
+        owner: Who owns the robot that the request is about.
+        lease_id: The lease that somebody holds.
     """
 
     code: str
     message: str
     absolute_path: str | None
+    owner: str | None
+    lease_id: str | None
 
-    def __init__(self, code: str, message: str, *, absolute_path: str | None = None) -> None:
+    def __init__(
+        self,
+        code: str,
+        message: str,
+        *,
+        absolute_path: str | None = None,
+        owner: str | None = None,
+        lease_id: str | None = None,
+    ) -> None:
         super().__init__(code, message)
         self.absolute_path = absolute_path
+        self.owner = owner
+        self.lease_id = lease_id
         self.code = code
         self.message = message
 

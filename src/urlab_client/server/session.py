@@ -46,10 +46,9 @@ class ServerSession:
         """Whether a request with this id belongs to the active session."""
         return session_id != "" and session_id == self.id
 
-    def adopt_level(self, observations: str | None) -> None:
-        """Take over the level named in a step, for this and later replies; unknown names change nothing."""
-        if observations is not None:
-            self.level = _level(observations) or self.level
+    def level_of(self, observations: str | None) -> ObservationLevel:
+        """Return the level that a step names; the session's, if it names none or an unknown one."""
+        return self.level if observations is None else _level(observations) or self.level
 
 
 def _level(name: str) -> ObservationLevel | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import logging
 import os
+import socket
 import threading
 import time
 import warnings
@@ -22,8 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client._landlock import is_available
+from urlab_client.protocol.base import DialectName
+from urlab_client.protocol.dialects import DIALECTS, Dialect
 from urlab_client.protocol.enums import CameraMode, PIEState, StepMode, Transport
 from urlab_client.protocol.errors import URLabError
+from urlab_client.protocol.instances import registry_directory
+from urlab_client.protocol.messages.session import InstanceInfo
 from urlab_client.protocol.rows import CameraEndpoint
 from urlab_client.server.assets.bundled_robots import bundled_models
 from urlab_client.server.assets.content import ContentRoot
@@ -33,15 +38,19 @@ from urlab_client.server.editor.viewport import Viewport
 from urlab_client.server.editor.world import EditorWorld
 from urlab_client.server.faults import Faults, FaultyEndpoint, Injector
 from urlab_client.server.handlers import HANDLERS
+from urlab_client.server.lease import DriverLease
 from urlab_client.server.limits import Limits
+from urlab_client.server.physics.channels import channel_problem
 from urlab_client.server.physics.controllers import ControllerConfig
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.render.camera_renderer import RenderQuality, find_backend
 from urlab_client.server.rpc.dispatch import Dispatcher
+from urlab_client.server.rpc.watchdog import Watchdog
 from urlab_client.server.session import ServerSession
 from urlab_client.server.snapshot import LARGEST_PIXELS, take_snapshot
 from urlab_client.server.streams.camera_streams import CameraStreams
 from urlab_client.server.streams.publishing import StreamServer
+from urlab_client.server.streams.registration import Registration
 from urlab_client.server.system.health import Health
 from urlab_client.server.system.temporary_folder import TemporaryFolder
 from urlab_client.server.transport.curve_authentication import CurveKeys, CurveServer, UnprotectedServer, is_loopback
@@ -58,6 +67,9 @@ CLOSE_S: Final = 1.0
 GAP_M: Final = 1.0
 """Free space between the models placed side by side, metres."""
 
+_FIRST_PORT: Final = 5559
+_PORTS_EACH: Final = 10
+_LAST_INDEX: Final = 5000
 _NO_LIMIT: Final = float("inf")
 _DEFAULT_LIMITS: Final = Limits()
 _INTERFACES: Final = {"0.0.0.0": "every network of this machine", "::": "every network of this machine"}  # noqa: S104
@@ -93,6 +105,9 @@ class _Config:
     physics: PhysicsConfig
     faults: Faults | None
     shm_dir: Path | None
+    dialect: Dialect
+    instance_id: str
+    index: int
 
 
 class SimulatedServer:
@@ -138,6 +153,10 @@ class SimulatedServer:
         actor_names: Literal["model", "plugin"] = "model",
         faults: Faults | None = None,
         shm_dir: str | os.PathLike[str] | None = None,
+        dialect: DialectName = "alpha",
+        user_channels: Mapping[str, Any] = MappingProxyType({}),
+        instance_id: str = "",
+        instance_index: int | None = None,
     ) -> None:
         """Describe a server; `start`, or entering it, opens it.
 
@@ -174,9 +193,16 @@ class SimulatedServer:
                 runs.
             shm_dir: Directory below which the server makes one of its own for shared-memory regions; a tmpfs such as
                 `/dev/shm` spares the disk. None for no shared memory.
+            dialect: Generation of the plugin to speak for: `alpha` (June 2026) or `beta` (August 2026).
+            user_channels: First value of the level's user channels by `ROBOT/CHANNEL` or `scene/CHANNEL`; its kind is
+                the channel's. For the beta.
+            instance_id: What this server is called among several; by default `live`, or after its index.
+            instance_index: Number of this server among several, which gives it ports of its own where none are asked
+                for: 5559 + 10 times the index for requests, then state, then cameras.
 
         Raises:
-            ValueError: An invalid port, mode or size, two levels, or both `curve` and `insecure_no_auth`.
+            ValueError: An invalid port, mode, size, dialect, channel or index, two levels, or both `curve` and
+                `insecure_no_auth`.
         """
         names = tuple(os.fspath(model) for model in models)
         if sum(map(_is_level, names)) > 1:
@@ -191,6 +217,16 @@ class SimulatedServer:
             raise ValueError(
                 "curve and insecure_no_auth exclude each other: a server with keys is not open to everyone"
             )
+        if dialect not in DIALECTS:
+            raise ValueError(f"dialect must be {' or '.join(DIALECTS)}, not {dialect!r}")
+        for channel, value in user_channels.items():
+            if problem := channel_problem(channel, value):
+                raise ValueError(f"user_channels: {problem}")
+        if instance_index is not None:
+            if not 0 <= instance_index <= _LAST_INDEX:
+                raise ValueError(f"instance_index must be a number from 0 to {_LAST_INDEX}, not {instance_index}")
+            base = _FIRST_PORT + _PORTS_EACH * instance_index
+            step_port, state_port, camera_port = step_port or base, state_port or base + 1, camera_port or base + 2
         ports = _Ports(step=step_port, state=state_port, ctrl=ctrl_port, info=info_port, camera=camera_port)
         for name, port in vars(ports).items():
             if not 0 <= port <= 65535:
@@ -214,9 +250,13 @@ class SimulatedServer:
                 camera_size=camera_size,
                 mjcf_options=mjcf_options,
                 render_quality=render_quality,
+                user_channels=dict(user_channels),
             ),
             faults=faults,
             shm_dir=None if shm_dir is None else Path(shm_dir),
+            dialect=DIALECTS[dialect],
+            instance_id=instance_id or ("live" if instance_index is None else f"instance_{instance_index}"),
+            index=-1 if instance_index is None else instance_index,
         )
         self._lock = threading.Lock()
         self._opened: _Opened | None = None
@@ -462,8 +502,11 @@ class _Opened:
         self._faults = config.faults
         self._authored: object = None
         self._endpoint: RpcEndpoint | None = None
+        self._watchdog: Watchdog | None = None
         self._memory: SharedMemoryServer | None = None
         self._core: ServerCore | None = None
+        self._registration: Registration | None = None
+        self._instance_id, self._index = config.instance_id, config.index
         self._closed = False
         self._pid = os.getpid()
 
@@ -535,6 +578,8 @@ class _Opened:
             world=EditorWorld(self._content(config), actor_names=config.actor_names),
             physics=config.physics,
             camera_endpoint=cameras.endpoint,
+            dialect=config.dialect,
+            instance=self._instance if config.dialect.instance else None,
             shm_directory=None if memory is None else str(memory.directory),
             health=self.health,
         )
@@ -566,7 +611,13 @@ class _Opened:
             for problem in unmatched_names(core.play.running().scene, config.physics):
                 raise ModelError(problem)
         self._authored = self._mark(core)
+        self._dispatcher.served = [served.serving for served in (self._endpoint, memory) if served is not None]
+        self._watchdog = Watchdog(core, self._dispatcher, self.health)
+        self._watchdog.start()
         self._endpoint.start()
+        if config.dialect.instance and (config.index >= 0 or os.environ.get("URLAB_REGISTRY_DIR")):
+            self._registration = Registration(registry_directory(), self._instance)
+            self._registration.start()
         if memory is not None:
             memory.start(partial(answer, transport=Transport.SHM, max_reply_bytes=MAX_REPLY_BYTES))
         if not is_available():
@@ -575,6 +626,22 @@ class _Opened:
         if self.curve_keys is None and not is_loopback(self.host):
             logger.warning("open to anyone who reaches %s, without authentication or encryption", self.host)
         logger.info("serving at %s:%d", tcp(self.host), self._endpoint.port)
+
+    def _instance(self) -> InstanceInfo:
+        core = self._core
+        return InstanceInfo(
+            instance_id=self._instance_id,
+            index=self._index,
+            pid=self._pid,
+            host=socket.gethostname(),
+            step_port=self.endpoint.port,
+            state_port=self.streams.state_port,
+            cam_base_port=self.cameras.port,
+            manager_present=core is not None and core.play.manager_present,
+            busy=core is not None and core.lease.held,
+            urlab_version="" if core is None else core.dialect.urlab_version,
+            capabilities=["render_sync", "render_async", *(["shm_rpc"] if self._memory else []), "model_upload"],
+        )
 
     def _content(self, config: _Config) -> ContentRoot:
         folder = config.saved_dir
@@ -599,6 +666,7 @@ class _Opened:
         with dispatcher.standstill(CLOSE_S) as idle:
             if not idle or self._mark(core) != self._authored:
                 return False
+            core.lease = DriverLease()
             core.session, core.viewport, core.drawings = (
                 ServerSession(),
                 Viewport(),
@@ -626,9 +694,9 @@ class _Opened:
                 files.add((file, status.st_mtime_ns, status.st_size))
         return core.world.authored(), files
 
-    def _served(self) -> list[RpcEndpoint | StreamServer | CameraStreams | SharedMemoryServer]:
+    def _served(self) -> list[Watchdog | RpcEndpoint | StreamServer | CameraStreams | SharedMemoryServer]:
         """Return what has a thread; shared memory last, since the streams write to it."""
-        every = (self._endpoint, self._streams, self._cameras, self._memory)
+        every = (self._watchdog, self._endpoint, self._streams, self._cameras, self._memory)
         return [served for served in every if served is not None]
 
     def close(self) -> None:
@@ -642,8 +710,12 @@ class _Opened:
         for served in self._served():
             served.stop()
         idle = True
+        if self._registration is not None:
+            self._registration.stop()
+            idle = self._registration.join(max(0.0, deadline - time.monotonic()))
         if self._core is not None:
-            idle = self._core.play.close(CLOSE_S / 2)
+            self._core.jobs.close()
+            idle = self._core.play.close(CLOSE_S / 2) and idle
         for served in self._served():
             idle = served.join(max(0.0, deadline - time.monotonic())) and idle
         if not idle:

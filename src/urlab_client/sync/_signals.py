@@ -5,7 +5,9 @@ from __future__ import annotations
 import importlib
 import signal
 import threading
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable
+from itertools import repeat, starmap
 from operator import itemgetter
 from types import FrameType, TracebackType
 from typing import Any, Self
@@ -18,6 +20,8 @@ _signal: Any = importlib.import_module("_signal")
 _get_handler: Callable[[int], Any] = _signal.getsignal
 _set_handler: Callable[[int, Any], Any] = _signal.signal
 _raise_soon: Callable[[int], None] = importlib.import_module("_thread").interrupt_main
+# Runs an iterator of calls into C to its end in one call into C: no signal handler runs in between.
+_consume: Callable[[Iterable[object]], None] = deque[object](maxlen=0).extend
 
 
 class DeferredSignals:
@@ -30,32 +34,38 @@ class DeferredSignals:
         on_arrival: Called when a signal arrives, amid any code of the block. Must not raise.
     """
 
-    __slots__ = ("_arrived", "_holding", "_set_aside", "_undelivered", "on_arrival")
+    __slots__ = ("_arrived", "_handlers", "_holding", "_numbers", "_undelivered", "on_arrival")
 
     def __init__(self) -> None:
         self.on_arrival: Callable[[], object] | None = None
         self._holding = False
-        self._set_aside: list[tuple[int, Any]] = []
+        self._numbers: list[int] = []
+        self._handlers: list[Any] = []
         self._arrived: list[tuple[int, FrameType | None]] = []
         self._undelivered: map[None] | None = None
 
     def __enter__(self) -> Self:
-        try:
-            self._hold()
-        except BaseException:
-            self._restore()
-            raise
+        if threading.get_ident() == threading.main_thread().ident:
+            self._numbers = numbers = [number for number in _SIGNALS if callable(_get_handler(number))]
+            try:
+                # A list keeps what came before an exception: exactly the handlers that were replaced.
+                self._handlers.extend(map(_set_handler, numbers, repeat(self._on_signal)))
+                self._holding = True
+            except BaseException:  # a handler that was not set aside yet has raised
+                self._holding = True
+                try:
+                    self._put_back()
+                except BaseException:  # and another one
+                    self._put_back()
+                    raise
+                raise
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        try:
-            self._restore()
-        finally:
-            if self._undelivered is not None:
-                # One call into C: all of them are due before the first handler can run, and raise.
-                any(self._undelivered)
+        if self._holding:
+            self._put_back()
 
     @property
     def arrived(self) -> bool:
@@ -65,55 +75,46 @@ class DeferredSignals:
     def let_in(self) -> BaseException | None:
         """Run the handlers of what has arrived; return what the first one that raises has raised.
 
-        Those after it wait on. All handlers are set aside again.
+        The others wait on. Meanwhile handlers stay aside: there is no moment at which one could strike this very code.
         """
         try:
-            self._restore()
             while self._arrived:
                 number, frame = self._arrived.pop(0)
                 handler = _get_handler(number)
+                if handler == self._on_signal:  # and nobody has installed another one meanwhile
+                    handler = self._aside(number)
                 if callable(handler):
                     handler(number, frame)
         except BaseException as error:  # noqa: BLE001  # what it is, is the caller's business
             trace = error.__traceback__
             return error.with_traceback(None if trace is None else trace.tb_next)  # without this frame
-        finally:
-            self._hold()
         return None
 
-    def _hold(self) -> None:
-        if threading.get_ident() != threading.main_thread().ident:
-            return
+    def _put_back(self) -> None:
+        """Put the handlers back, and let those of signals that have arrived run, one by one as Python does."""
+        mine = self._on_signal
+        # Not those that somebody has replaced meanwhile.
+        aside = [pair for pair in zip(self._numbers, self._handlers) if _get_handler(pair[0]) == mine]  # noqa: B905
         try:
-            for number in _SIGNALS:
-                handler = _get_handler(number)
-                if callable(handler) and handler != self._on_signal:
-                    self._set_aside.append((number, handler))
-                    _set_handler(number, self._on_signal)
-            self._holding = True
-        except BaseException:  # a handler that was not set aside yet has raised
-            self._hold()
+            _consume(starmap(_set_handler, aside))
+        except BaseException:  # a handler that was back already has raised
+            _consume(starmap(_set_handler, aside))
             raise
-
-    def _restore(self) -> None:
-        """Put the handlers back. One that runs, and raises, as soon as it is back does not keep the others out."""
-        self._holding = False
-        try:
-            while self._set_aside:
-                number, handler = self._set_aside[-1]
-                if _get_handler(number) == self._on_signal:  # and not what somebody has installed meanwhile
-                    _set_handler(number, handler)
-                self._set_aside.pop()
         finally:
-            if self._set_aside:
-                self._restore()
+            self._holding = False
+            if self._undelivered is not None:
+                _consume(self._undelivered)
+
+    def _aside(self, number: int) -> Any:
+        """Return the handler that is aside, here or in a block around this one."""
+        handler = dict(zip(self._numbers, self._handlers, strict=False)).get(number)
+        outer = getattr(handler, "__self__", None)
+        return outer._aside(number) if isinstance(outer, DeferredSignals) else handler  # noqa: SLF001  # our own
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         if not self._holding:
-            # It strikes while handlers are being set aside or put back: it must not be lost, wherever that stands.
-            handler = dict(self._set_aside).get(number)
-            if handler is not None:
-                handler(number, frame)
+            # At the edges of the block, and after it if several signals have struck there: as if it were not aside.
+            self._aside(number)(number, frame)
             return
         if all(number != other for other, _ in self._arrived):
             self._arrived.append((number, frame))

@@ -12,7 +12,7 @@ from urlab_client.aio.control import CLAIM_S
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.model.elements import Actuator, Body, Joint, Sensor
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.enums import ControlMode
+from urlab_client.protocol.enums import ControlMode, OutOfRange
 from urlab_client.protocol.names import NameMap
 from urlab_client.sync._portal import Facade
 from urlab_client.sync.cameras import URLabCameraView
@@ -101,7 +101,8 @@ class URLabEntity(Facade, twin=aio.URLabEntity):
             torque: (tx, ty, tz), N m, world frame.
 
         Raises:
-            ValueError: A vector does not have three components.
+            TypeError: A component is not a number.
+            ValueError: A vector does not have three finite components.
         """
         self._aio.apply_xfrc(force=force, torque=torque)
 
@@ -181,7 +182,14 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
 
     @property
     def ctrl_array(self) -> Floats:
-        """Set-points that the next step sends, shape (n_actuators,). A live view: write to it in place."""
+        """Set-points that the next step sends, shape (n_actuators,). A live view: write to it in place.
+
+        Assigning to the property checks the values; `step()` refuses NaN and infinities that were written in place.
+
+        Raises:
+            TypeError: On assigning what is not numbers.
+            ValueError: On assigning NaN, infinities or another number of values.
+        """
         return self._aio.ctrl_array
 
     @ctrl_array.setter
@@ -238,16 +246,19 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
         """Angular velocity of the root, shape (3,), rad/s, body frame (as MuJoCo stores it)."""
         return self._aio.root_ang_vel_b
 
-    def set_ctrl(self, values: Mapping[str, float]) -> None:
+    def set_ctrl(self, values: Mapping[str, float], *, out_of_range: str | OutOfRange = "allow") -> None:
         """Set some set-points by actuator name; the others keep their last value.
 
         Args:
             values: Actuator name to set-point.
+            out_of_range: What becomes of a value outside its actuator's range; see `Actuator.set_control`.
 
         Raises:
             KeyError: A name is unknown; nothing was set.
+            TypeError: A value is not a number; nothing was set.
+            ValueError: A value is NaN, infinite, or, with `error`, out of range; nothing was set.
         """
-        self._aio.set_ctrl(values)
+        self._aio.set_ctrl(values, out_of_range=out_of_range)
 
     def get_ctrl(self) -> dict[str, float]:
         """Return the set-points that the next step sends, by actuator name."""
@@ -284,7 +295,8 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
 
         Raises:
             KeyError: The articulation has no such body.
-            ValueError: A vector does not have three components, or the body must be named.
+            TypeError: A component is not a number.
+            ValueError: A vector does not have three finite components, or the body must be named.
         """
         self._aio.apply_xfrc(body, force=force, torque=torque)
 

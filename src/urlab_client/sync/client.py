@@ -349,6 +349,7 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
             StepTimeout: The server did not finish within its 5 s; the steps are still queued there.
             OutcomeUnknown: The connection broke: the steps may or may not have been taken. `resync()` finds out.
             KeyError: Unknown camera; nothing was sent.
+            ValueError: A set-point is NaN or infinite, or in puppet mode something in `data`; nothing was sent.
         """
         return self._portal.call(
             self._aio.step, n_steps, include_cameras=include_cameras, observations=observations, timeout=timeout
@@ -376,6 +377,8 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
         Raises:
             UnknownKeyframe: No keyframe, or more than one, has this name; nothing was reset.
             KeyError: Unknown articulation or joint; nothing was sent.
+            TypeError: A position is not a number; nothing was sent.
+            ValueError: A position is NaN or infinite; nothing was sent.
         """
         return self._portal.call(self._aio.reset, keyframe_name, seed, per_articulation_qpos, timeout=timeout)
 

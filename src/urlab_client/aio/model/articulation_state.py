@@ -6,14 +6,16 @@ its record to a new model.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
-from urlab_client.aio.model.layout import ArticulationLayout
+from urlab_client._mujoco import control_counts, control_starts
+from urlab_client.aio.model.layout import JOINT_TRANSMISSIONS, ArticulationLayout
 from urlab_client.aio.model.mirror import Mirror
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.enums import ControlMode
+from urlab_client.protocol.enums import ControllerKind, ControlMode
 from urlab_client.protocol.errors import ProtocolError
 from urlab_client.protocol.messages.session import (
     ArticulationCommand,
@@ -280,7 +282,11 @@ class MirroredArticulation(MirroredEntity):
         """Write set-points that changed since the last time into the mirror's `ctrl`, for a puppet step.
 
         Those that did not change are left alone: in puppet mode `client.data.ctrl` is the user's to write.
+
+        Raises:
+            ValueError: A set-point is NaN or infinite.
         """
+        self._set_points()
         data = self.mirror.data
         if data is not None and not np.array_equal(self.ctrl, self._written_ctrl):
             data.ctrl[self.layout.ctrl_adr] = self.ctrl
@@ -301,17 +307,87 @@ class MirroredArticulation(MirroredEntity):
         return self._driven or not np.array_equal(self.ctrl, self._left_ctrl)
 
     def live_command(self) -> ArticulationCommand:
-        """Return what a live step tells the articulation: the server ignores anything but `ctrl`."""
-        return ArticulationCommand(ctrl=self.ctrl.tolist())
+        """Return what a live step tells the articulation: the server ignores anything but `ctrl`.
+
+        Raises:
+            ValueError: A set-point is NaN or infinite.
+        """
+        return ArticulationCommand(ctrl=self._set_points())
 
     def direct_command(self) -> ArticulationCommand:
-        """Return what a direct step tells the articulation."""
+        """Return what a direct step tells the articulation.
+
+        Raises:
+            ValueError: A set-point is NaN or infinite.
+        """
         bypass = self.controller is not None and self.control_mode is ControlMode.RAW
         return ArticulationCommand(
-            ctrl=self.ctrl.tolist(),
+            ctrl=self._set_points(),
             control_mode=str(ControlMode.RAW) if bypass else None,
             xfrc_applied=self._compiled(self.wrenches) or None,
         )
+
+    def _set_points(self) -> list[float]:
+        values: list[float] = self.ctrl.tolist()
+        # The sum is not finite either when one of them is not, and costs a tenth of looking at each.
+        if not math.isfinite(sum(values)) and (strange := self.not_finite()):
+            problem = f"set-points of articulation {self.name!r} are not finite: {', '.join(strange)}"
+            raise ValueError(f"step: {problem}. Nothing was sent.")
+        return values
+
+    def not_finite(self) -> list[str]:
+        """Return the set-points that are NaN or infinite, as `'elbow' nan`."""
+        return [f"{self.input_name(i)} {self.ctrl[i]}" for i in np.flatnonzero(~np.isfinite(self.ctrl)).tolist()]
+
+    def out_of_range(self) -> list[str]:
+        """Return the set-points outside their range, as `'elbow' 5 (-1 to 1)`."""
+        low, high = self.ranges()
+        outside = np.flatnonzero((self.ctrl < low) | (self.ctrl > high)).tolist()
+        return [f"{self.input_name(i)} {self.ctrl[i]:g} ({low[i]:g} to {high[i]:g})" for i in outside]
+
+    def input_name(self, i: int) -> str:
+        """Return the quoted name of the actuator of a set-point, with the number of its input if it has several."""
+        model = self.mirror.model
+        if model is None:
+            return repr([*self.info.actuator_types][i])
+        counts = control_counts(model)
+        for name, actuator in self.layout.actuators.items():
+            count = int(counts[actuator])
+            if i < count:
+                return repr(name) if count == 1 else f"{name!r} input {i}"
+            i -= count
+        raise IndexError(i)
+
+    def ranges(self) -> tuple[Floats, Floats]:
+        """Return the least and the largest value of each set-point, infinite where there is none or it is not known.
+
+        Set-points are controls, and those of a PD controller in force are positions of the joint that is driven.
+        """
+        low, high = np.full(len(self.ctrl), -np.inf), np.full(len(self.ctrl), np.inf)
+        model, controller = self.mirror.model, self.controller
+        if model is None:
+            return low, high
+        positions = (
+            controller is not None
+            and controller.kind == ControllerKind.PD
+            and self.control_mode is ControlMode.UE_CONTROLLER
+        )
+        counts, starts = control_counts(model), control_starts(model)
+        start = 0
+        for actuator in self.layout.actuators.values():
+            count, first = int(counts[actuator]), int(starts[actuator])
+            joint = int(model.actuator_trnid[actuator][0])
+            if not positions:
+                limited = model.actuator_ctrllimited[first : first + count].astype(bool)
+                bounds = model.actuator_ctrlrange[first : first + count]
+            elif count == 1 and model.actuator_trntype[actuator] in JOINT_TRANSMISSIONS:
+                limited, bounds = model.jnt_limited[[joint]].astype(bool), model.jnt_range[[joint]]
+            else:
+                limited, bounds = np.zeros(count, dtype=bool), np.zeros((count, 2))
+            where = start + np.flatnonzero(limited)
+            low[where], high[where] = bounds[limited].T
+            start += count
+        return low, high
 
     def _compiled(self, wrenches: Wrenches) -> Wrenches:
         """Return wrenches by names that the server finds: where robots have public names, only compiled ones."""

@@ -10,17 +10,16 @@ import numpy as np
 
 from urlab_client._mujoco import control_counts, control_starts, force_counts
 from urlab_client.aio.model.articulation_state import MirroredArticulation
-from urlab_client.aio.model.layout import QPOS_WIDTH, QVEL_WIDTH
+from urlab_client.aio.model.layout import JOINT_TRANSMISSIONS, QPOS_WIDTH, QVEL_WIDTH
+from urlab_client.aio.model.numbers import finite, finite_array, is_array
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.enums import ActuatorType, known
+from urlab_client.protocol.enums import ActuatorType, OutOfRange, known
 from urlab_client.protocol.names import NameMap
 
 if TYPE_CHECKING:
     import mujoco
 
 __all__ = ["Actuator", "ArticulationElements", "Body", "Joint", "Sensor", "make_elements"]
-
-_JOINT_TRANSMISSIONS = (0, 1)  # mjTRN_JOINT, mjTRN_JOINTINPARENT
 
 
 class Actuator:
@@ -95,10 +94,34 @@ class Actuator:
         """The set-point (its first input), as the next step will send it."""
         return float(self._record.ctrl[self.ctrl_local.start])
 
-    def set_control(self, v: float | Sequence[float]) -> None:
-        """Set the set-point that the next step sends; a sequence for actuators with several inputs."""
+    def set_control(self, v: float | Sequence[float] | Floats, *, out_of_range: str | OutOfRange = "allow") -> None:
+        """Set the set-point that the next step sends.
+
+        Args:
+            v: The set-point; for actuators with several inputs a sequence.
+            out_of_range: What becomes of a value outside the actuator's range: `error` refuses it, `clamp` takes the
+                nearest value inside, `allow` sends it as it is. The range is the control range; while a PD controller
+                is in force it is that of the driven joint. Without a local model no range is known.
+
+        Raises:
+            TypeError: It is not a number.
+            ValueError: It is NaN, infinite, or, with `error`, out of range; nothing was set.
+        """
+        value = self.checked(v, OutOfRange(out_of_range))
         self._record.drive()
-        self._record.ctrl[self.ctrl_local] = v
+        self._record.ctrl[self.ctrl_local] = value
+
+    def checked(self, v: object, out_of_range: OutOfRange) -> float | Floats:
+        """Return what `set_control` would set; raises as it does."""
+        what = f"actuator {self.name!r} of {self._record.name!r}"
+        value = finite_array(what, v) if is_array(v) else finite(what, v)
+        if out_of_range is OutOfRange.ALLOW:
+            return value
+        low, high = (bounds[self.ctrl_local] for bounds in self._record.ranges())
+        inside = np.clip(value, low, high)
+        if out_of_range is OutOfRange.ERROR and np.any(inside != value):
+            raise ValueError(f"{what} takes {_listed(low)} to {_listed(high)}, got {v}. Nothing was set")
+        return inside
 
     def __repr__(self) -> str:
         return f"<Actuator {self.name!r} id={self.id}>"
@@ -285,7 +308,7 @@ def _actuators(record: MirroredArticulation, model: mujoco.MjModel | None) -> li
     controls, starts, forces = control_counts(model), control_starts(model), force_counts(model)
     for name, i in record.layout.actuators.items():
         kind = types.get(name)
-        driven = int(model.actuator_trnid[i][0]) if model.actuator_trntype[i] in _JOINT_TRANSMISSIONS else -1
+        driven = int(model.actuator_trnid[i][0]) if model.actuator_trntype[i] in JOINT_TRANSMISSIONS else -1
         width, first = int(controls[i]), int(starts[i])
         actuators.append(
             Actuator(
@@ -315,3 +338,7 @@ def _sensors(record: MirroredArticulation, model: mujoco.MjModel | None) -> list
 
 def _interval(bounds: Floats) -> tuple[float, float]:
     return float(bounds[0]), float(bounds[1])
+
+
+def _listed(bounds: Floats) -> str:
+    return ", ".join(f"{bound:g}" for bound in bounds)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from urlab_client._mujoco import without_newer_attributes
+from urlab_client.aio.model.numbers import first_not_finite
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.errors import ProtocolError, URLabVersionMismatch
 from urlab_client.protocol.messages.session import HelloOk, Perturbation
@@ -244,6 +245,23 @@ class Mirror:
             self._dragged = perturbation.body_id
             self.data.xfrc_applied[self._dragged] = perturbation.xfrc
 
+    def check_finite(self) -> None:
+        """Check what a push is about to send, before the local step. Call under the lock.
+
+        Raises:
+            ValueError: Time, or something in `qpos`, `qvel` or `ctrl`, is NaN or infinite.
+        """
+        model, data = self.model, self.data
+        if model is None or data is None:
+            return
+        if not math.isfinite(data.time):
+            raise ValueError(f"step: data.time is {data.time}. Nothing was sent.")
+        for what, array in (("qpos", data.qpos), ("qvel", data.qvel), ("ctrl", data.ctrl)):
+            i = first_not_finite(array)
+            if i is not None:
+                whose = f" of {_owner(model, what, i)}" if what != "ctrl" else ""
+                raise ValueError(f"step: data.{what}[{i}]{whose} is {array[i]}. Nothing was sent.")
+
     def mark_stale(self) -> None:
         """Note that positions or velocities changed, so that derived quantities must be computed before use."""
         self._stale = True
@@ -272,3 +290,10 @@ class Mirror:
             velocity = np.zeros(6)
             mujoco.mj_objectVelocity(*pair, mujoco.mjtObj.mjOBJ_XBODY, body_id, velocity, 0)
             return velocity
+
+
+def _owner(model: mujoco.MjModel, what: str, i: int) -> str:
+    """Return the joint that a position or velocity belongs to."""
+    starts = model.jnt_qposadr if what == "qpos" else model.jnt_dofadr
+    joint = int(np.searchsorted(starts, i, side="right")) - 1
+    return f"joint {model_names(model, 'joint')[joint]!r}"

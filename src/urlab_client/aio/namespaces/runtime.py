@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import numpy as np
 
 from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.model.numbers import finite
 from urlab_client.aio.namespaces._base import Vector, fill, target_by
 from urlab_client.aio.namespaces._ops import RuntimeOps
 from urlab_client.aio.session import Session
 from urlab_client.aio.state.sim_state import SimState
+from urlab_client.protocol.base import Floats
 from urlab_client.protocol.codec import building
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.messages.runtime import ContactFilter, GetContacts, SetQpos, SetSimOptions, SetUserChannels
 from urlab_client.protocol.messages.session import Forward, ForwardOk
+from urlab_client.protocol.sim_options import check_sim_options
 from urlab_client.protocol.types import ContactsResult, SimOptions
 
 __all__ = ["RuntimeNamespace"]
+
+_NUMPY = (np.ndarray, np.generic)
 
 
 class RuntimeNamespace(RuntimeOps):
@@ -43,10 +48,22 @@ class RuntimeNamespace(RuntimeOps):
         Raises:
             UnknownArticulation: No articulation has this key or actor id.
             DimMismatch: The number of values does not fit.
+            TypeError: Some are not numbers; nothing was sent.
+            ValueError: Some are NaN or infinite; nothing was sent.
         """
-        values = np.asarray(tuple(qpos), dtype=np.float64)
+        values = self._positions(target, qpos, by_name=by_name)
         reply = await self._call(SetQpos(target=target, qpos=values, target_by=target_by(by_name)), timeout)
         self._state.mirror_qpos(reply.actor_name, reply.qpos)
+
+    def _positions(self, target: str, qpos: Vector, *, by_name: bool) -> Floats:
+        values = tuple(qpos)
+        arts = self._state.articulations if by_name else self._state.articulations_by_id
+        joints = {j.qpos_local_offset: name for name, j in arts[target].joints.items()} if target in arts else {}
+        joint = ""
+        for i, value in enumerate(values):
+            joint = joints.get(i, joint)
+            finite(f"set_qpos: qpos[{i}]{f', joint {joint!r}' if joint else ''}", value)
+        return np.array(values, dtype=np.float64)
 
     async def get_contacts(
         self,
@@ -86,14 +103,25 @@ class RuntimeNamespace(RuntimeOps):
 
         Raises:
             TypeError: An unknown option, or one of the wrong type; nothing was sent.
+            ValueError: A number that the option cannot be, such as a timestep of 0 or NaN; nothing was sent.
             BadValue: Unknown integrator, cone or solver.
         """
         unknown = sorted(set(opts) - set(SimOptions.__struct_fields__))
         if unknown:
             known = ", ".join(SimOptions.__struct_fields__)
-            raise TypeError(f"set_sim_options: unknown option {', '.join(unknown)}; it takes {known}")
-        with building():
-            options = msgspec.convert(opts, SimOptions)
+            raise TypeError(f"set_sim_options: unknown option {', '.join(unknown)}; it takes {known}.")
+        plain: dict[str, Any] = {
+            name: cast("np.ndarray[Any, Any]", value).tolist() if isinstance(value, _NUMPY) else value
+            for name, value in opts.items()
+        }
+        try:
+            with building():
+                options = msgspec.convert(plain, SimOptions)
+            check_sim_options(options)
+        except msgspec.ValidationError as error:
+            raise TypeError(f"set_sim_options: {error}. Nothing was sent.") from None
+        except ValueError as error:
+            raise ValueError(f"set_sim_options: {error}. Nothing was sent.") from None
         reply = await self._call(SetSimOptions(options=options), timeout)
         self._state.mirror_options(reply.options)
         return reply.options

@@ -7,13 +7,14 @@ end of its file kills the process: so whoever touches one asks `intact` first.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import mmap
 import os
 import stat
 import sys
 from pathlib import Path
 
-from urlab_client.aio.transport.windows import NamedLock
+from urlab_client._windows import NamedLock
 from urlab_client.protocol.errors import ProtocolError
 from urlab_client.protocol.fence import processor_fence
 from urlab_client.protocol.shm import HEADER_SIZE, LAYOUT_SIZE, RegionNotReady, attach
@@ -85,7 +86,9 @@ class MappedRegion:
 
     def _take_lock(self) -> bool:
         if sys.platform == "win32":
-            self._lock = NamedLock(f"Local\\URLab_{self.path.parent.name}_client")
+            # Of this file: servers call their directories by the same name.
+            place = hashlib.sha256(os.path.normcase(self.path.resolve()).encode()).hexdigest()[:16]
+            self._lock = NamedLock(f"Local\\URLab_{place}_client")
             return self._lock.held
         try:
             fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)

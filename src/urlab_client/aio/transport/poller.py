@@ -42,7 +42,7 @@ class RegionPoll:
     """
 
     def __init__(
-        self, probe: Callable[[], bool], notify: Callable[[], None], block: Callable[[float], None] | None = None
+        self, probe: Callable[[], bool], notify: Callable[[], None], block: Callable[[float], object] | None = None
     ) -> None:
         self.probe = probe
         self.notify = notify
@@ -136,7 +136,7 @@ class Poller:
             if block is not None:
                 block(min(pause, _BLOCK_S))
 
-    def _look(self) -> tuple[float, Callable[[float], None] | None]:
+    def _look(self) -> tuple[float, Callable[[float], object] | None]:
         """Look at everything once; return how long to sleep, and how."""
         pause, block, now = _SLOWEST_S, None, time.monotonic()
         for watch in self._watches:

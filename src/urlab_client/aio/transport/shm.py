@@ -20,11 +20,11 @@ from typing import Final
 import msgspec
 from msgspec import Struct
 
+from urlab_client._windows import NamedEvent
 from urlab_client.aio.transport.base import RequestTransport
 from urlab_client.aio.transport.busy_poll import BusyPoll
 from urlab_client.aio.transport.mapped_region import MappedRegion, RegionInUse
 from urlab_client.aio.transport.poller import Doorbell, Poller, ReplyPoll
-from urlab_client.aio.transport.windows import NamedEvent
 from urlab_client.protocol import doorbell
 from urlab_client.protocol.base import Effect, Needs, Op
 from urlab_client.protocol.codec import encode_request

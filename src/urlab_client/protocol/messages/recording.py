@@ -134,6 +134,7 @@ OPS: Final = (
         ns="recording",
         method="start",
         needs=Needs.MANAGER,
+        infinite=("max_duration_s",),
         errors=("not_ready", "recording_already_active"),
         declares=(),
     ),

@@ -278,6 +278,7 @@ OPS: Final = (
         request=ConfigureController,
         ns="runtime",
         needs=Needs.MANAGER,
+        infinite=("params",),
         errors=(
             "not_ready",
             "missing_field",

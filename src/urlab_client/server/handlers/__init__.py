@@ -1,6 +1,29 @@
 """The op handlers. Importing this package registers all of them; ops without one answer `unsupported`."""
 
-from urlab_client.server.handlers import debug, options, outliner, recording, runtime, scene, session, sim, viewport
+from urlab_client.server.handlers import (
+    control,
+    debug,
+    options,
+    outliner,
+    recording,
+    runtime,
+    scene,
+    session,
+    sim,
+    viewport,
+)
 from urlab_client.server.rpc.dispatch import HANDLERS
 
-__all__ = ["HANDLERS", "debug", "options", "outliner", "recording", "runtime", "scene", "session", "sim", "viewport"]
+__all__ = [
+    "HANDLERS",
+    "control",
+    "debug",
+    "options",
+    "outliner",
+    "recording",
+    "runtime",
+    "scene",
+    "session",
+    "sim",
+    "viewport",
+]

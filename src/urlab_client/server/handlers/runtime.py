@@ -40,6 +40,7 @@ from urlab_client.protocol.messages.runtime import (
 )
 from urlab_client.protocol.types import Contact, KeyframeInfo
 from urlab_client.server.core import ServerCore
+from urlab_client.server.handlers.control import check_all_owners, check_owner
 from urlab_client.server.physics.controllers import ArticulationControl
 from urlab_client.server.physics.engine import Engine, parse_control_source, parse_mode
 from urlab_client.server.refusal import Refusal
@@ -54,7 +55,7 @@ def set_mode(server: ServerCore, request: SetMode) -> SetModeOk:
     engine = server.play.running().engine
     if engine.pinned_mode is not None:
         engine.set_mode(StepMode.LIVE)  # refuses, before the field is looked at
-    previous, current = engine.set_mode(parse_mode(need(request, request.mode, "mode")))
+    previous, current = engine.set_mode(parse_mode(need(request, request.mode, "mode"), server.dialect))
     return SetModeOk(previous_mode=previous, current_mode=current)
 
 
@@ -78,8 +79,10 @@ def set_control_source(server: ServerCore, request: SetControlSource) -> SetCont
     engine = server.play.running().engine
     source = parse_control_source(need(request, request.source, "source"))
     if not request.articulation:
+        check_all_owners(server, request)
         engine.set_control_source(source)
         return SetControlSourceOk(source=source, scope="global")
+    check_owner(server, request, engine.control(request.articulation))
     engine.set_control_source(source, request.articulation)
     return SetControlSourceOk(source=source, scope="articulation", articulation=request.articulation)
 
@@ -96,6 +99,7 @@ class AnyTwist(SetTwist, tag="set_twist", kw_only=True):
 def set_twist(server: ServerCore, request: AnyTwist) -> SetTwistOk:
     engine = server.play.running().engine
     key = need(request, request.articulation, "articulation")
+    check_owner(server, request, engine.control(key))
     twist = engine.set_twist(key, request.linear, request.angular)
     return SetTwistOk(articulation=key, linear=twist.linear, angular=twist.angular)
 
@@ -113,7 +117,9 @@ def set_qpos(server: ServerCore, request: SetQpos) -> SetQposOk:
     engine, model, data = running.engine, running.scene.model, running.scene.data
     target = need(request, request.target, "target")
     by_name = request.target_by == "actor_name"
-    index = engine.control(target).index if by_name else _by_actor_id(engine, target).index
+    control = engine.control(target) if by_name else _by_actor_id(engine, target)
+    check_owner(server, request, control)
+    index = control.index
     qpos = need(request, request.qpos, "qpos")
     if not len(index.joints):
         raise Refusal("no_joints", f"articulation '{index.key}' has no joints")

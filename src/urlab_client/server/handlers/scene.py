@@ -24,6 +24,8 @@ from urlab_client.protocol.messages.scene import (
     ImportXmlOk,
     LoadLevel,
     LoadLevelOk,
+    RemoveActor,
+    RemoveActorOk,
     SaveLevel,
     SaveLevelOk,
     SetActorTransform,
@@ -180,6 +182,12 @@ def spawn_light(server: ServerCore, request: SpawnLight) -> SpawnLightOk:
 def destroy_actor(server: ServerCore, request: DestroyActor) -> DestroyActorOk:
     server.world.destroy_actor(need(request, request.target, "target"))
     return DestroyActorOk(requires_pie_restart=server.world.pie_running)
+
+
+@handles(RemoveActor)
+def remove_actor(server: ServerCore, request: RemoveActor) -> RemoveActorOk:
+    server.world.destroy_actor(need(request, request.target, "target"))
+    return RemoveActorOk(requires_pie_restart=server.world.pie_running)
 
 
 @handles(DestroyAsset)

@@ -11,6 +11,7 @@ import msgspec
 import mujoco
 
 from urlab_client.protocol.enums import ObservationLevel, StepMode
+from urlab_client.protocol.messages.control import UNCLAIMED
 from urlab_client.protocol.messages.session import (
     ArticulationInfo,
     CameraInfo,
@@ -32,6 +33,7 @@ from urlab_client.protocol.messages.session import (
 )
 from urlab_client.server.compile.scene import EntityIndex
 from urlab_client.server.core import ServerCore
+from urlab_client.server.handlers.control import check_owner
 from urlab_client.server.physics.controllers import ArticulationControl, float32
 from urlab_client.server.physics.observe import sim_clock, wall_clock
 from urlab_client.server.physics.play import Running
@@ -65,6 +67,8 @@ def handshake(server: ServerCore, session_id: str, *, include_assets: bool = Fal
     )
     if not server.play.manager_present:
         return reply
+    if server.instance is not None:
+        reply.instance = server.instance()
     reply.shm_session_dir = server.shm_directory
     reply.entities = {}
     reply.global_cameras = {}
@@ -72,9 +76,9 @@ def handshake(server: ServerCore, session_id: str, *, include_assets: bool = Fal
     if running is None:
         return reply
     scene, engine = running.scene, running.engine
-    with engine.lock:
+    with engine.look():
         reply.mjb = scene.mjb()
-        reply.articulations = [_articulation(server, control) for control in engine.controls.values()]
+        reply.articulations = [_articulation(server, name, control) for name, control in engine.controls.items()]
     reply.mjb_base64 = msgspec.Raw(msgspec.msgpack.encode(base64.b64encode(reply.mjb).decode("ascii")))
     reply.mjb_size = len(reply.mjb)
     reply.entities = {entity.name: _entity(entity) for entity in scene.entities}
@@ -83,12 +87,13 @@ def handshake(server: ServerCore, session_id: str, *, include_assets: bool = Fal
     return reply
 
 
-def _articulation(server: ServerCore, control: ArticulationControl) -> ArticulationInfo:
-    index, controller = control.index, control.controller
+def _articulation(server: ServerCore, name: str, control: ArticulationControl) -> ArticulationInfo:
+    index, controller, dialect = control.index, control.controller, server.dialect
     names = index.original_names
     return ArticulationInfo(
-        prefix=index.key,
+        prefix=name,
         actor_id=index.actor_id,
+        actor_name=index.key if dialect.public_names else None,
         default_control_mode="raw" if controller is None else "ue_controller",
         controller=None
         if controller is None
@@ -101,12 +106,12 @@ def _articulation(server: ServerCore, control: ArticulationControl) -> Articulat
             bodies=dict(names["bodies"]),
         ),
         camera_topics={
-            camera.name: CameraInfo(
+            dialect.camera_key(name, camera.name): CameraInfo(
                 mode=server.physics.camera_mode(index, camera.name),
                 resolution=camera.resolution,
                 fovy=float32(camera.fovy),
-                zmq_endpoint=server.camera_endpoint(index.key, camera.name),
-                zmq_topic=f"{index.key}/camera/{camera.name}",
+                zmq_endpoint=server.camera_endpoint(name, dialect.camera_part(camera.name)),
+                zmq_topic=dialect.camera_topic(name, camera.name),
             )
             for camera in index.cameras
         },
@@ -158,28 +163,48 @@ def meta(server: ServerCore, request: Meta) -> MetaOk:
 @handles(Step)
 def step(server: ServerCore, request: Step) -> StepOk | bytes:
     running = server.play.running()
+    _check_owners(server, running, request)
     most = server.limits.n_steps
     if request.n_steps > most:
         raise Refusal("bad_request", f"step: {request.n_steps} steps are more than the limit n_steps, {most}")
-    if running.engine.mode in (StepMode.DIRECT, StepMode.PUPPET):
-        server.session.adopt_level(request.observations)
-    level = server.session.level
+    level = server.session.level_of(request.observations)
+    if server.dialect.level_sticks:
+        if running.engine.mode in (StepMode.DIRECT, StepMode.PUPPET):
+            server.session.level = level
+        level = server.session.level
     shots = running.cameras.shots(request.include_cameras)
 
     if not shots:
-        if server.session.json or running.engine.replay is not None:
+        if server.session.json or running.engine.replay is not None or running.channels.declared:
             return running.engine.step(request, lambda _: _observe_step(running, level))
         engine, encode = running.engine, running.step_frames.encode
-        return engine.step(request, lambda _: encode(level, engine.time, engine.step_count))
+        return engine.step(request, lambda _: encode(level, engine.time, engine.step_count, engine.frame_id))
 
     def observe(mode: StepMode) -> tuple[StepOk, StepMode, Exposure | None]:
-        stepped = mode in (StepMode.DIRECT, StepMode.PUPPET)
+        stepped = mode in (StepMode.DIRECT, StepMode.PUPPET) or server.dialect.camera_forms
         return _observe_step(running, level), mode, running.cameras.capture(shots) if stepped else None
 
     reply, mode, exposure = running.engine.step(request, observe)
-    if mode in (StepMode.DIRECT, StepMode.PUPPET):
+    if exposure is not None or mode in (StepMode.DIRECT, StepMode.PUPPET):
         reply.cameras = running.cameras.frames(shots, exposure)
     return reply
+
+
+def _check_owners(server: ServerCore, running: Running, request: Step) -> None:
+    """Refuse commands to robots that are not the sender's, where robots have owners.
+
+    Raises:
+        Refusal: `not_control_owner`; nothing was applied.
+    """
+    if not server.dialect.claims:
+        return
+    for name, command in (request.per_articulation or {}).items():
+        if command.ctrl is None and command.ctrl_map is None and command.xfrc_applied is None:
+            continue
+        control = running.engine.find(name)
+        if control is None:
+            raise Refusal("not_control_owner", f"there is no articulation '{name}'", owner=UNCLAIMED)
+        check_owner(server, request, control)
 
 
 def _observe_step(running: Running, level: ObservationLevel) -> StepOk:
@@ -192,6 +217,7 @@ def _observe_step(running: Running, level: ObservationLevel) -> StepOk:
         wall_time=wall_clock(),
         per_articulation=observer.articulations(level),
         entities=observer.entities(),
+        frame_id=engine.frame_id if engine.dialect.frame_ids else None,
         replay=None
         if engine.replay is None
         else ReplayProgress(current_frame=engine.replay.current_frame, total_frames=engine.replay.total_frames),

@@ -57,7 +57,7 @@ class ControlSource(StrEnum):
 
 
 class SetPoints:
-    """Staged set-points of one articulation, one float32 per control; they persist until overwritten.
+    """Staged set-points of one articulation, one number per control; they persist until overwritten.
 
     Attributes:
         network: Written by `step` and the control topic, shape (n controls,).
@@ -67,18 +67,19 @@ class SetPoints:
 
     __slots__ = ("_places", "network", "source", "ui")
 
-    network: Float32s
-    ui: Float32s
+    network: Float32s | Float64s
+    ui: Float32s | Float64s
     source: ControlSource
 
-    def __init__(self, neutral: Sequence[float] | Float64s, places: Mapping[str, int]) -> None:
+    def __init__(self, neutral: Sequence[float] | Float64s, places: Mapping[str, int], *, exact: bool = False) -> None:
         """Start from neutral controls.
 
         Args:
             neutral: Controls after a reset, in the articulation's order, shape (n controls,).
             places: Short and compiled actuator names to the position of the actuator's first control.
+            exact: Keep what is staged by position as it is; else everything is rounded to float32.
         """
-        self.network = _float32_array(neutral).copy()
+        self.network = np.array(neutral, dtype=np.float64) if exact else _float32_array(neutral).copy()
         self.ui = self.network.copy()
         self.source = ControlSource.ZMQ
         folded: dict[str, int] = {}
@@ -87,14 +88,15 @@ class SetPoints:
         self._places = {**folded, **places}
 
     @property
-    def selected(self) -> Float32s:
+    def selected(self) -> Float32s | Float64s:
         """The set-points of the source in force, shape (n controls,)."""
         return self.network if self.source is ControlSource.ZMQ else self.ui
 
     def stage(self, values: Sequence[float] | Float64s) -> None:
         """Stage network set-points by position; surplus ones are ignored, missing ones keep their value."""
         count = min(len(values), len(self.network))
-        self.network[:count] = _float32_array(values[:count])
+        with np.errstate(over="ignore"):  # beyond the range of float32 lies infinity, as in C
+            self.network[:count] = values[:count]
 
     def stage_named(self, values: Mapping[str, float]) -> None:
         """Stage network set-points by short or compiled actuator name; unknown names are ignored.
@@ -273,7 +275,7 @@ class Controller(ABC):
         return self.enabled and bool(self._binding.names)
 
     @abstractmethod
-    def write(self, set_points: Float32s, qpos: Float64s, qvel: Float64s, ctrl: Float64s) -> None:
+    def write(self, set_points: Float32s | Float64s, qpos: Float64s, qvel: Float64s, ctrl: Float64s) -> None:
         """Write the bound actuators' entries of `ctrl`. All arrays may have leading axes, the same ones.
 
         Args:
@@ -301,7 +303,7 @@ class PassthroughController(Controller):
 
     kind = "base"
 
-    def write(self, set_points: Float32s, qpos: Float64s, qvel: Float64s, ctrl: Float64s) -> None:
+    def write(self, set_points: Float32s | Float64s, qpos: Float64s, qvel: Float64s, ctrl: Float64s) -> None:
         """Copy the bound set-points."""
         del qpos, qvel
         ctrl[..., self._binding.ctrl_adr] = set_points.take(self._binding.places, axis=-1)
@@ -326,7 +328,7 @@ class PDController(Controller):
         self._gains = {name: np.full(count, self._defaults[name], dtype=np.float32) for name in _GAINS}
         self._rows = {name: row for row, name in enumerate(self.bound)}
 
-    def write(self, set_points: Float32s, qpos: Float64s, qvel: Float64s, ctrl: Float64s) -> None:
+    def write(self, set_points: Float32s | Float64s, qpos: Float64s, qvel: Float64s, ctrl: Float64s) -> None:
         """Write the bound actuators' torques or forces."""
         binding, gains = self._binding, self._gains
         with np.errstate(all="ignore"):  # overflow and NaN follow IEEE, as in the plugin
@@ -384,7 +386,13 @@ class ArticulationControl:
     twist: Twist
 
     def __init__(
-        self, model: mujoco.MjModel, index: ArticulationIndex, neutral: Float64s, config: ControllerConfig | None = None
+        self,
+        model: mujoco.MjModel,
+        index: ArticulationIndex,
+        neutral: Float64s,
+        config: ControllerConfig | None = None,
+        *,
+        exact: bool = False,
     ) -> None:
         """Bind to a compiled model.
 
@@ -393,6 +401,7 @@ class ArticulationControl:
             index: The articulation.
             neutral: `mjData.ctrl` of the whole model after a reset, shape (nu,).
             config: Controller to attach; None for raw controls.
+            exact: Keep set-points as they are; else they are rounded to float32.
         """
         self.index = index
         places: dict[str, int] = {}
@@ -400,7 +409,7 @@ class ArticulationControl:
             places[f"{index.prefix}{name}"] = place
         places.update({name: places[f"{index.prefix}{name}"] for name in index.actuator_names})
         self._ctrl_adr = index.ctrl_adr.astype(np.intp)
-        self.set_points = SetPoints(neutral[self._ctrl_adr], places)
+        self.set_points = SetPoints(neutral[self._ctrl_adr], places, exact=exact)
         self.controller = _attach(model, index, config)
         self.twist = Twist()
 

@@ -12,7 +12,9 @@ import math
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Container, Generator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from types import MappingProxyType, TracebackType
 from typing import Any, Final, Generic, Self, TypeVar, cast
 
@@ -21,16 +23,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client._mujoco import reset_controls
+from urlab_client.protocol.dialects import ALPHA, Dialect
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.messages.session import ArticulationCommand, Step
-from urlab_client.server.compile.scene import CompiledScene
+from urlab_client.server.compile.scene import ArticulationIndex, CompiledScene
 from urlab_client.server.physics.controllers import ArticulationControl, ControllerConfig, ControlSource, Twist, float32
 from urlab_client.server.physics.replay import Player
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.system.health import Health
 from urlab_client.server.system.thread_join import ended, within
 
-__all__ = ["DataLock", "Engine", "parse_control_source", "parse_mode"]
+__all__ = ["DataLock", "Engine", "Overdue", "parse_control_source", "parse_mode"]
 
 logger = logging.getLogger("urlab_client.server")
 
@@ -61,21 +64,25 @@ SLICE_S: Final = 0.05
 MAX_SLICE: Final = 1000
 """Sub-steps in such a slice at most, for models that get slower while they run."""
 
+LEAST_PATIENCE_S: Final = 1.0
+"""A call of MuJoCo does not count as overdue before; a slice of a long request may take a while on a busy machine."""
+
 INLINE_SHARE: Final = 0.02
 """A direct step expected to take less than this share of the step timeout runs on the calling thread."""
 
 
-def parse_mode(text: str) -> StepMode:
-    """Return the step mode called `text`, in any case; `streaming` is another name of live.
+def parse_mode(text: str, dialect: Dialect = ALPHA) -> StepMode:
+    """Return the step mode called `text`, in any case; `streaming` is another name of live, `auto` in newer dialects.
 
     Raises:
         Refusal: `bad_mode`.
     """
     name = text.casefold()
     try:
-        return StepMode.LIVE if name == "streaming" else StepMode(name)
+        mode = StepMode.LIVE if name == "streaming" else StepMode(name)
     except ValueError:
         raise Refusal("bad_mode", f"unknown step mode '{text}': use live, direct, puppet or auto") from None
+    return StepMode.LIVE if mode is StepMode.AUTO and not dialect.auto_mode else mode
 
 
 def parse_control_source(text: str) -> ControlSource:
@@ -103,7 +110,11 @@ class Engine:
         lock: Guards the model, the data and this object. Re-entrant. `with engine.lock` raises a `not_ready` refusal
             when physics keeps it for longer than the step timeout. Not to be held while calling `step` or `close`,
             which may have to wait for the physics thread.
-        controls: Set-points, controller and twist of each articulation, by articulation key.
+        dialect: What the server says in the way of one generation of the plugin.
+        controls: Set-points, controller and twist of each articulation, by what it is called in requests and replies.
+        names: What each articulation is called in requests and replies, by the key of its compiled names.
+        frame_id: Number of the newest snapshot of the state; grows with each request that steps, and in live mode with
+            each iteration that moves.
         on_substep: Called under the lock after each integration step and each puppet push.
         on_tick: Called under the lock after each live iteration (also while paused) and each direct request, and about
             ten times a second while a stepped mode idles. A hook of either list that raises is logged and removed.
@@ -119,6 +130,7 @@ class Engine:
         controllers: Mapping[str, ControllerConfig] = MappingProxyType({}),
         step_timeout_s: float = 5.0,
         health: Health | None = None,
+        dialect: Dialect = ALPHA,
     ) -> None:
         """Prepare a scene for stepping; `start` sets it going.
 
@@ -129,9 +141,12 @@ class Engine:
             controllers: Controller to attach by articulation key; `*` stands for all keys not listed.
             step_timeout_s: Seconds a direct step may take before its caller is told `step_timeout`.
             health: Told when the physics thread dies.
+            dialect: Decides what articulations are called, and what steps do besides.
         """
         self.scene = scene
-        self.lock = DataLock(step_timeout_s)
+        self.dialect = dialect
+        self._call = _MujocoCall(max(step_timeout_s, LEAST_PATIENCE_S))
+        self.lock = DataLock(step_timeout_s, self._call)
         self.on_substep: list[Hook] = []
         self.on_tick: list[Hook] = []
         self.seed: int | None = None
@@ -145,16 +160,26 @@ class Engine:
         everyone = controllers.get("*")
         self.controls: Mapping[str, ArticulationControl] = MappingProxyType(
             {
-                index.key: ArticulationControl(self._model, index, neutral, controllers.get(index.key, everyone))
-                for index in scene.articulations
+                name: ArticulationControl(
+                    self._model,
+                    index,
+                    neutral,
+                    controllers.get(index.key, everyone),
+                    exact=not dialect.controls_float32,
+                )
+                for name, index in _named(scene, dialect)
             }
         )
-        self._folded = {key.casefold(): control for key, control in reversed([*self.controls.items()])}
+        self._folded = _folded(self.controls, dialect)
+        self._names = {control: name for name, control in self.controls.items()}
+        self.names: Mapping[str, str] = {control.index.key: name for name, control in self.controls.items()}
         self._pinned = None if pinned_mode is StepMode.AUTO else pinned_mode
         self._mode = self._pinned or StepMode.LIVE
         self._paused = paused
         self._speed = 100.0
         self._step_count = 0
+        self.frame_id = 0
+        self._live_pushed: list[int] = []
         self._fault: str | None = None
         self._death: str | None = None
         self._health = Health() if health is None else health
@@ -198,7 +223,11 @@ class Engine:
         """
         first, self._stopping = not self._stopping, True
         deadline = time.monotonic() + timeout
-        idle = within(timeout, lambda seconds: self.lock.inner.acquire(timeout=seconds))
+        idle = within(timeout / 2.0, lambda seconds: self.lock.inner.acquire(timeout=seconds))
+        if not idle:
+            # Whatever its solver still iterates for is no longer wanted: any improvement is too small to go on.
+            self._model.opt.tolerance = self._model.opt.noslip_tolerance = math.inf
+            idle = within(timeout / 2.0, lambda seconds: self.lock.inner.acquire(timeout=seconds))
         if idle:
             self._wake.notify_all()
             self.lock.inner.release()
@@ -253,6 +282,26 @@ class Engine:
     def fault(self) -> str | None:
         """What stopped physics, or None. Cleared by a reset, by unpausing and by a change of mode."""
         return self._fault
+
+    @property
+    def overdue(self) -> Overdue | None:
+        """The call of MuJoCo that has not come back for longer than a step may take, or None."""
+        return self._call.overdue
+
+    @contextmanager
+    def look(self) -> Generator[None]:
+        """Hold the lock, or go without it while MuJoCo does not come back: for what no step changes.
+
+        Raises:
+            Refusal: `not_ready` when physics is busy, but comes back.
+        """
+        with ExitStack() as held:
+            try:
+                held.enter_context(self.lock)
+            except Refusal:
+                if self.overdue is None:
+                    raise
+            yield
 
     @property
     def replay(self) -> Player | None:
@@ -312,12 +361,12 @@ class Engine:
                 `shutting_down`, or `not_ready` with MuJoCo's text after a physics error.
         """
         deadline = time.monotonic() + self._step_timeout_s
-        if not self.lock.inner.acquire(timeout=self._step_timeout_s):
+        if not self.lock.acquire():
             if self._mode is not StepMode.DIRECT:
                 raise _busy()
             queued = _QueuedStep(request, observe)
             self._queue.append(queued)
-            return queued.wait(0.0, self._step_timeout_s)
+            return self._await(queued, 0.0)
         try:
             mode = self._mode
             if self._stopping:
@@ -331,6 +380,10 @@ class Engine:
                 raise Refusal("not_ready", self._fault)
             if mode is not StepMode.DIRECT:
                 self._stage_positional(request)
+                if self.dialect.live_commands:
+                    commands = request.per_articulation or {}
+                    self._stage_named(commands)
+                    self._live_pushed += self._apply_wrenches(commands)
                 self._kick()
                 return observe(mode)
             n_steps = max(1, request.n_steps)
@@ -346,7 +399,10 @@ class Engine:
             self._wake.notify()
         finally:
             self.lock.inner.release()
-        return queued.wait(deadline - time.monotonic(), self._step_timeout_s)
+        return self._await(queued, deadline - time.monotonic())
+
+    def _await(self, queued: _QueuedStep[T], remaining: float) -> T:
+        return queued.wait(remaining, self._step_timeout_s, runs_late=self.dialect.late_steps)
 
     def reset(
         self,
@@ -383,7 +439,7 @@ class Engine:
                 else:
                     mujoco.mj_resetDataKeyframe(self._model, self._data, key)
                 self._override_joints(per_articulation_qpos or {})
-                mujoco.mj_forward(self._model, self._data)
+                self._forward()
             except Exception as error:
                 raise self._fail(error) from error
             self._step_count = 0
@@ -399,7 +455,7 @@ class Engine:
         with self.lock:
             self._tick_if_due()
             try:
-                mujoco.mj_forward(self._model, self._data)
+                self._forward()
             except Exception as error:
                 raise self._fail(error) from error
 
@@ -484,8 +540,12 @@ class Engine:
 
     def reset_step_count(self) -> None:
         """Set the step counter to 0, as a handshake does."""
-        with self.lock:
+        with self.look():
             self._step_count = 0
+
+    def name(self, control: ArticulationControl) -> str:
+        """Return what an articulation is called in requests and replies."""
+        return self._names[control]
 
     # What follows runs under the lock.
 
@@ -542,10 +602,12 @@ class Engine:
         self._tick_if_due()
         n_steps = max(1, n_steps)
         try:
-            player.advance(n_steps)
+            with self._call:
+                player.advance(n_steps)
         except Exception as error:
             raise self._fail(error) from error
         self._step_count += n_steps
+        self.frame_id += 1
         self._tick_due = bool(self.on_tick)
 
     def _run_direct(self, request: Step) -> None:
@@ -567,6 +629,7 @@ class Engine:
             if pushed:
                 self._xfrc[pushed] = 0.0
         self._step_count += n_steps
+        self.frame_id += 1
         self._tick_due = bool(self.on_tick)
 
     def _integrate(self, n_steps: int, raw: Container[ArticulationControl]) -> None:
@@ -579,13 +642,14 @@ class Engine:
                 raise _shutting_down()
             count = min(n_steps, MAX_SLICE, max(1, int(SLICE_S / self._substep_s)))
             started = time.perf_counter()
-            if every_substep:
-                for _ in range(count):
-                    self._apply_controls(raw)
-                    mj_step(model, data)
-                    _call(self.on_substep)
-            else:
-                mj_step(model, data, count)
+            with self._call:
+                if every_substep:
+                    for _ in range(count):
+                        self._apply_controls(raw)
+                        mj_step(model, data)
+                        _call(self.on_substep)
+                else:
+                    mj_step(model, data, count)
             self._substep_s = max((time.perf_counter() - started) / count, 1e-9)
             n_steps -= count
 
@@ -599,11 +663,16 @@ class Engine:
                 target[:] = values
         self._data.time = request.time or 0.0
         try:
-            mujoco.mj_forward(self._model, self._data)
+            self._forward()
         except Exception as error:
             raise self._fail(error) from error
         _call(self.on_substep)
         self._step_count += 1
+        self.frame_id += 1
+
+    def _forward(self) -> None:
+        with self._call:
+            mujoco.mj_forward(self._model, self._data)
 
     def _override_joints(self, overrides: Mapping[str, Mapping[str, float]]) -> None:
         for key, joints in overrides.items():
@@ -668,6 +737,8 @@ class Engine:
             self._wake.wait(IDLE_S)
 
     def _serve(self, queued: _QueuedStep[Any]) -> None:
+        if not queued.begin():
+            return
         try:
             self._run_direct(queued.request)
             queued.succeed()
@@ -684,8 +755,13 @@ class Engine:
         self._slot = now if now - due > MAX_LAG_S else due
         self._apply_controls()
         if not self._paused:
-            mujoco.mj_step(self._model, self._data)
-            _call(self.on_substep)
+            with self._call:
+                mujoco.mj_step(self._model, self._data)
+                _call(self.on_substep)
+            self.frame_id += 1
+        if self._live_pushed:
+            self._xfrc[self._live_pushed] = 0.0
+            self._live_pushed.clear()
         self._tick()
         if time.perf_counter() - self._last_rest > HOLD_S:
             self._wake.wait(GIVE_WAY_S)
@@ -699,6 +775,48 @@ class Engine:
         return min(period, MAX_PERIOD_S) if period > MIN_PERIOD_S else MIN_PERIOD_S
 
 
+@dataclass(frozen=True)
+class Overdue:
+    """A call of MuJoCo that takes longer than a step may.
+
+    Attributes:
+        thread: The thread that is in it.
+        began_at: When it began, seconds of `time.perf_counter`.
+        seconds: How long ago that is.
+    """
+
+    thread: threading.Thread
+    began_at: float
+    seconds: float
+
+
+class _MujocoCall:
+    """Which thread is inside MuJoCo, and since when. Entered under the engine's lock, looked at by everybody."""
+
+    __slots__ = ("_patience_s", "_under_way")
+
+    def __init__(self, patience_s: float) -> None:
+        self._patience_s = patience_s
+        self._under_way: tuple[threading.Thread, float] | None = None
+
+    def __enter__(self) -> None:
+        self._under_way = threading.current_thread(), time.perf_counter()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._under_way = None
+
+    @property
+    def overdue(self) -> Overdue | None:
+        under_way = self._under_way
+        if under_way is None:
+            return None
+        thread, began_at = under_way
+        seconds = time.perf_counter() - began_at
+        return Overdue(thread, began_at, seconds) if seconds > self._patience_s else None
+
+
 class DataLock:
     """A re-entrant lock around model and data whose `with` gives up after a time.
 
@@ -706,20 +824,39 @@ class DataLock:
         inner: The lock itself, for the physics thread and for waits with deadlines of their own.
     """
 
-    __slots__ = ("_timeout", "inner")
+    __slots__ = ("_call", "_timeout", "inner")
 
-    def __init__(self, timeout: float) -> None:
+    def __init__(self, timeout: float, call: _MujocoCall) -> None:
         """Make a lock that nobody holds.
 
         Args:
             timeout: Seconds after which entering raises `Refusal` with `not_ready`: a step request may legally keep
                 physics busy for hours, and no other request may hang for that.
+            call: Tells when there is nothing to wait for.
         """
         self.inner = threading.RLock()
         self._timeout = timeout
+        self._call = call
+
+    def acquire(self) -> bool:
+        """Take the lock, if it becomes free in time.
+
+        Raises:
+            Refusal: `not_ready`, at once, while MuJoCo does not come back.
+        """
+        if self.inner.acquire(blocking=False):
+            return True
+        overdue = self._call.overdue
+        if overdue is not None:
+            raise Refusal(
+                "not_ready",
+                f"physics has not come back from MuJoCo for {overdue.seconds:.0f} s: play goes on when it does, and "
+                "stop_pie ends it",
+            )
+        return self.inner.acquire(timeout=self._timeout)
 
     def __enter__(self) -> None:
-        if not self.inner.acquire(timeout=self._timeout):
+        if not self.acquire():
             raise _busy()
 
     def __exit__(
@@ -736,8 +873,17 @@ class _QueuedStep(Generic[T]):
         self._observe = observe
         self._settled = threading.Event()
         self._abandoned = False
+        self._begun = False
+        self._dropped = False
+        self._lock = threading.Lock()
         self._results: list[T] = []
         self._error: Exception | None = None
+
+    def begin(self) -> bool:
+        """Return whether it is to be done; its caller may have been told that it will not be."""
+        with self._lock:
+            self._begun = True
+            return not self._dropped
 
     def succeed(self) -> None:
         """Observe for the caller, if it still waits, and release it. The engine's lock is held."""
@@ -750,19 +896,20 @@ class _QueuedStep(Generic[T]):
         self._error = error
         self._settled.set()
 
-    def wait(self, remaining: float, timeout: float) -> T:
+    def wait(self, remaining: float, timeout: float, *, runs_late: bool) -> T:
         """Return the observation, or raise what the step raised.
 
         Args:
             remaining: Seconds until `step_timeout` is raised.
             timeout: Seconds since the request came in by then.
+            runs_late: Whether it stays queued then although it has not begun.
         """
         if not self._settled.wait(max(0.0, remaining)):
             self._abandoned = True
-            raise Refusal(
-                "step_timeout",
-                f"the step did not finish within {timeout:g} s; it stays queued and runs when physics gets to it",
-            )
+            with self._lock:
+                self._dropped = not (runs_late or self._begun)
+            fate = "is not done any more" if self._dropped else "runs to its end when physics gets to it"
+            raise Refusal("step_timeout", f"the step did not finish within {timeout:g} s; it {fate}")
         if self._error is not None:
             raise self._error
         return self._results[0]
@@ -802,6 +949,26 @@ class _WarningLog:
 
 
 _mujoco_warnings = _WarningLog()
+
+
+def _named(scene: CompiledScene, dialect: Dialect) -> list[tuple[str, ArticulationIndex]]:
+    """Return each articulation by what it is called; of two that would be called alike, the later by its actor."""
+    named: dict[str, ArticulationIndex] = {}
+    for index in scene.articulations:
+        name = dialect.robot_key(index.actor_id, index.key)
+        named[index.key if name in named else name] = index
+    return list(named.items())
+
+
+def _folded(controls: Mapping[str, ArticulationControl], dialect: Dialect) -> dict[str, ArticulationControl]:
+    """Return the articulations by all that requests may call them, in one case; the first to claim a name has it."""
+    folded = {name.casefold(): control for name, control in reversed([*controls.items()])}
+    if dialect.public_names:
+        for control in controls.values():
+            for name in (control.index.key, control.index.actor_id):
+                if name:
+                    folded.setdefault(name.casefold(), control)
+    return folded
 
 
 def _call(hooks: list[Hook]) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from urlab_client.protocol.enums import ObservationLevel
 from urlab_client.protocol.messages.session import ArticulationState, BodyPose, Clock, EntityState, TwistState
 from urlab_client.server.compile.scene import CompiledScene, EntityIndex
+from urlab_client.server.physics.channels import SCENE, UserChannels
 from urlab_client.server.physics.controllers import ArticulationControl
 
 __all__ = ["Observer", "sim_clock", "wall_clock"]
@@ -106,13 +108,20 @@ def _sensors(
 class Observer:
     """Reads reply blocks from a scene's data."""
 
-    def __init__(self, scene: CompiledScene, controls: Mapping[str, ArticulationControl]) -> None:
+    def __init__(
+        self,
+        scene: CompiledScene,
+        controls: Mapping[str, ArticulationControl],
+        channels: UserChannels | None = None,
+    ) -> None:
         """Prepare for a scene.
 
         Args:
             scene: The scene.
             controls: `Engine.controls` of the engine that steps it; holds the twists.
+            channels: The user channels; None for none.
         """
+        self._channels = channels
         data = scene.data
         self._readers = {key: _StateReader(scene.model, data, control) for key, control in controls.items()}
         self._entities = scene.entities
@@ -123,7 +132,15 @@ class Observer:
 
     def articulations(self, level: ObservationLevel) -> dict[str, ArticulationState]:
         """Return the state of every articulation by key, with the fields of `level`."""
-        return {key: reader.read(level) for key, reader in self._readers.items()}
+        states = {key: reader.read(level) for key, reader in self._readers.items()}
+        if self._channels is not None and self._channels.declared and level is not ObservationLevel.MINIMAL:
+            for key, state in states.items():
+                state.user = self._channels.of(key)
+        return states
+
+    def scene_channels(self) -> dict[str, Any]:
+        """Return the channels of the scene by name."""
+        return {} if self._channels is None else self._channels.of(SCENE) or {}
 
     def entities(self) -> dict[str, EntityState]:
         """Return the state of every entity by name; `qpos` (7,) and `qvel` (6,) for those with a free joint."""

@@ -15,6 +15,7 @@ from msgspec import Struct
 
 from urlab_client._mujoco import set_threads, thread_limit
 from urlab_client.protocol.base import Vec3
+from urlab_client.protocol.dialects import ALPHA, Dialect
 from urlab_client.protocol.types import SimOptions
 from urlab_client.server.assets.option_ranges import option_problem
 from urlab_client.server.limits import Limits
@@ -37,6 +38,7 @@ CHOICES: Final = {
         "newton": mujoco.mjtSolver.mjSOL_NEWTON,
     },
 }
+MJCF_SPELLING: Final = {"euler": "Euler", "rk4": "RK4", "pgs": "PGS", "cg": "CG", "newton": "Newton"}
 SCALARS: Final = (
     "timestep",
     "density",
@@ -113,15 +115,17 @@ class OptionOverrides:
     only once they have been used, so that raw masks stay as they were sent.
     """
 
-    def __init__(self, model: mujoco.MjModel, limits: Limits) -> None:
+    def __init__(self, model: mujoco.MjModel, limits: Limits, dialect: Dialect = ALPHA) -> None:
         """Start with the integrator the scene was compiled with.
 
         Args:
             model: The model of the play session.
             limits: For the iterations.
+            dialect: Decides the precision of numbers and the spelling of keywords.
         """
         self._limits = limits
-        self._kept: dict[str, Any] = {"integrator": int(model.opt.integrator), "sleep_tolerance": float32(1e-4)}
+        self._dialect = dialect
+        self._kept: dict[str, Any] = {"integrator": int(model.opt.integrator), "sleep_tolerance": self._number(1e-4)}
         self._threads = 0
 
     def apply(self, model: mujoco.MjModel, data: mujoco.MjData, options: SimOptions) -> OptionsInForce:
@@ -134,10 +138,10 @@ class OptionOverrides:
         """
         given = [(name, value) for name in IN_ORDER if (value := getattr(options, name)) is not None]
         for name, value in given:
-            if name not in CHOICES and (problem := option_problem(name, _stored(name, value), self._limits)):
+            if name not in CHOICES and (problem := option_problem(name, self._stored(name, value), self._limits)):
                 raise Refusal("bad_value", problem)
         for name, value in given:
-            self._kept[name] = _stored(name, value)
+            self._kept[name] = self._stored(name, value)
         opt, kept = model.opt, self._kept
         for name in ("disableflags", "enableflags"):
             mask = getattr(options, name)
@@ -179,9 +183,9 @@ class OptionOverrides:
             tolerance=opt.tolerance,
             iterations=opt.iterations,
             ls_iterations=opt.ls_iterations,
-            integrator=_choice("integrator", opt.integrator),
-            cone=_choice("cone", opt.cone),
-            solver=_choice("solver", opt.solver),
+            integrator=self._choice("integrator", opt.integrator),
+            cone=self._choice("cone", opt.cone),
+            solver=self._choice("solver", opt.solver),
             noslip_iterations=opt.noslip_iterations,
             noslip_tolerance=opt.noslip_tolerance,
             ccd_iterations=opt.ccd_iterations,
@@ -193,25 +197,27 @@ class OptionOverrides:
             enableflags=opt.enableflags,
         )
 
+    def _stored(self, name: str, value: Any) -> Any:
+        if name in CHOICES:
+            found = CHOICES[name].get(value.casefold())
+            if found is None:
+                raise Refusal("bad_value", f"unknown {name} '{value}': use {', '.join(CHOICES[name])}")
+            return int(found)
+        if name in SCALARS:
+            return self._number(value)
+        if name in SCALED:
+            return [self._number(item * 100.0) / 100.0 for item in value] if self._dialect.options_float32 else value
+        if name == "magnetic":
+            return [self._number(item) for item in value]
+        return value
 
-def _stored(name: str, value: Any) -> Any:
-    if name in CHOICES:
-        found = CHOICES[name].get(value.casefold())
-        if found is None:
-            raise Refusal("bad_value", f"unknown {name} '{value}': use {', '.join(CHOICES[name])}")
-        return int(found)
-    if name in SCALARS:
-        return float32(value)
-    if name in SCALED:
-        return [float32(item * 100.0) / 100.0 for item in value]
-    if name == "magnetic":
-        return [float32(item) for item in value]
-    return value
+    def _number(self, value: float) -> float:
+        return float32(value) if self._dialect.options_float32 else value
 
-
-def _choice(name: str, number: int) -> str:
-    """Return an option's name; a model of its own options may use one that the protocol has no name for."""
-    return next((text for text, item in CHOICES[name].items() if int(item) == int(number)), str(int(number)))
+    def _choice(self, name: str, number: int) -> str:
+        """Return an option's name; a model of its own options may use one that the protocol has no name for."""
+        text = next((text for text, item in CHOICES[name].items() if int(item) == int(number)), str(int(number)))
+        return text if self._dialect.options_float32 else MJCF_SPELLING.get(text, text)
 
 
 def _vec3(values: np.ndarray[Any, np.dtype[np.float64]]) -> Vec3:

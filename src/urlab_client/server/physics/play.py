@@ -10,7 +10,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Final
@@ -18,6 +18,8 @@ from typing import Final
 from urlab_client.protocol.enums import PIEState
 from urlab_client.server.compile.scene import CompiledScene, CompileFailed
 from urlab_client.server.limits import Limits
+from urlab_client.server.physics.channels import UserChannels
+from urlab_client.server.physics.claims import ControlClaims
 from urlab_client.server.physics.engine import Engine
 from urlab_client.server.physics.observe import Observer
 from urlab_client.server.physics.options import OptionOverrides
@@ -45,6 +47,7 @@ class Running:
         cameras: What draws its cameras.
         recordings: Files in the folder of recordings at the start.
         limits: How much is done for clients.
+        channels: The user channels.
     """
 
     scene: CompiledScene
@@ -53,16 +56,22 @@ class Running:
     cameras: CameraRenderer
     recordings: Sequence[Path] = ()
     limits: Limits = _DEFAULT_LIMITS
+    channels: UserChannels = field(default_factory=lambda: UserChannels({}))
+
+    @cached_property
+    def claims(self) -> ControlClaims:
+        """Who owns which robot."""
+        return ControlClaims()
 
     @cached_property
     def step_frames(self) -> StepReplies:
         """What encodes the replies to `step`."""
-        return StepReplies(self.scene, self.engine.controls)
+        return StepReplies(self.scene, self.engine.controls, self.engine.dialect)
 
     @cached_property
     def options(self) -> OptionOverrides:
         """What `set_sim_options` remembers."""
-        return OptionOverrides(self.scene.model, self.limits)
+        return OptionOverrides(self.scene.model, self.limits, self.engine.dialect)
 
     @cached_property
     def sessions(self) -> ReplaySessions:

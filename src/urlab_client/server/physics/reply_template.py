@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client.protocol.codec import encode_reply
+from urlab_client.protocol.dialects import ALPHA, Dialect
 from urlab_client.protocol.enums import ObservationLevel
 from urlab_client.protocol.messages.session import Clock, StepOk
 from urlab_client.server.compile.scene import CompiledScene
@@ -33,39 +34,44 @@ _FLOAT64: Final = b"\xcb"
 _MARK: Final = 2.0**52
 """The first mark: whole, so that it also fits where integers go, and as good as never a constant of a reply."""
 
-_CLOCKS: Final = 6
-"""Time, step counter, and seconds and nanoseconds of both clocks."""
+_CLOCKS: Final = 7
+"""Time, step counter, seconds and nanoseconds of both clocks, and the snapshot's number."""
 
 
 class StepReplies:
     """Encodes the replies to `step` of a scene."""
 
-    def __init__(self, scene: CompiledScene, controls: Mapping[str, ArticulationControl]) -> None:
+    def __init__(
+        self, scene: CompiledScene, controls: Mapping[str, ArticulationControl], dialect: Dialect = ALPHA
+    ) -> None:
         """Prepare for a scene.
 
         Args:
             scene: The scene.
             controls: `Engine.controls` of the engine that steps it; holds the twists.
+            dialect: What the replies look like.
         """
         self._scene = scene
+        self._dialect = dialect
         self._controls = controls
         self._twists = [control.twist for control in controls.values()]
         self._sources = _arrays(scene.data)
         self._templates: dict[ObservationLevel, _ReplyTemplate] = {}
 
-    def encode(self, level: ObservationLevel, time: float, step: int) -> bytes:
+    def encode(self, level: ObservationLevel, time: float, step: int, frame_id: int = 0) -> bytes:
         """Return the msgpack frame of a `StepOk` without cameras and replay. The caller holds the engine's lock.
 
         Args:
             level: Which fields it has.
             time: `mjData.time`, seconds.
             step: Step counter.
+            frame_id: Number of the snapshot, in dialects that tell it.
         """
         template = self._templates.get(level)
         if template is None:
             template = self._templates[level] = self._cut(level)
         sim, wall = sim_clock(time), wall_clock()
-        numbers = [time, step, sim.sec, sim.nsec, wall.sec, wall.nsec]
+        numbers = [time, step, sim.sec, sim.nsec, wall.sec, wall.nsec, frame_id]
         for twist in self._twists:
             numbers += (twist.vx, twist.vy, twist.yaw_rate, twist.actions)
         return template.fill(numbers)
@@ -74,7 +80,7 @@ class StepReplies:
         temporary_folder = mujoco.MjData(self._scene.model)
         controls = {key: copy.copy(control) for key, control in self._controls.items()}
         marks = iter(range(int(_MARK), int(_MARK) + _CLOCKS + 4 * len(controls)))
-        time, step, sec, nsec, wall_sec, wall_nsec = (next(marks) for _ in range(_CLOCKS))
+        time, step, sec, nsec, wall_sec, wall_nsec, frame_id = (next(marks) for _ in range(_CLOCKS))
         for control in controls.values():
             control.twist = Twist(next(marks), next(marks), next(marks), next(marks))
         first = _MARK + _CLOCKS + 4 * len(controls)
@@ -89,8 +95,9 @@ class StepReplies:
             wall_time=Clock(sec=wall_sec, nsec=wall_nsec),
             per_articulation=observer.articulations(level),
             entities=observer.entities(),
+            frame_id=frame_id if self._dialect.frame_ids else None,
         )
-        return _ReplyTemplate(encode_reply(reply), _CLOCKS + 4 * len(controls), self._sources)
+        return _ReplyTemplate(encode_reply(self._dialect.shaped(reply)), _CLOCKS + 4 * len(controls), self._sources)
 
 
 class _ReplyTemplate:

@@ -29,7 +29,7 @@ import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Any, Final, Literal, Self, TypeAlias
 
 import mujoco
@@ -37,6 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client._children import APART
+from urlab_client.protocol.dialects import ALPHA, Dialect
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import CameraChoice, CameraFrame
@@ -305,6 +306,9 @@ class CameraRenderer:
         classes: Mapping[str, str],
         quality: RenderQuality = "auto",
         health: Health | None = None,
+        *,
+        names: Mapping[str, str] = MappingProxyType({}),
+        dialect: Dialect = ALPHA,
     ) -> None:
         """Prepare for a scene; nothing is drawn, and no OpenGL looked for, before a frame is wanted.
 
@@ -314,6 +318,8 @@ class CameraRenderer:
             classes: By actor name, the class or mesh that the colours of `semantic` and `instance` go by.
             quality: How well to draw.
             health: Told when the thread that draws dies.
+            names: What articulations are called in requests and replies, by key; that, for those not mentioned.
+            dialect: Decides what cameras are called there.
         """
         self._scene = scene
         self._health = Health() if health is None else health
@@ -324,8 +330,9 @@ class CameraRenderer:
         for index in scene.articulations:
             for info in index.cameras:
                 camera = _Camera(info, modes.get((index.key, info.name), CameraMode.REAL))
-                self._by_name[f"{index.key}/{info.name}"] = camera
-                self._bare[info.name] = camera  # of several, the last
+                robot = names.get(index.key, index.key)
+                self._by_name[f"{robot}/{dialect.camera_part(info.name)}"] = camera
+                self._bare[dialect.camera_key(robot, info.name)] = camera  # of several, the last
         self._model: mujoco.MjModel | None = None
         self._spare: list[mujoco.MjData] = []  # making one takes longer than copying a state
         self._queue: queue.SimpleQueue[Exposure | Painting | None] = queue.SimpleQueue()

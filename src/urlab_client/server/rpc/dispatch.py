@@ -11,14 +11,18 @@ from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from typing import Any, Final, TypeVar, get_args, get_type_hints
 
-from urlab_client.protocol.base import Effect, Needs, Reply, Request
+import msgspec
+
+from urlab_client.protocol.base import Effect, Needs, Op, Reply, Request
 from urlab_client.protocol.codec import encode_reply
 from urlab_client.protocol.enums import Transport
+from urlab_client.protocol.messages.jobs import OpStarted
 from urlab_client.protocol.messages.session import ErrorReply
 from urlab_client.protocol.registry import OPS
 from urlab_client.server.core import ServerCore
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.requests import Incoming, RequestReader
+from urlab_client.server.system.serving_thread import ServingThread
 
 __all__ = ["HANDLERS", "Dispatcher", "Handler", "HandlerTable", "handles"]
 
@@ -28,6 +32,11 @@ Q = TypeVar("Q", bound=Request[Any])
 A = TypeVar("A", bound=Reply | bytes)
 Handler = Callable[[ServerCore, Any], Reply | bytes]
 """Returns the reply, or its msgpack frame where that is quicker to make; a session in JSON gets replies only."""
+
+_WITHOUT_SESSION: Final = frozenset({"hello", "meta"})
+_NO_SIGN_OF_USE: Final = frozenset({"hello", "meta", "pie_status", "op_status", "acquire_lease", "release_lease"})
+_BESIDE_JOBS: Final = frozenset({"op_status", "pie_status"})
+"""Ops of the editor that do not wait for jobs before them."""
 
 BARE_NAMES: Final = ("recording", "replay")
 """Namespaces whose ops are looked up in any case but recognise only their exact name."""
@@ -81,8 +90,18 @@ HANDLERS: Final = HandlerTable()
 handles = HANDLERS.handles
 
 
+RENEWED_S: Final = 0.25
+"""How soon a request notices that the lock it waits for is not the one any more."""
+
+
 class Dispatcher:
-    """Answers requests, one at a time whatever transport they came by."""
+    """Answers requests, one at a time whatever transport they came by.
+
+    Attributes:
+        served: The threads that call `answer`.
+    """
+
+    served: list[ServingThread]
 
     def __init__(self, core: ServerCore, table: HandlerTable) -> None:
         """Prepare for a server.
@@ -95,6 +114,8 @@ class Dispatcher:
         self._handlers: Mapping[str, Handler] = table.handlers
         self._reader = RequestReader(ops=core.dialect.ops, structs=table.structs, limits=core.world.content.limits)
         self._lock = threading.Lock()
+        self._name = ""
+        self.served = []
 
     def answer(
         self, frame: bytes, transport: Transport = Transport.ZMQ, *, max_reply_bytes: int | None = None
@@ -106,36 +127,82 @@ class Dispatcher:
             transport: How it came; shared memory does not take the editor's ops.
             max_reply_bytes: Longest reply that can be sent. A request whose reply cannot be shorter is not executed.
         """
-        with self._lock:
-            name = "request"
+        lock = self._enter()
+        try:
+            self._name = name = "request"
             try:
                 incoming = self._reader.read(frame)
-                name = incoming.name or name
+                self._name = name = incoming.name or name
                 reply = self._serve(incoming, transport, max_reply_bytes)
-                frame = reply if isinstance(reply, bytes) else encode_reply(reply, json=self._core.session.json)
-                return _fitting(frame, incoming, max_reply_bytes)
-            except Refusal as refusal:
-                path = refusal.absolute_path if refusal.code == "path_not_writable" else None
-                error = ErrorReply(code=refusal.code, message=refusal.message, absolute_path=path)
-            except Exception as failure:
-                logger.exception("%s failed", name)
-                error = ErrorReply(
-                    code="internal_error",
-                    message=f"{name}: the server failed with {type(failure).__name__}; its log has the details",
-                )
-            return encode_reply(error, json=self._core.session.json)
+                return _fitting(self._encoded(reply), incoming, max_reply_bytes)
+            except Exception as failure:  # noqa: BLE001 - whatever happens, there is an answer
+                return encode_reply(_error(name, failure), json=self._core.session.json)
+        finally:
+            lock.release()
+
+    def _encoded(self, reply: Reply | bytes) -> bytes:
+        core = self._core
+        return reply if isinstance(reply, bytes) else encode_reply(core.dialect.shaped(reply), json=core.session.json)
 
     @contextmanager
     def standstill(self, timeout: float) -> Generator[bool]:
         """Answer no request meanwhile; yields False if the one under way did not end within `timeout` seconds."""
-        idle = self._lock.acquire(timeout=timeout)
+        lock = self._lock
+        idle = lock.acquire(timeout=timeout)
         try:
             yield idle
         finally:
             if idle:
-                self._lock.release()
+                lock.release()
+
+    def relieve(self, thread: threading.Thread) -> bool:
+        """Answer the request that a thread does not come back from, and let another thread serve.
+
+        What was asked for goes on, and takes effect when MuJoCo comes back, as a step does that is queued.
+
+        Returns:
+            False when the thread serves no request, or has come back.
+        """
+        error = ErrorReply(
+            code="step_timeout",
+            message=f"{self._name}: MuJoCo has not come back from it; it takes effect when MuJoCo does, "
+            "unless stop_pie ends play before",
+        )
+        reply = encode_reply(error, json=self._core.session.json)
+        return any(serving.relieve(thread, reply, self._renew) for serving in self.served)
+
+    def _renew(self) -> None:
+        """Leave the lock to the thread that does not come back."""
+        self._lock = threading.Lock()
+
+    def _enter(self) -> threading.Lock:
+        """Wait for one's turn and return the lock to release after it."""
+        while True:
+            lock = self._lock
+            if lock.acquire(timeout=RENEWED_S):
+                if lock is self._lock:
+                    return lock
+                lock.release()
 
     def _serve(self, incoming: Incoming, transport: Transport, max_reply_bytes: int | None) -> Reply | bytes:
+        core, request = self._core, incoming.request
+        op = self._admitted(incoming, transport)
+        handler = self._handlers.get(op.name)
+        if handler is None:
+            raise Refusal("unsupported", f"op '{op.name}' is not implemented by this simulated server")
+        if max_reply_bytes is not None and core.least_reply_bytes(request) > max_reply_bytes:
+            raise Refusal(
+                "wrong_transport", f"the reply to '{op.name}' would not fit into shared memory: send it over ZMQ"
+            )
+        if op.job and core.dialect.jobs:
+            return OpStarted(job_id=core.jobs.start(lambda: self._job(op.name, handler, request)))
+        if op.needs is Needs.EDITOR and op.name not in _BESIDE_JOBS:
+            with core.jobs.alone():
+                return handler(core, request)
+        return handler(core, request)
+
+    def _admitted(self, incoming: Incoming, transport: Transport) -> Op:
+        """Make the checks that come before any handler, in the plugin's order, and return the op."""
         op, name = incoming.op, incoming.name
         if self._core.health.failure is not None:
             raise Refusal("internal_error", f"{self._core.health.failure}; start the server again")
@@ -143,7 +210,9 @@ class Dispatcher:
             raise Refusal("wrong_transport", f"op '{name}' is not served over shared memory: send it over ZMQ")
         if name is None:
             raise Refusal("missing_op", "the request has no field 'op' that reads as a string")
-        if op is None or op.needs is not Needs.NOTHING:
+        if name not in _NO_SIGN_OF_USE:
+            self._core.lease.touch()
+        if op is None or op.name not in _WITHOUT_SESSION:
             self._check_session(incoming.session_id)
         if op is None:
             raise Refusal("unknown_op", f"this server has no op '{name}'")
@@ -153,18 +222,35 @@ class Dispatcher:
             raise Refusal("no_active_manager", f"op '{op.name}' needs a running play session: call begin_pie first")
         if op.ns in BARE_NAMES and name != op.name:
             raise Refusal("unknown_op", name)
-        handler = self._handlers.get(op.name)
-        if handler is None:
-            raise Refusal("unsupported", f"op '{op.name}' is not implemented by this simulated server")
-        if max_reply_bytes is not None and self._core.least_reply_bytes(incoming.request) > max_reply_bytes:
-            raise Refusal(
-                "wrong_transport", f"the reply to '{name}' would not fit into shared memory: send it over ZMQ"
-            )
-        return handler(self._core, incoming.request)
+        return op
+
+    def _job(self, name: str, handler: Handler, request: Any) -> dict[str, Any]:
+        """Return what the handler of a job comes to, as plain data with the numbers of the wire."""
+        try:
+            reply: Any = handler(self._core, request)
+        except Exception as failure:  # noqa: BLE001 - whoever asks for the job must hear of it
+            reply = _error(name, failure)
+        return msgspec.msgpack.decode(encode_reply(reply))
 
     def _check_session(self, session_id: str) -> None:
         if not self._core.session.accepts(session_id):
             raise Refusal("session_expired", f"session '{session_id}' is not the active one: send hello first")
+
+
+def _error(name: str, failure: Exception) -> ErrorReply:
+    if isinstance(failure, Refusal):
+        return ErrorReply(
+            code=failure.code,
+            message=failure.message,
+            absolute_path=failure.absolute_path if failure.code == "path_not_writable" else None,
+            owner=failure.owner,
+            lease_id=failure.lease_id,
+        )
+    logger.error("%s failed", name, exc_info=failure)
+    return ErrorReply(
+        code="internal_error",
+        message=f"{name}: the server failed with {type(failure).__name__}; its log has the details",
+    )
 
 
 def _fitting(reply: bytes, incoming: Incoming, limit: int | None) -> bytes:

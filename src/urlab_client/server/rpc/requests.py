@@ -30,6 +30,9 @@ __all__ = ["Incoming", "RequestReader", "need", "usable"]
 
 _DEFAULT_LIMITS: Final = Limits()
 
+_BINARY_SUFFIX: Final = "__b64__"
+"""Ends the key of what is binary, in JSON."""
+
 INT32_MIN: Final = -(2**31)
 INT32_MAX: Final = 2**31 - 1
 
@@ -524,12 +527,23 @@ def _converter(info: inspect.Type) -> Converter:
     return convert
 
 
+def _binary(value: Plain) -> Any:
+    """Return bytes; text, in which JSON carries them, is base64."""
+    if isinstance(value, str):
+        try:
+            return base64.b64decode(value, validate=True)
+        except ValueError:
+            return _ABSENT
+    return value if isinstance(value, bytes) else _ABSENT
+
+
 def _same(value: Plain) -> Plain:
     return value
 
 
 _SIMPLE: Final[Mapping[type[inspect.Type], Converter]] = {
     inspect.StrType: _text,
+    inspect.BytesType: _binary,
     inspect.BoolType: _flag,
     inspect.IntType: _whole,
     inspect.FloatType: _number,
@@ -627,15 +641,18 @@ def _nested_converter(struct: type[Struct]) -> Converter:
 @cache
 def _struct_converter(struct: type[Struct]) -> Callable[[dict[str, Plain]], Any]:
     """Return a function that fills a `struct` from a map with lower-case keys."""
-    plan: list[tuple[str, str, Converter, Callable[[], Any]]] = []
+    plan: list[tuple[str, str, str, Converter, Callable[[], Any]]] = []
     for field in msgspec.structs.fields(struct):
         info = inspect.type_info(field.type)
-        plan.append((field.name, field.encode_name.lower(), _converter(info), _default(field)))
+        key = field.encode_name.lower()
+        binary = isinstance(info.type if isinstance(info, inspect.Metadata) else info, inspect.BytesType)
+        plan.append((field.name, key, key + _BINARY_SUFFIX if binary else key, _converter(info), _default(field)))
 
     def convert(fields: dict[str, Plain]) -> Any:
         values: dict[str, Any] = {}
-        for name, key, of_field, default in plan:
-            value = of_field(fields[key]) if key in fields else _ABSENT
+        for name, key, other, of_field, default in plan:
+            sent = key if key in fields else other
+            value = of_field(fields[sent]) if sent in fields else _ABSENT
             values[name] = default() if value is _ABSENT else value
         return struct(**values)
 

@@ -99,8 +99,8 @@ _ROW_KINDS: Final = {
 }
 
 
-class StateFull(Struct, tag_field="op", tag="state_full", kw_only=True):
-    """The map of a `state/full` message, every field of it always present."""
+class StateFull(Struct, tag_field="op", tag="state_full", kw_only=True, omit_defaults=True):
+    """The map of a `state/full` message, every field of it but the last always present."""
 
     time: float
     step: int
@@ -108,6 +108,7 @@ class StateFull(Struct, tag_field="op", tag="state_full", kw_only=True):
     wall_time: Clock
     per_articulation: dict[str, ArticulationState]
     entities: dict[str, EntityState]
+    user: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,16 +165,17 @@ class _Broadcast:
         self._hand_over = hand_over
         self._memory = memory
         self._engine = running.engine
+        self._dialect = running.engine.dialect
         scene = running.scene
         # The encoders read a mirror of the data that only the sending thread touches.
         self._mirror = mujoco.MjData(scene.model)
         self._controls = list(running.engine.controls.values())
         mirrored = {key: _with_own_twist(control) for key, control in running.engine.controls.items()}
         self._twists = [control.twist for control in mirrored.values()]
-        self._observer = Observer(dataclasses.replace(scene, data=self._mirror), mirrored)
+        self._observer = Observer(dataclasses.replace(scene, data=self._mirror), mirrored, running.channels)
         self._sources = _arrays(scene, scene.data)
         self._targets = _arrays(scene, self._mirror)
-        self._rows = list(_rows(scene, self._mirror, mirrored.values()))
+        self._rows = list(_rows(scene, self._mirror, mirrored.values())) if self._dialect.rows_published else []
         self._actuators = _Actuators(scene.model, self._controls)
         self._wanted_rows: list[_Row] = []
         self.full_wanted = False
@@ -217,16 +219,16 @@ class _Broadcast:
             yield STATE_FULL, self._state_full(tick)
 
     def _state_full(self, tick: _Tick) -> bytes:
-        return encode_reply(
-            StateFull(
-                time=tick.time,
-                step=tick.step,
-                sim_time=sim_clock(tick.time),
-                wall_time=tick.wall_time,
-                per_articulation=self._observer.articulations(ObservationLevel.STANDARD),
-                entities=self._observer.entities(),
-            )
+        snapshot = StateFull(
+            time=tick.time,
+            step=tick.step,
+            sim_time=sim_clock(tick.time),
+            wall_time=tick.wall_time,
+            per_articulation=self._observer.articulations(ObservationLevel.STANDARD),
+            entities=self._observer.entities(),
+            user=self._observer.scene_channels() or None,
         )
+        return encode_reply(self._dialect.shaped(snapshot))
 
     def info_messages(
         self, tick: _Tick, cameras: Callable[[CompiledScene], Iterable[CameraEndpoint]]
@@ -285,6 +287,7 @@ class _Broadcast:
         live = engine.mode in _LIVE
         self._live_ticks += live
         full = self.full_wanted or (self._memory is not None and self._memory.wants_state())
+        full = full and (live or self._dialect.steps_published)
         shown = full or (live and bool(self._wanted_rows))
         if not shown and not (live and self._info_wanted and self._live_ticks >= self._info_due):
             return

@@ -10,7 +10,6 @@ import errno
 import logging
 import os
 import socket
-import threading
 from collections.abc import Callable
 from typing import ClassVar, Final
 
@@ -19,7 +18,7 @@ import zmq
 from urlab_client._uninterrupted import uninterrupted
 from urlab_client.server.limits import Limits
 from urlab_client.server.system.health import Health
-from urlab_client.server.system.thread_join import ended
+from urlab_client.server.system.serving_thread import ServingThread
 from urlab_client.server.transport.curve_authentication import CurveKeys, ZapAuthenticator
 
 __all__ = ["PortInUse", "RpcEndpoint", "bind_tcp", "bound_peers", "connect_host", "numeric_host", "tcp"]
@@ -147,10 +146,12 @@ class RpcEndpoint:
     Attributes:
         kind: Type of the ZeroMQ socket.
         port: TCP port that is bound.
+        serving: The thread that serves.
     """
 
     kind: ClassVar[int] = zmq.REP
     port: int
+    serving: ServingThread
 
     def __init__(
         self,
@@ -201,16 +202,16 @@ class RpcEndpoint:
         self._waker = self._context.socket(zmq.DEALER)
         self._waker.connect(_WAKE)
         self._stopping = False
-        self._thread = threading.Thread(target=self._run, name="urlab-rpc", daemon=True)
+        self.serving = ServingThread("urlab-rpc", self._run)
 
     @property
     def alive(self) -> bool:
         """Whether requests are served."""
-        return self._thread.is_alive()
+        return self.serving.alive
 
     def start(self) -> None:
         """Start the thread that serves."""
-        self._thread.start()
+        self.serving.start()
 
     def stop(self) -> None:
         """Ask the thread to end after the request under way, without waiting. Call once."""
@@ -228,20 +229,22 @@ class RpcEndpoint:
         Returns:
             False when the request under way took longer; the thread then closes the socket when it is done.
         """
-        if self._thread.ident is None:
+        if not self.serving.started:
             self._close()
-        elif self._thread is not threading.current_thread():
-            return ended(self._thread, timeout)
-        return not self._thread.is_alive()
+            return True
+        return self.serving.join(timeout)
 
-    def _run(self) -> None:
+    def _run(self, owed: bytes | None) -> None:
         try:
+            if owed is not None:
+                self._send_owed(owed)
             while self._serve():
                 pass
         except zmq.ZMQError as error:
             self._health.report(error)
         finally:
-            self._close()
+            if self.serving.is_current:
+                self._close()
 
     def _serve(self) -> bool:
         """Answer one request, with the reason where that fails; return False when it is time to end."""
@@ -250,6 +253,8 @@ class RpcEndpoint:
         except zmq.ZMQError:
             raise
         except BaseException as error:  # noqa: BLE001 - clients wait; from now on the answer says what happened
+            if not self.serving.finish():
+                return False
             reason = self._health.report(error)
             with contextlib.suppress(zmq.ZMQError):  # nobody has asked
                 self._send_owed(self._refuse("internal_error", reason))
@@ -269,7 +274,11 @@ class RpcEndpoint:
             frame = b""
         if self._stopping:
             return False
-        socket.send(self._answer(frame))
+        self.serving.begin()
+        reply = self._answer(frame)
+        if not self.serving.finish():
+            return False
+        socket.send(reply)
         return True
 
     def _close(self) -> None:

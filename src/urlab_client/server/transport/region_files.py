@@ -21,7 +21,9 @@ from urlab_client.protocol import doorbell
 from urlab_client.protocol.fence import processor_fence
 from urlab_client.protocol.shm import HEADER_SIZE, LIVE_DIRECTORY, MAGIC, SIZE_PREFIX, VERSION, region_size
 
-if sys.platform != "win32":
+if sys.platform == "win32":
+    import msvcrt
+else:
     import fcntl
 
 __all__ = ["InstanceDirectory", "RegionFile", "RequestFile"]
@@ -41,6 +43,8 @@ _LATEST_AT: Final = 24
 _COUNTERS: Final = Layout("<QI")
 _SIZE: Final = Layout("<I")
 _LOOKS: Final = 100
+_LOCKED_AT: Final = 1024  # beyond the text: Windows lets nobody read what is locked
+_RAW: Final = getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0)
 
 
 class InstanceDirectory:
@@ -66,9 +70,7 @@ class InstanceDirectory:
         self.path = self._instance / LIVE_DIRECTORY
         with contextlib.ExitStack() as made:
             made.callback(_remove, self._instance)
-            self._lock = os.open(
-                self._instance / LOCK_FILE, os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0), 0o600
-            )
+            self._lock = os.open(self._instance / LOCK_FILE, os.O_RDWR | os.O_CREAT | _RAW, 0o600)
             made.callback(os.close, self._lock)
             # Before the text: a server that starts at this moment takes a directory without it for somebody else's.
             _lock(self._lock)
@@ -78,14 +80,21 @@ class InstanceDirectory:
 
     def remove(self) -> None:
         """Remove the directory with everything in it."""
+        os.close(self._lock)  # first: Windows removes no file that is open
         _remove(self._instance)
-        os.close(self._lock)
 
 
 def _lock(descriptor: int) -> bool:
     """Take a lock that ends with the process; return False if somebody has it."""
     if sys.platform == "win32":
-        return True  # an open file cannot be removed there, which does as well
+        os.lseek(descriptor, _LOCKED_AT, os.SEEK_SET)
+        try:
+            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+        except OSError:
+            return False
+        finally:
+            os.lseek(descriptor, 0, os.SEEK_SET)
+        return True
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -100,15 +109,16 @@ def _remove_left_behind(base: Path) -> None:
             mine = sys.platform == "win32" or directory.lstat().st_uid == os.getuid()
             if directory.is_symlink() or not mine:
                 continue
-            descriptor = os.open(directory / LOCK_FILE, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0))
+            descriptor = os.open(directory / LOCK_FILE, os.O_RDWR | _RAW | getattr(os, "O_NOFOLLOW", 0))
         except OSError:  # not one of ours
             continue
         try:
-            if _pread(descriptor, len(LOCK_TEXT) + 1, 0) == LOCK_TEXT and _lock(descriptor):
-                _remove(directory)
-                logger.info("removed %s, which a killed server left behind", directory)
+            abandoned = _pread(descriptor, len(LOCK_TEXT) + 1, 0) == LOCK_TEXT and _lock(descriptor)
         finally:
             os.close(descriptor)
+        if abandoned:
+            _remove(directory)
+            logger.info("removed %s, which a killed server left behind", directory)
 
 
 def _remove(instance: Path) -> None:
@@ -141,14 +151,29 @@ class RegionFile:
         self._fence = processor_fence()
         self._sequence = self._latest = 0
         new = path.with_name(f".{path.name}")
-        self._fd = os.open(new, os.O_RDWR | os.O_CREAT | os.O_TRUNC | getattr(os, "O_CLOEXEC", 0), 0o600)
+        self._fd = os.open(new, os.O_RDWR | os.O_CREAT | os.O_TRUNC | _RAW, 0o600)
         try:
             self._lay_out()
-            new.replace(path)
+            self._put_in_place(new)
         except BaseException:
-            os.close(self._fd)
-            new.unlink()
+            with contextlib.suppress(OSError):
+                os.close(self._fd)
+            new.unlink(missing_ok=True)
             raise
+
+    def _put_in_place(self, new: Path) -> None:
+        if sys.platform != "win32":
+            new.replace(self.path)
+            return
+        os.close(self._fd)  # Windows moves no file that is open
+        try:
+            new.replace(self.path)
+        except PermissionError:  # nor does it replace one: who has it open finds it laid out anew
+            new.unlink()
+            self._fd = os.open(self.path, os.O_RDWR | _RAW)
+            self._lay_out()
+        else:
+            self._fd = os.open(self.path, os.O_RDWR | _RAW)
 
     @property
     def max_payload(self) -> int:
@@ -176,10 +201,10 @@ class RegionFile:
         _pwrite(self._fd, _SEQUENCE.pack(self._sequence), _SEQUENCE_AT)
 
     def close(self) -> None:
-        """Remove the file and let go of it."""
+        """Let go of the file and remove it. On Windows it stays while a client has it open."""
+        os.close(self._fd)
         with contextlib.suppress(OSError):
             self.path.unlink()
-        os.close(self._fd)
 
     def _mend(self) -> None:
         """Lay the region out anew if somebody cut the file off or wrote over the header's fixed part."""
@@ -198,7 +223,7 @@ class RegionFile:
                 os.posix_fallocate(self._fd, 0, self._size)
             except OSError as error:
                 raise OSError(error.errno, os.strerror(error.errno or 0), os.fspath(self.path)) from None
-        else:
+        elif os.fstat(self._fd).st_size < self._size:
             os.ftruncate(self._fd, self._size)
         _pwrite(self._fd, self._fixed().ljust(HEADER_SIZE, b"\0"), 0)
 

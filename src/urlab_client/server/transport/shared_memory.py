@@ -1,7 +1,8 @@
 """The shared-memory transport of a server: requests and replies in two regions, state and pictures in others.
 
-For `SimulatedServer`. One thread watches the request region. With our own client it sleeps until the doorbell rings;
-for clients without one, as the plugin's, it looks every 100 µs while they are at work and every 5 ms otherwise.
+For `SimulatedServer`. One thread watches the request region. With our own client it sleeps until the doorbell rings, or
+on Windows the named event is set; for clients without one, as the plugin's, it looks every 100 µs while they are at
+work and every 5 ms otherwise.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import Final, cast
 
 from urlab_client._processors import crowded
+from urlab_client._windows import NamedEvent
 from urlab_client.protocol import doorbell
 from urlab_client.protocol.errors import ProtocolError
 from urlab_client.protocol.shm import (
@@ -31,7 +33,7 @@ from urlab_client.protocol.shm import (
     state_stride,
 )
 from urlab_client.server.system.health import Health
-from urlab_client.server.system.thread_join import ended
+from urlab_client.server.system.serving_thread import ServingThread
 from urlab_client.server.transport.region_files import InstanceDirectory, RegionFile, RequestFile
 
 __all__ = ["MAX_REPLY_BYTES", "SharedMemoryServer"]
@@ -116,7 +118,9 @@ class SharedMemoryServer:
         self._stopping = False
         self._released = False
         self._given_up = False
-        self._thread: threading.Thread | None = None
+        self._seen = 0  # whoever was quicker than the thread is not forgotten
+        self._answer: Answer = bytes
+        self.serving = ServingThread("urlab-shm", self._run)
 
     def start(self, answer: Answer) -> None:
         """Start the thread that serves.
@@ -124,13 +128,13 @@ class SharedMemoryServer:
         Args:
             answer: Turns a request into its reply of at most `MAX_REPLY_BYTES`; must not raise.
         """
-        self._thread = threading.Thread(target=self._run, args=(answer,), name="urlab-shm", daemon=True)
-        self._thread.start()
+        self._answer = answer
+        self.serving.start()
 
     @property
     def alive(self) -> bool:
         """Whether requests are served."""
-        return self._thread is not None and self._thread.is_alive()
+        return self.serving.alive
 
     def stop(self) -> None:
         """Ask the thread to end after the request under way, without waiting."""
@@ -143,10 +147,10 @@ class SharedMemoryServer:
         Returns:
             False when the request under way took longer.
         """
-        if self._thread is not None:
-            ended(self._thread, timeout)
+        if self.serving.started:
+            ended = self.serving.join(timeout)
             with self._lock:
-                self._given_up = self._thread.is_alive()
+                self._given_up = not ended and self.serving.alive
             if self._given_up:
                 return False
         self._release()
@@ -230,18 +234,20 @@ class SharedMemoryServer:
 
     # The thread.
 
-    def _run(self, answer: Answer) -> None:
-        seen = 0  # whoever was quicker than this thread is not forgotten
+    def _run(self, owed: bytes | None) -> None:
         try:
+            if owed is not None:
+                self._reply(owed)
             while not self._stopping:
-                if self._requests.sequence() == seen and not (self._brisk and self._follows(seen)):
+                if self._requests.sequence() == self._seen and not (self._brisk and self._follows(self._seen)):
                     rung = self._bell.wait(self._pause())
-                    if self._requests.sequence() == seen:
+                    if self._requests.sequence() == self._seen:
                         continue
                     if not rung:
                         self._unrung_at = time.monotonic()
                 self._brisk = time.monotonic() - self._served_at < BRISK_S and not crowded()
-                seen = self._serve(answer)
+                if not self._serve():
+                    return
                 self._served_at = time.monotonic()
         except (OSError, ValueError):
             logger.exception("shared memory failed; the server answers over ZMQ alone")
@@ -252,7 +258,7 @@ class SharedMemoryServer:
         finally:
             with self._lock:
                 given_up = self._given_up
-            if given_up:  # nobody waits for this thread any more
+            if given_up and self.serving.is_current:  # nobody waits for this thread any more
                 self._release()
 
     def _give_up(self) -> None:
@@ -272,16 +278,23 @@ class SharedMemoryServer:
             return BUSY_POLL_S
         return RUNG_POLL_S if self._bell.listeners else IDLE_POLL_S
 
-    def _serve(self, answer: Answer) -> int:
-        sequence, request = self._requests.read()
+    def _serve(self) -> bool:
+        """Answer the request that is there; return False if another thread has done so and serves now."""
+        self._seen, request = self._requests.read()
         if request is None:
             logger.warning("a request in shared memory could not be read and stays unanswered")
-        else:
-            reply = answer(request)
-            if reply:
-                self._replies.publish(reply)
-                self._bell.ring(doorbell.REPLY)
-        return sequence
+            return True
+        self.serving.begin()
+        reply = self._answer(request)
+        if not self.serving.finish():
+            return False
+        if reply:
+            self._reply(reply)
+        return True
+
+    def _reply(self, reply: bytes) -> None:
+        self._replies.publish(reply)
+        self._bell.ring(doorbell.REPLY)
 
     def _release(self) -> None:
         with self._lock:
@@ -297,9 +310,14 @@ class SharedMemoryServer:
 
 
 class _Bell:
-    """The server's end of the doorbell; see `urlab_client.protocol.doorbell`. Without Unix sockets nobody rings."""
+    """The server's end of the doorbell; see `urlab_client.protocol.doorbell`.
+
+    Windows has no Unix sockets in Python. There the plugin's named events tell of requests and replies.
+    """
 
     def __init__(self, directory: Path) -> None:
+        self._asked = NamedEvent(f"Local\\URLab_{directory.name}_req_ready", create=True)
+        self._answered = NamedEvent(f"Local\\URLab_{directory.name}_rep_ready", create=True)
         self._wants: dict[socket.socket, set[bytes]] = {}
         self._lock = threading.Lock()
         self._selector = selectors.DefaultSelector()
@@ -322,6 +340,8 @@ class _Bell:
 
     def ring(self, ring: bytes) -> None:
         """Tell the clients, without waiting for any. From any thread."""
+        if ring == doorbell.REPLY:
+            self._answered.set()
         with self._lock:
             for client, wants in self._wants.items():
                 if ring == doorbell.REPLY or ring in wants:
@@ -330,11 +350,14 @@ class _Bell:
 
     def wake(self) -> None:
         """End `wait`. From any thread."""
+        self._asked.set()
         with contextlib.suppress(OSError):
             self._waker.send(b"\0")
 
     def wait(self, seconds: float) -> bool:
         """Wait until a client rings, or for so long; return whether one announced a request."""
+        if self._asked.exists:
+            return self._asked.wait(seconds)
         if self._door_shut_until and time.monotonic() >= self._door_shut_until:
             self._open_door()
         if seconds < _SELECTOR_STEP_S:
@@ -345,6 +368,8 @@ class _Bell:
 
     def close(self) -> None:
         """Let everybody go and remove the socket."""
+        self._asked.close()
+        self._answered.close()
         with self._lock:
             for client in self._wants:
                 client.close()

@@ -38,6 +38,8 @@ class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
         Raises:
             UnknownArticulation: No articulation has this key or actor id.
             DimMismatch: The number of values does not fit.
+            TypeError: Some are not numbers; nothing was sent.
+            ValueError: Some are NaN or infinite; nothing was sent.
         """
         self._portal.call(self._aio.set_qpos, target, qpos, by_name=by_name, timeout=timeout)
 
@@ -83,6 +85,7 @@ class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
 
         Raises:
             TypeError: An unknown option, or one of the wrong type; nothing was sent.
+            ValueError: A number that the option cannot be, such as a timestep of 0 or NaN; nothing was sent.
             BadValue: Unknown integrator, cone or solver.
         """
         return self._portal.call(self._aio.set_sim_options, timeout=timeout, **opts)

@@ -1,0 +1,66 @@
+"""The driver lease: by it clients tell each other that a server is in use. Nothing is enforced by it."""
+
+from __future__ import annotations
+
+import threading
+import time
+import uuid
+from collections.abc import Callable
+
+from urlab_client.server.refusal import Refusal
+
+__all__ = ["DriverLease"]
+
+
+class DriverLease:
+    """One lease at a time, which ends by itself after a time without requests.
+
+    Args:
+        clock: Tells the time, seconds.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._id = ""
+        self._ttl_s = 0.0
+        self._touched = 0.0
+
+    @property
+    def held(self) -> bool:
+        """Whether somebody holds it."""
+        with self._lock:
+            return self._holds()
+
+    def acquire(self, ttl_s: float) -> str:
+        """Take it and return its id.
+
+        Raises:
+            Refusal: `busy`.
+        """
+        with self._lock:
+            if self._holds():
+                raise Refusal("busy", "somebody holds the driver lease", lease_id=self._id)
+            self._id, self._ttl_s, self._touched = str(uuid.uuid4()).upper(), ttl_s, self._clock()
+            return self._id
+
+    def release(self, lease_id: str) -> None:
+        """Give it back.
+
+        Raises:
+            Refusal: `bad_request` for any id but the holder's.
+        """
+        with self._lock:
+            if not self._holds() or lease_id != self._id:
+                raise Refusal("bad_request", f"'{lease_id}' is not the lease that is held")
+            self._id = ""
+
+    def touch(self) -> None:
+        """Note that the server is in use."""
+        if self._id:
+            with self._lock:
+                if self._holds():
+                    self._touched = self._clock()
+
+    def _holds(self) -> bool:
+        return bool(self._id) and self._clock() - self._touched <= self._ttl_s and self._ttl_s > 0

@@ -1,0 +1,67 @@
+"""Keeps requests answered while physics does not come back from MuJoCo.
+
+For `SimulatedServer`. A short step runs on the thread that serves requests; when MuJoCo then keeps it for longer than
+the step timeout, its client is told so, and another thread serves. What needs physics is refused meanwhile, by the
+engine's lock; the rest, such as `hello`, `meta` and `stop_pie`, does not wait for it.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from typing import Final
+
+from urlab_client.server.core import ServerCore
+from urlab_client.server.rpc.dispatch import Dispatcher
+from urlab_client.server.system.health import Health
+from urlab_client.server.system.thread_join import ended
+
+__all__ = ["Watchdog"]
+
+logger = logging.getLogger("urlab_client.server")
+
+INTERVAL_S: Final = 0.25
+
+
+class Watchdog:
+    """A thread that looks at the physics of a server a few times a second."""
+
+    def __init__(self, core: ServerCore, dispatcher: Dispatcher, health: Health) -> None:
+        """Prepare; `start` begins to look."""
+        self._core = core
+        self._dispatcher = dispatcher
+        self._health = health
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="urlab-watchdog", daemon=True)
+
+    @property
+    def alive(self) -> bool:
+        """Whether it looks."""
+        return self._thread.is_alive()
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Ask the thread to end."""
+        self._stopping.set()
+
+    def join(self, timeout: float) -> bool:
+        """Wait for the end after `stop`; return False if it takes longer."""
+        return self._thread.ident is None or ended(self._thread, timeout)
+
+    def _run(self) -> None:
+        told: object = None
+        with self._health.watch():
+            while not self._stopping.wait(INTERVAL_S):
+                running = self._core.play.current
+                overdue = None if running is None else running.engine.overdue
+                if overdue is None:
+                    continue
+                if overdue.began_at != told:
+                    told = overdue.began_at
+                    logger.warning(
+                        "physics has not come back from MuJoCo for %.1f s; stop_pie ends it", overdue.seconds
+                    )
+                self._dispatcher.relieve(overdue.thread)

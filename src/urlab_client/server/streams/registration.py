@@ -1,0 +1,70 @@
+"""Telling the clients of a machine which servers run on it, by a file that is written again and again."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime as dt
+import logging
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from urlab_client.protocol import instances
+from urlab_client.protocol.messages.session import InstanceInfo
+from urlab_client.server.system.thread_join import ended
+
+__all__ = ["Registration"]
+
+logger = logging.getLogger("urlab_client.server")
+
+
+class Registration:
+    """Keeps the file of one server in the registry for as long as the server is open."""
+
+    def __init__(self, directory: Path, describe: Callable[[], InstanceInfo]) -> None:
+        """Prepare; `start` writes the file.
+
+        Args:
+            directory: The registry.
+            describe: Returns what the file is to say.
+        """
+        self._directory = directory
+        self._describe = describe
+        self._path: Path | None = None
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="urlab-registry", daemon=True)
+
+    def start(self) -> None:
+        """Write the file, and again whenever it would be taken for that of a dead server."""
+        self._write()
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Ask the thread to end."""
+        self._stopping.set()
+
+    def join(self, timeout: float) -> bool:
+        """Wait for the end and remove the file; return False when the thread was still busy."""
+        if self._thread.ident is not None:
+            ended(self._thread, timeout)
+        if self._path is not None:
+            with contextlib.suppress(OSError):
+                self._path.unlink()
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        while not self._stopping.wait(instances.REWRITE_S):
+            self._write()
+
+    def _write(self) -> None:
+        instance = self._describe()
+        path = self._directory / f"{instance.instance_id}_{instance.pid}.json"
+        fresh = path.with_suffix(".new")
+        try:
+            self._directory.mkdir(parents=True, exist_ok=True)
+            fresh.write_bytes(instances.encode(instance, dt.datetime.now(dt.UTC)))
+            fresh.replace(path)
+        except OSError as error:
+            logger.warning("the server is not in the registry: %s", error)
+        else:
+            self._path = path
