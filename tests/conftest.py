@@ -1,7 +1,7 @@
 """What holds for every test."""
 
-import importlib.metadata
 import gc
+import importlib.metadata
 import importlib.util
 import os
 import sys
