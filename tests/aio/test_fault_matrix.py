@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 from samples import filled
+from scripted import meta_ok
 from waiting import in_time, until
 
 from urlab_client.aio import URLabClient, launch
@@ -43,6 +44,7 @@ async def arrived(scripted: Any, op: str) -> None:
 @pytest.mark.parametrize(("fault", "name"), PAIRS)
 async def test_the_call_after_a_fault_works(client: Any, scripted: Any, fault: str, name: str) -> None:
     op, answer = OPS[name], encode_reply(filled(OPS[name].reply))
+    scripted.on("meta", meta_ok(op.dialects[0]))
     await client.discover()
     scripted.on(name, {"truncated": answer[:-1], "garbage": b"\xc1" * 40}.get(fault))
     call = asyncio.create_task(client.call(filled(op.request), timeout=0.02 if fault == "timed out" else 5))
@@ -64,6 +66,7 @@ async def test_the_call_after_a_fault_works(client: Any, scripted: Any, fault: s
 @pytest.mark.parametrize("name", SOME)
 async def test_a_server_that_dies_with_the_request_and_comes_back(client: Any, scripted: Any, name: str) -> None:
     op, answer = OPS[name], encode_reply(filled(OPS[name].reply))
+    scripted.on("meta", meta_ok(op.dialects[0]))
     await client.discover()
     scripted.on(name, None)
     call = asyncio.create_task(client.call(filled(op.request), timeout=5))
