@@ -85,11 +85,11 @@ def flatten(model: str | os.PathLike[str] | mujoco.MjSpec) -> FlatModel:
 
     from urlab_client._mujoco import flat_model  # noqa: PLC0415
 
-    path = Path(model) if isinstance(model, (str, os.PathLike)) else None  # pyright: ignore[reportUnknownArgumentType]
+    given: Any = model
+    path = Path(given) if isinstance(given, (str, os.PathLike)) else None  # pyright: ignore[reportUnknownArgumentType]
     if path is not None and not path.is_file():
         raise FileNotFoundError(f"upload_model: {path} does not exist or is not a file")
     source = "the spec" if path is None else str(path)
-    given: Any = model
     try:
         spec: mujoco.MjSpec = given.copy() if path is None else mujoco.MjSpec.from_file(source)
         spec.compile()
