@@ -8,10 +8,10 @@ set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.." || exit 1
 
 SUBSET=(
-    tests/test_import.py tests/test_mujoco_releases.py
+    tests/test_import.py tests/test_mujoco_releases.py tests/test_not_on_windows.py
     tests/protocol
-    tests/aio/test_readiness.py tests/aio/test_busy_loops.py tests/aio/test_stream_buffer.py tests/aio/test_live.py
-    tests/server/test_scene.py tests/server/test_shm_server.py
+    tests/aio/test_readiness.py tests/aio/test_busy_loops.py tests/aio/test_stream_buffer.py
+    tests/server/test_debug_ops.py
 )
 FILE_S=900
 
