@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from urlab_client import SessionTakenOver, UnknownKeyframe, UnknownName, URLabError
+from urlab_client import ModeLocked, NoSession, SessionTakenOver, UnknownKeyframe, UnknownName, URLabError
 from urlab_client.enums import ControlMode, StepMode
 from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.server import ControllerConfig, SimulatedServer
@@ -360,6 +360,98 @@ def _set_mode(mode: str) -> Any:
     from urlab_client.protocol.messages.runtime import SetMode
 
     return SetMode(mode=mode)
+
+
+@pytest.mark.parametrize("pinned", [True, False])
+@pytest.mark.parametrize("step_mode", ["auto", "direct"])
+async def test_the_mode_that_the_server_is_in_already(connect: Any, pinned: bool, step_mode: str) -> None:
+    """session-ops.md, sections 6 and 9.6: no op tells the mode, a pinned server refuses to change it, and play starts
+    paused."""
+    with SimulatedServer("ball", play=True, step_mode="direct" if pinned else "auto") as server:
+        if not pinned:
+            before = connect(server, step_mode="direct", auto_promote_step_mode=False)
+            await before.discover()
+            await before.runtime.set_mode("direct")
+        client = connect(server, step_mode=step_mode)
+        await client.discover()
+        if pinned and step_mode == "auto":
+            await client.runtime.set_paused(False)
+        reply = await client.step(5)
+        assert (reply.step, client.step_count, client.step_mode) == (5, 5, StepMode.DIRECT)
+        assert reply.time == pytest.approx(5 * client.model.opt.timestep)
+        assert (await client.step(2)).step == 7
+        assert await client.runtime.set_mode("direct") is StepMode.DIRECT
+
+
+async def test_a_server_that_is_pinned_to_another_mode(connect: Any) -> None:
+    with SimulatedServer("ball", play=True, step_mode="puppet") as server:
+        client = connect(server, step_mode="direct")
+        with pytest.raises(ModeLocked, match="puppet"):
+            await client.discover()
+        assert client.step_mode is StepMode.PUPPET
+        with pytest.raises(ModeLocked, match="puppet"):
+            await client.runtime.set_mode("live")
+        assert (await client.step(5)).time == client.data.time == pytest.approx(5 * client.model.opt.timestep)
+
+
+async def test_auto_follows_a_server_in_puppet_mode(connect: Any) -> None:
+    with SimulatedServer("ball", play=True, step_mode="puppet") as server:
+        client = connect(server)
+        await client.discover()
+        reply = await client.step(5)
+        assert client.step_mode is StepMode.PUPPET
+        assert reply.time == client.data.time == pytest.approx(5 * client.model.opt.timestep)
+
+
+async def test_auto_stays_live_where_the_server_is(connect: Any) -> None:
+    with SimulatedServer("ball", play=True) as server:
+        client = connect(server)
+        await client.discover()
+        for n_steps in (1, 5):
+            assert (await client.step(n_steps)).step == client.step_count == 0
+            assert client.step_mode is StepMode.LIVE
+
+
+@pytest.mark.parametrize(("actual", "expected"), [("live", "direct"), ("direct", "live"), ("live", "puppet")])
+async def test_a_mode_that_was_not_to_be_changed_is_told_apart(connect: Any, actual: str, expected: str) -> None:
+    with SimulatedServer("ball", play=True, step_mode=actual, unpaused=True) as server:
+        client = connect(server, step_mode=expected, auto_promote_step_mode=False)
+        await client.discover()
+        with pytest.raises(URLabError, match=rf"step mode {actual}, .*not in {expected}.*set_mode\('{expected}'\)"):
+            await client.step(5)
+        assert client.step_mode == actual
+        assert (await client.step(5)).step == (10 if actual == "direct" else 0)
+
+
+async def test_live_is_asked_for_where_somebody_left_another_mode(connect: Any) -> None:
+    with SimulatedServer("ball", play=True) as server:
+        left = connect(server)
+        await left.discover()
+        await left.runtime.set_mode("direct")
+        client = connect(server, step_mode="live")
+        await client.discover()
+        assert (await client.step(5)).step == 0
+
+
+@pytest.mark.parametrize(("mode", "n_steps"), [("direct", 0), ("direct", -1), ("live", 0), ("puppet", -1)])
+async def test_fewer_steps_than_there_can_be_are_refused(connect: Any, mode: str, n_steps: int) -> None:
+    """simulation.md, section 2.4: the server takes one step where none was asked for."""
+    with SimulatedServer("ball", play=True) as server:
+        client = connect(server, step_mode=mode)
+        await client.discover()
+        with pytest.raises(ValueError, match=rf"^step: n_steps is at least .* got {n_steps}"):
+            await client.step(n_steps)
+        assert (await client.runtime.forward()).step == 0
+
+
+async def test_calls_before_the_handshake_say_so(connect: Any) -> None:
+    with SimulatedServer("ball", play=True) as server:
+        client = connect(server)
+        for call in (client.scene.current_level, client.step, client.reset, client.runtime.forward):
+            with pytest.raises(NoSession, match=r"^\w+: no session is open\. Call discover\(\) first\.$"):
+                await call()
+        await client.discover()
+        assert (await client.step()).step == 0
 
 
 async def test_live_mode_hands_over_set_points(connect: Any) -> None:

@@ -120,7 +120,7 @@ class URLabEntity:
             TypeError: A component is not a number.
             ValueError: A vector does not have three finite components.
         """
-        self._record.wrenches[self._record.name] = _wrench(force, torque)
+        self._record.apply_wrench(self._record.name, _wrench(force, torque))
 
     def _pose(self) -> tuple[Floats, Floats]:
         record = self._record
@@ -389,7 +389,7 @@ class URLabArticulation(URLabEntity):
             body = next((name for name, handle in bodies.items() if handle.id == self.body_id), "")
         if not body:
             raise ValueError(f"{self.prefix}: name the body: without a local model its root is not known")
-        self._record.wrenches[body] = _wrench(force, torque)
+        self._record.apply_wrench(body, _wrench(force, torque))
         self._record.drive()
 
     async def claim(self, *, force: bool = False, ttl: float = CLAIM_S, timeout: Timeout = DEFAULT) -> None:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import logging
 import operator
 import os
 import re
-import warnings
 from collections.abc import Collection, Mapping
 from threading import RLock
 from types import TracebackType
@@ -34,20 +34,20 @@ from urlab_client.aio.namespaces.sim import SimNamespace
 from urlab_client.aio.namespaces.viewport import ViewportNamespace
 from urlab_client.aio.session import Session
 from urlab_client.aio.state.connection_monitor import ConnectionMonitor
-from urlab_client.aio.state.recovery import resync
+from urlab_client.aio.state.recovery import leaves_open, resync
 from urlab_client.aio.state.sim_state import SimState
-from urlab_client.aio.state.step_pictures import StepPictures
+from urlab_client.aio.state.stepping import take_steps
 from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS, Stream
 from urlab_client.aio.transport.base import RequestTransport, TransportStats
 from urlab_client.aio.transport.curve import ClientKeys, client_keys, is_local
 from urlab_client.aio.transport.shm import SharedMemoryRegions, ShmTransport
 from urlab_client.aio.transport.zmq import ZmqTransport
 from urlab_client.protocol.base import Reply, Request
-from urlab_client.protocol.codec import op_of
 from urlab_client.protocol.enums import CameraTiming, ObservationLevel, StepMode, Transport
 from urlab_client.protocol.errors import UnknownKeyframe, URLabError
+from urlab_client.protocol.messages.runtime import SetMode
+from urlab_client.protocol.messages.session import Hello, MetaOk, OpInfo, Reset, ResetOk, Step, StepOk
 from urlab_client.protocol.messages.session import Meta as MetaRequest
-from urlab_client.protocol.messages.session import MetaOk, OpInfo, Reset, ResetOk, Step, StepOk
 from urlab_client.protocol.messages.streams import ClientEvent, RowSample, StateSnapshot, StreamPolicy
 from urlab_client.protocol.names import NameMap
 from urlab_client.protocol.rows import TopicKind
@@ -405,7 +405,8 @@ class URLabClient:
             AuthenticationFailed: Server and client do not accept each other's keys.
         """
         level = ObservationLevel(observations)
-        await self._state.open(level, timeout=timeout)
+        async with self._session.turn(Hello, timeout=timeout) as turn:
+            await self._state.open(turn, level)
 
     async def step(
         self,
@@ -422,7 +423,7 @@ class URLabClient:
         are handed over and the present state is read; physics runs by itself.
 
         Args:
-            n_steps: Physics steps.
+            n_steps: Physics steps, at least 1; at least 0 in `puppet`. Not used in `live`.
             include_cameras: True for the newest frame of every camera, or camera name to `sync` (rendered after the
                 step) or `latest`. A `sync` picture that came out older than the step is left out of the reply, as one
                 that did not come. Ignored in live mode by servers that draw in the other modes only.
@@ -435,46 +436,15 @@ class URLabClient:
         Raises:
             StepTimeout: The server did not finish within its 5 s; the steps are still queued there.
             OutcomeUnknown: The connection broke: the steps may or may not have been taken. `resync()` finds out.
+            ValueError: Fewer steps than the mode allows; nothing was sent.
             KeyError: Unknown camera; nothing was sent.
             ValueError: A set-point is NaN or infinite, or in puppet mode something in `data`; nothing was sent.
+            NoSession: `discover()` was not called, or was broken off; nothing was sent.
         """
-        state = self._state
         n_steps = operator.index(n_steps)  # a hot op: its request is not checked again before it is sent
-        level = state.level if isinstance(observations, SessionLevel) else ObservationLevel(observations)
-        cameras = self._cameras(include_cameras)
-        for observer in state.observers:
-            cameras = observer.wanted_pictures(cameras, n_steps)
-        pictures = StepPictures(state, cameras)
-        if timeout is DEFAULT and pictures.seconds:
-            timeout = pictures.seconds + (op_of(Step).timeout or 0.0)
-        if state.mode is StepMode.LIVE:
-            return await self._live_step(pictures, timeout)
-        request = self._puppet_request(n_steps) if state.mode is StepMode.PUPPET else self._direct_request(n_steps)
-        carried = state.buffered_wrenches()
-        if pictures:
-            pictures.ask(request)
-        if level != state.sent_level:
-            request.observations = level
-        state.sent_level = ""  # unknown to us until the server has answered
-        try:
-            reply = await self._session.call(request, timeout=timeout)
-            state.sent_level = level if self._session.features.level_sticks else state.level
-            if state.mode is StepMode.DIRECT:
-                for record, wrenches in carried:
-                    record.drop_wrenches(wrenches)
-            pictures.take(reply)
-            state.absorb(reply, "step", into_mirror=state.mode is not StepMode.PUPPET)
-        except BaseException as error:
-            state.pending.add_steps(state, error, 1 if state.mode is StepMode.PUPPET else max(n_steps, 1), carried)
-            raise
-        if state.pending:
-            state.pending.clear()
-        if state.mode is StepMode.PUPPET:
-            with state.mirror.lock:
-                state.mirror.perturb(reply.perturbation)
-        if pictures:
-            state.note_missing_frames(pictures.names, reply)
-        return reply
+        level = None if isinstance(observations, SessionLevel) else ObservationLevel(observations)
+        async with self._session.turn(Step, timeout=timeout) as turn:
+            return await take_steps(self._state, turn, n_steps, include_cameras, level)
 
     async def reset(
         self,
@@ -501,23 +471,27 @@ class URLabClient:
             TypeError: A position is not a number; nothing was sent.
             ValueError: A position is NaN or infinite; nothing was sent.
         """
-        overrides = {
-            self.articulations[key].prefix: self._joint_values(key, values)
-            for key, values in (per_articulation_qpos or {}).items()
-        }
-        request = Reset(
-            keyframe_name=None if keyframe_name is None else self._keyframe(keyframe_name),
-            seed=seed,
-            per_articulation_qpos=overrides or None,
-        )
-        try:
-            reply = await self._session.call(request, timeout=timeout)
-            self._state.absorb_reset(reply, request.keyframe_name)
-        except BaseException as error:
-            self._state.pending.add_reset(self._state, error, request.keyframe_name)
-            raise
-        self._state.pending.clear()
-        return reply
+        state = self._state
+        async with self._session.turn(Reset, timeout=timeout) as turn:
+            state.require_handshake("reset")
+            overrides = {
+                self.articulations[key].prefix: self._joint_values(key, values)
+                for key, values in (per_articulation_qpos or {}).items()
+            }
+            request = Reset(
+                keyframe_name=None if keyframe_name is None else self._keyframe(keyframe_name),
+                seed=seed,
+                per_articulation_qpos=overrides or None,
+            )
+            try:
+                reply = await turn.call(request)
+                state.absorb_reset(reply, request.keyframe_name)
+            except BaseException as error:
+                if turn.sent and leaves_open(error):
+                    state.pending.add_reset(state, request.keyframe_name)
+                raise
+            state.pending.clear()
+            return reply
 
     async def resync(self, *, timeout: Timeout = DEFAULT) -> Resync:
         """Find out what became of steps, resets and mode changes whose replies were lost, and go on from there.
@@ -657,9 +631,11 @@ class URLabClient:
                 await self._publishers.camera_switch.aclose(connected=playing)
             await self._session.control.aclose(connected=playing)
             await self._watch.aclose()
+            await asyncio.sleep(0)  # a blocking client notices only now that the server has gone meanwhile
             if promoted_from is not None and self.connected and self.manager_present:
                 with contextlib.suppress(URLabError):  # a courtesy: the server may have moved on
-                    await self._state.ask_mode(promoted_from, timeout=_REVERT_S)
+                    async with self._session.turn(SetMode, timeout=_REVERT_S) as turn:
+                        await self._state.ask_mode(turn, promoted_from)
         finally:
             await self._session.aclose()
 
@@ -681,51 +657,6 @@ class URLabClient:
             "URLabClient cannot be pickled: it belongs to a connection of this process. "
             "Send client.config, and make a client from it: URLabClient(**config.options())."
         )
-
-    async def _live_step(self, pictures: StepPictures, timeout: Timeout) -> StepOk:
-        state = self._state
-        everything = self._session.features.live_pictures_in_steps
-        carried = state.buffered_wrenches() if everything else []
-        request = Step(per_articulation=state.live_commands() or None)
-        if pictures and everything:
-            pictures.ask(request)
-        reply = await self._session.call(request, timeout=timeout)
-        for record, wrenches in carried:
-            record.drop_wrenches(wrenches)
-        pictures.take(reply)
-        state.absorb(reply, "step")
-        if request.include_cameras:
-            state.note_missing_frames(pictures.names, reply)
-        return reply
-
-    def _direct_request(self, n_steps: int) -> Step:
-        return Step(n_steps=n_steps, per_articulation=self._state.direct_commands() or None)
-
-    def _puppet_request(self, n_steps: int) -> Step:
-        mirror = self._state.mirror
-        model, data = mirror.model, mirror.data
-        if model is None or data is None:
-            raise URLabError(
-                "step: puppet mode integrates the local model, which this client does not have.",
-                op="step",
-                hint="Make the client with local_model=True and call discover() during play.",
-            )
-        if self._state.buffered_wrenches():
-            warnings.warn("apply_xfrc() is inert in puppet mode: write client.data.xfrc_applied instead.", stacklevel=3)
-        with mirror.lock:
-            for record in self._state.records.values():
-                record.write_set_points()
-            mirror.check_finite()
-            if n_steps > 0:
-                import mujoco  # noqa: PLC0415
-
-                mujoco.mj_step(model, data, n_steps)
-            return Step(qpos=data.qpos.copy(), qvel=data.qvel.copy(), ctrl=data.ctrl.copy(), time=data.time)
-
-    def _cameras(self, include: bool | Mapping[str, str | CameraTiming]) -> bool | dict[str, str | None]:
-        if isinstance(include, bool):
-            return include
-        return {name: str(CameraTiming(timing)) for name, timing in include.items()}
 
     def _state_port(self) -> int:
         hello = self._state.hello

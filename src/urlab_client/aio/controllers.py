@@ -67,13 +67,13 @@ class URLabController:
         return await self._push({}, timeout)
 
     async def _push(self, params: dict[str, Any], timeout: Timeout) -> dict[str, Any]:
-        request = ConfigureController(articulation=self._prefix, params=params)
-        reply = await self._session.call(request, timeout=timeout)
-        _check_gains(self._prefix, self._info.kind, reply.params, "configure_controller")
-        # In place, so that views handed out before stay current.
-        self._info.params.clear()
-        self._info.params.update(reply.params)
-        return dict(self._info.params)
+        async with self._session.turn(ConfigureController, timeout=timeout) as turn:
+            reply = await turn.call(ConfigureController(articulation=self._prefix, params=params))
+            _check_gains(self._prefix, self._info.kind, reply.params, "configure_controller")
+            # In place, so that views handed out before stay current.
+            self._info.params.clear()
+            self._info.params.update(reply.params)
+            return dict(self._info.params)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.kind} of {self._prefix!r}>"

@@ -24,7 +24,7 @@ import msgspec
 from msgspec import Struct
 
 from urlab_client._children import APART
-from urlab_client.aio.transport.base import TransportStats
+from urlab_client.aio.transport.base import LateReply, TransportStats
 from urlab_client.aio.transport.zmq import ZmqTransport
 from urlab_client.protocol.base import Op
 from urlab_client.protocol.errors import ClientClosed, ServerUnreachable
@@ -103,8 +103,10 @@ class LaunchedTransport:
         """Whether the server runs and is on the line."""
         return self._inner is not None and self._inner.connected
 
-    async def request(self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None) -> bytes:
-        """See `Transport.request`. The first request also starts the server, which its deadline does not cover.
+    async def request(
+        self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
+    ) -> bytes:
+        """See `RequestTransport.request`. The first request also starts the server, which its deadline does not cover.
 
         When the server has died, a handshake starts another one; anything else would be refused by it anyway.
         """
@@ -126,7 +128,7 @@ class LaunchedTransport:
             took = loop.time() - before
             deadline = None if deadline is None else deadline + took
             connect_by = None if connect_by is None else connect_by + took
-        return await self._inner.request(frame, op, deadline=deadline, connect_by=connect_by)
+        return await self._inner.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
 
     async def follow(self, hello: HelloOk) -> None:
         """See `Transport.follow`: there is no other way."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import re
 import statistics
 import time
 from typing import TYPE_CHECKING
@@ -222,8 +221,7 @@ async def _pinned_mode(client: URLabClient) -> str | None:
     try:
         await client.call(SetMode(mode="?"))  # no mode: changes nothing on any server
     except ModeLocked as locked:
-        named = re.search(r"\b(live|direct|puppet|auto)\b", locked.message, re.IGNORECASE)
-        return named[0].lower() if named else "unknown"
+        return locked.pinned or "unknown"
     except URLabRPCError:
         return None
     return None

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 __all__ = ["add_parser", "run"]
 
 _VIEW_MODES = ("lit", "unlit", "wireframe", "collision")
+_TIMEOUT_S = 5.0
 _CHUNK = 100  # physics steps of one request, which the server gives 5 s
 _BEYOND_M = 1e5  # farther than what a ray can meet
 
@@ -44,7 +45,7 @@ class SnapshotArguments(ServerArguments):
     size: tuple[int, int]
     seconds: float | None
     keyframe: str | None
-    timeout: float
+    timeout: float | None
 
 
 def add_parser(commands: Commands) -> None:
@@ -86,7 +87,10 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("--seconds", type=seconds, metavar="S", help="simulate for this long before")
     add_ports(parser, state=False)
     parser.add_argument(
-        "--timeout", type=seconds, default=5.0, metavar="S", help="to wait for a running server (default: %(default)s)"
+        "--timeout",
+        type=seconds,
+        metavar="S",
+        help="to wait for a running server (default: 5, and 30 for its first picture)",
     )
     add_keys(parser)
     parser.set_defaults(run=run)
@@ -169,7 +173,7 @@ def _of_running_server(arguments: SnapshotArguments) -> NDArray[np.uint8]:
     if arguments.keyframe or arguments.seconds:
         raise CommandError("--keyframe and --seconds are for models: what a running server does is not changed")
     (address,) = arguments.sources
-    timeout_ms = round(1e3 * arguments.timeout)
+    timeout_ms = round(1e3 * (arguments.timeout or _TIMEOUT_S))
     with make_client(URLabClient, address, arguments, rcv_timeout_ms=timeout_ms) as client:
         client.discover()
         if arguments.camera is None:
@@ -180,13 +184,10 @@ def _of_running_server(arguments: SnapshotArguments) -> NDArray[np.uint8]:
         if arguments.mode not in (None, view.mode):
             raise CommandError(f"--mode {arguments.mode}: {arguments.camera} is a camera of mode {view.mode}")
         try:
-            with view.frames(timeout=arguments.timeout) as frames:
+            with view.frames() if arguments.timeout is None else view.frames(timeout=arguments.timeout) as frames:
                 next(frames)
-        except URLabTimeoutError:
-            raise CommandError(
-                f"{address}: no picture of {arguments.camera} within {arguments.timeout:g} s; servers publish them in "
-                "live mode only, and where they can draw"
-            ) from None
+        except URLabTimeoutError as error:
+            raise CommandError(f"{address}: no picture of {arguments.camera}: {error}") from None
         return _pixels(view)
 
 

@@ -6,10 +6,11 @@ Mistakes in arguments are plain `ValueError` or `TypeError`, raised before anyth
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from urlab_client.protocol.enums import PIEState
+from urlab_client.protocol.enums import PIEState, StepMode
 
 __all__ = [
     "RPC_ERRORS",
@@ -50,6 +51,7 @@ __all__ = [
     "NoController",
     "NoEngine",
     "NoJoints",
+    "NoSession",
     "NoTwistController",
     "NoViewport",
     "NoWorld",
@@ -315,6 +317,17 @@ class SessionTakenOver(
     """The server no longer knows this session: another client said hello, or the server restarted."""
 
 
+class NoSession(SessionTakenOver, advice="Call discover() first."):
+    """No session is open, or what it is about is not known: `discover()` was not called, or did not finish.
+
+    The op was not executed.
+    """
+
+    def __init__(self, message: str, *, op: str | None = None, hint: str | None = None) -> None:
+        super().__init__("session_expired", message, op=op, hint=hint)
+        self.args = (f"{op}: {message}" if op else message,)  # the code would say something else
+
+
 class BadRequest(URLabRPCError, code="bad_request"):
     """The frame is neither a msgpack map nor a JSON object."""
 
@@ -380,6 +393,15 @@ class UnknownKeyframe(URLabRPCError, code="unknown_keyframe"):
 
 class ModeLocked(URLabRPCError, code="mode_locked_by_server"):
     """The project pins the step mode."""
+
+    @property
+    def pinned(self) -> StepMode | None:
+        """The mode it is pinned to; None when the server's text names none, or more than one."""
+        named = {mode for mode in _PINNABLE if re.search(rf"\b{mode}\b", self.message, re.IGNORECASE)}
+        return named.pop() if len(named) == 1 else None
+
+
+_PINNABLE = (StepMode.LIVE, StepMode.DIRECT, StepMode.PUPPET)
 
 
 class BadMode(URLabRPCError, code="bad_mode"):

@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from typing import Any, NoReturn, TypeVar, cast, overload
 
-__all__ = ["NameMap", "UnknownName", "owner_of", "split_prefix", "unknown_name"]
+__all__ = ["NameMap", "UnknownName", "owner_of", "split_prefix"]
 
 T = TypeVar("T")
 D = TypeVar("D")
@@ -65,22 +65,6 @@ class UnknownName(KeyError):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.kind, self.name, self.matches, self.known, self.suggestions)
-
-
-def unknown_name(
-    kind: str, name: object, known: Collection[str], *, aliases: Collection[str] = (), matches: Sequence[str] = ()
-) -> UnknownName:
-    """Return the error for a name that is not among those known, with those spelled alike.
-
-    Args:
-        kind: What was looked for, for example `camera`.
-        name: The name that was asked for.
-        known: All names there are.
-        aliases: Further names that would have been found.
-        matches: The names that an ambiguous one could mean.
-    """
-    alike = difflib.get_close_matches(name, [*known, *aliases]) if isinstance(name, str) else []
-    return UnknownName(kind, name, tuple(matches), tuple(known), tuple(alike))
 
 
 def _listed(names: Sequence[str], conjunction: str) -> str:
@@ -161,9 +145,11 @@ class NameMap(dict[str, T]):
         return default if found is None else super().__getitem__(found)
 
     def _unknown(self, name: object) -> UnknownName:
+        known = tuple(self)
         matches = self._aliases.get(cast("str", name), ())
         unique = [alias for alias, keys in self._aliases.items() if len(keys) == 1]
-        return unknown_name(self.kind, name, self, aliases=unique, matches=matches)
+        suggestions = difflib.get_close_matches(name, [*known, *unique]) if isinstance(name, str) else []
+        return UnknownName(self.kind, name, matches, known, tuple(suggestions))
 
     def __reduce__(self) -> tuple[Any, ...]:
         return NameMap, (dict(self), self._aliases, self.kind)

@@ -28,7 +28,7 @@ from urlab_client.protocol.messages.session import (
     TwistState,
 )
 
-__all__ = ["MirroredArticulation", "MirroredEntity", "Wrenches"]
+__all__ = ["Carried", "MirroredArticulation", "MirroredEntity", "Wrenches", "give_back"]
 
 Wrenches = dict[str, list[float]]
 """(fx, fy, fz, tx, ty, tz) by body."""
@@ -109,13 +109,20 @@ class MirroredEntity:
             return data.qvel[self.qvel_offset : self.qvel_offset + 6].copy()
         return None if self.pose is None or self.pose.qvel is None else self.pose.qvel.copy()
 
-    def wrench_command(self) -> ArticulationCommand:
+    def wrench_command(self, wrenches: Wrenches) -> ArticulationCommand:
         """Return what makes a direct step carry the wrenches alone."""
-        return ArticulationCommand(xfrc_applied=self.wrenches)
+        return ArticulationCommand(xfrc_applied=wrenches)
 
-    def drop_wrenches(self, carried: Wrenches) -> None:
-        """Forget the wrenches that a step has carried, but not one that was applied again meanwhile."""
-        self.wrenches = {body: w for body, w in self.wrenches.items() if carried.get(body) is not w}
+    def apply_wrench(self, body: str, wrench: list[float]) -> None:
+        """Buffer a wrench for the next step, in place of an earlier one on the same body. From any thread."""
+        with self.mirror.lock:
+            self.wrenches[body] = wrench
+
+    def take_wrenches(self) -> Wrenches:
+        """Return the wrenches for the step that is being built, and leave the buffer empty."""
+        with self.mirror.lock:
+            taken, self.wrenches = self.wrenches, {}
+        return taken
 
 
 class MirroredArticulation(MirroredEntity):
@@ -314,8 +321,8 @@ class MirroredArticulation(MirroredEntity):
         """
         return ArticulationCommand(ctrl=self._set_points())
 
-    def direct_command(self) -> ArticulationCommand:
-        """Return what a direct step tells the articulation.
+    def direct_command(self, wrenches: Wrenches | None) -> ArticulationCommand:
+        """Return what a direct step that carries these wrenches tells the articulation.
 
         Raises:
             ValueError: A set-point is NaN or infinite.
@@ -324,7 +331,7 @@ class MirroredArticulation(MirroredEntity):
         return ArticulationCommand(
             ctrl=self._set_points(),
             control_mode=str(ControlMode.RAW) if bypass else None,
-            xfrc_applied=self._compiled(self.wrenches) or None,
+            xfrc_applied=self._compiled(wrenches or {}) or None,
         )
 
     def _set_points(self) -> list[float]:
@@ -403,3 +410,14 @@ class MirroredArticulation(MirroredEntity):
                 return np.array(received.xpos), np.array(received.xquat)
             pair = self.mirror.derived()
             return None if pair is None else (pair[1].xpos[body_id].copy(), pair[1].xquat[body_id].copy())
+
+
+Carried = dict[MirroredEntity, Wrenches]
+"""The wrenches that a step carries, by what they were applied to."""
+
+
+def give_back(carried: Carried) -> None:
+    """Buffer wrenches again whose step was not executed, where nothing newer was applied."""
+    for record, wrenches in carried.items():
+        with record.mirror.lock:
+            record.wrenches = {**wrenches, **record.wrenches}

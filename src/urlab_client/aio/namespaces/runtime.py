@@ -17,7 +17,14 @@ from urlab_client.aio.state.sim_state import SimState
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.codec import building
 from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.messages.runtime import ContactFilter, GetContacts, SetQpos, SetSimOptions, SetUserChannels
+from urlab_client.protocol.messages.runtime import (
+    ContactFilter,
+    GetContacts,
+    SetMode,
+    SetQpos,
+    SetSimOptions,
+    SetUserChannels,
+)
 from urlab_client.protocol.messages.session import Forward, ForwardOk
 from urlab_client.protocol.sim_options import check_sim_options
 from urlab_client.protocol.types import ContactsResult, SimOptions
@@ -51,9 +58,11 @@ class RuntimeNamespace(RuntimeOps):
             TypeError: Some are not numbers; nothing was sent.
             ValueError: Some are NaN or infinite; nothing was sent.
         """
-        values = self._positions(target, qpos, by_name=by_name)
-        reply = await self._call(SetQpos(target=target, qpos=values, target_by=target_by(by_name)), timeout)
-        self._state.mirror_qpos(reply.actor_name, reply.qpos)
+        async with self._session.turn(SetQpos, timeout=timeout) as turn:
+            self._state.require_handshake("set_qpos")
+            values = self._positions(target, qpos, by_name=by_name)
+            reply = await turn.call(SetQpos(target=target, qpos=values, target_by=target_by(by_name)))
+            self._state.mirror_qpos(reply.actor_name, reply.qpos)
 
     def _positions(self, target: str, qpos: Vector, *, by_name: bool) -> Floats:
         values = tuple(qpos)
@@ -122,9 +131,10 @@ class RuntimeNamespace(RuntimeOps):
             raise TypeError(f"set_sim_options: {error}. Nothing was sent.") from None
         except ValueError as error:
             raise ValueError(f"set_sim_options: {error}. Nothing was sent.") from None
-        reply = await self._call(SetSimOptions(options=options), timeout)
-        self._state.mirror_options(reply.options)
-        return reply.options
+        async with self._session.turn(SetSimOptions, timeout=timeout) as turn:
+            reply = await turn.call(SetSimOptions(options=options))
+            self._state.mirror_options(reply.options)
+            return reply.options
 
     async def set_user_channels(
         self,
@@ -162,13 +172,14 @@ class RuntimeNamespace(RuntimeOps):
 
         Raises:
             ValueError: Unknown mode; nothing was sent.
-            ModeLocked: The project pins the mode.
+            ModeLocked: The project pins another mode.
         """
         wanted = StepMode(mode)
-        # On the wire `auto` is a mode in which every step times out.
-        await self._state.ask_mode(StepMode.LIVE if wanted is StepMode.AUTO else wanted, timeout=timeout)
-        self._state.wanted_mode = self._state.mode
-        return self._state.mode
+        async with self._session.turn(SetMode, timeout=timeout) as turn:
+            # On the wire `auto` is a mode in which every step times out.
+            await self._state.ask_mode(turn, StepMode.LIVE if wanted is StepMode.AUTO else wanted)
+            self._state.wanted_mode = self._state.mode
+            return self._state.mode
 
     async def forward(self, *, timeout: Timeout = DEFAULT) -> ForwardOk:
         """Run `mj_forward` on the server and take over the state: kinematics and dynamics, no integration.
@@ -178,6 +189,8 @@ class RuntimeNamespace(RuntimeOps):
         Returns:
             The state; time and step counter are unchanged.
         """
-        reply = await self._call(Forward(), timeout)
-        self._state.absorb(reply, "forward", into_mirror=self._state.mode is not StepMode.PUPPET)
-        return reply
+        async with self._session.turn(Forward, timeout=timeout) as turn:
+            self._state.require_handshake("forward")
+            reply = await turn.call(Forward())
+            self._state.absorb(reply, "forward", into_mirror=self._state.mode is not StepMode.PUPPET)
+            return reply

@@ -10,11 +10,12 @@ import msgspec
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.namespaces._base import Namespace
-from urlab_client.aio.session import Session
+from urlab_client.aio.session import Session, Turn
+from urlab_client.aio.state.recovery import leaves_open
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.protocol.enums import PIEState
 from urlab_client.protocol.errors import URLabPIEError, URLabTimeoutError
-from urlab_client.protocol.messages.sim import BeginPie, BeginPieOk, PieStatus, StopPie
+from urlab_client.protocol.messages.sim import BeginPie, BeginPieOk, PieStatus, PieStatusOk, StopPie
 from urlab_client.protocol.types import PIEStartResult, PIEStatus
 
 __all__ = ["SimNamespace"]
@@ -57,26 +58,14 @@ class SimNamespace(Namespace):
         Raises:
             URLabPIEError: Play did not become ready; its message carries the compile log.
         """
-        loop = running_loop()
-        deadline = loop.time() + timeout_s
-        # In slices: while the server waits for the compile it answers nobody, this client included.
-        reply = await self._begin(level_path, min(timeout_s, _SLICE_S), timeout)
-        while reply.state == PIEState.TIMEOUT and not reply.compile_error and loop.time() < deadline:
-            status = await self.status(timeout=timeout)
-            if on_progress is not None:
-                on_progress(status)
-            if status.state is PIEState.COMPILING:
-                await asyncio.sleep(min(_POLL_S, max(0.0, deadline - loop.time())))
-            elif status.state is PIEState.OFF:
-                break
-            else:
-                reply = await self._begin(None, min(max(0.0, deadline - loop.time()), _SLICE_S), timeout)
-        state = reply.state
-        payload = reply.handshake_payload
-        result = PIEStartResult(state=state, compile_error=reply.compile_error)
-        if payload is not None:
-            await self._state.adopt(payload, timeout=timeout)
-            result.handshake_payload = msgspec.to_builtins(payload)
+        async with self._session.turn(BeginPie, timeout=timeout, each=True) as turn:
+            reply = await self._play(turn, level_path, timeout_s, on_progress)
+            state = reply.state
+            payload = reply.handshake_payload
+            result = PIEStartResult(state=state, compile_error=reply.compile_error)
+            if payload is not None:
+                await self._state.adopt(turn, payload)
+                result.handshake_payload = msgspec.to_builtins(payload)
         if raise_on_failure and not result.is_ready:
             explanation = reply.compile_error or (
                 f"no compiled model within {timeout_s:g} s; does the level have a manager (scene.ensure_manager())?"
@@ -84,9 +73,36 @@ class SimNamespace(Namespace):
             raise URLabPIEError(code=str(state), message=explanation, state=state)
         return result
 
-    async def _begin(self, level_path: str | None, timeout_s: float, timeout: Timeout) -> BeginPieOk:
-        seconds = timeout_s + _SLACK_S if timeout is DEFAULT else timeout
-        return await self._call(BeginPie(level_path=level_path, timeout_s=timeout_s), seconds)
+    async def _play(
+        self, turn: Turn, level_path: str | None, timeout_s: float, on_progress: Callable[[PIEStatus], object] | None
+    ) -> BeginPieOk:
+        """Begin play and wait until its model is compiled, or has failed to, or time is up."""
+        loop = running_loop()
+        deadline = loop.time() + timeout_s
+        # In slices: while the server waits for the compile it answers nobody, this client included.
+        reply = await self._begin(turn, level_path, min(timeout_s, _SLICE_S))
+        while reply.state == PIEState.TIMEOUT and not reply.compile_error and loop.time() < deadline:
+            status = _status(await turn.call(PieStatus()))
+            if on_progress is not None:
+                on_progress(status)
+            if status.state is PIEState.COMPILING:
+                await turn.aside(asyncio.sleep(min(_POLL_S, max(0.0, deadline - loop.time()))))
+            elif status.state is PIEState.OFF:
+                break
+            else:
+                reply = await self._begin(turn, None, min(max(0.0, deadline - loop.time()), _SLICE_S))
+        return reply
+
+    async def _begin(self, turn: Turn, level_path: str | None, timeout_s: float) -> BeginPieOk:
+        pending = self._state.pending
+        try:
+            reply = await turn.call(BeginPie(level_path=level_path, timeout_s=timeout_s), takes=timeout_s + _SLACK_S)
+        except BaseException as error:
+            pending.play = pending.play or (turn.sent and leaves_open(error))
+            raise
+        # Until the handshake has been taken over, or there will be none.
+        pending.play = reply.state in (PIEState.READY, PIEState.TIMEOUT)
+        return reply
 
     async def stop(self, *, timeout: Timeout = DEFAULT) -> None:
         """End play and wait until it has ended; a success without one. The session goes on, authoring works.
@@ -99,22 +115,28 @@ class SimNamespace(Namespace):
             URLabTimeoutError: The editor agreed, but play has not ended after ten seconds.
         """
         loop = running_loop()
-        self._state.stopping = True
-        # On Windows, what we have mapped the server could neither remove nor make anew.
-        self._state.publishers.release_regions()
-        try:
-            await self._call(StopPie(), timeout)
-            # The plugin answers when the end has been requested.
-            deadline = loop.time() + _WIND_DOWN_S
-            while (await self.status(timeout=timeout)).state is not PIEState.OFF:
-                if loop.time() > deadline:
-                    raise URLabTimeoutError(f"stop_pie: play has not ended within {_WIND_DOWN_S:g} s.", op="stop_pie")
-                await asyncio.sleep(_STOP_POLL_S)
-        finally:
-            self._state.stopping = False
-        self._state.on_play_ended("stopped by this client")
+        async with self._session.turn(StopPie, timeout=timeout, each=True) as turn:
+            self._state.stopping = True
+            # On Windows, what we have mapped the server could neither remove nor make anew.
+            self._state.publishers.release_regions()
+            try:
+                await turn.call(StopPie())
+                # The plugin answers when the end has been requested.
+                deadline = loop.time() + _WIND_DOWN_S
+                while _status(await turn.call(PieStatus())).state is not PIEState.OFF:
+                    if loop.time() > deadline:
+                        raise URLabTimeoutError(
+                            f"stop_pie: play has not ended within {_WIND_DOWN_S:g} s.", op="stop_pie"
+                        )
+                    await turn.aside(asyncio.sleep(_STOP_POLL_S))
+            finally:
+                self._state.stopping = False
+            self._state.on_play_ended("stopped by this client")
 
     async def status(self, *, timeout: Timeout = DEFAULT) -> PIEStatus:
         """Read the state of play."""
-        reply = await self._call(PieStatus(), timeout)
-        return PIEStatus(state=reply.state, compile_error=reply.compile_error, sim_time=reply.sim_time)
+        return _status(await self._call(PieStatus(), timeout))
+
+
+def _status(reply: PieStatusOk) -> PIEStatus:
+    return PIEStatus(state=reply.state, compile_error=reply.compile_error, sim_time=reply.sim_time)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from urlab_client.aio.deadline import DEFAULT, Timeout, shared
+from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.model.articulation_state import Carried, give_back
+from urlab_client.aio.session import Turn
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import (
     InternalError,
+    ModeLocked,
     NoActiveManager,
+    NoSession,
     NotReady,
     ServerUnreachable,
     SessionTakenOver,
@@ -22,10 +26,9 @@ from urlab_client.protocol.messages.session import Forward, ForwardOk
 from urlab_client.protocol.types import Resync
 
 if TYPE_CHECKING:
-    from urlab_client.aio.model.articulation_state import MirroredEntity, Wrenches
     from urlab_client.aio.state.sim_state import SimState
 
-__all__ = ["PendingOutcomes", "resync"]
+__all__ = ["PendingOutcomes", "leaves_open", "resync"]
 
 # These refusals leave open whether the op was executed. All others mean that it was not.
 _UNDECIDED = (StepTimeout, ShuttingDown, InternalError)
@@ -40,15 +43,17 @@ class PendingOutcomes:
         time: Simulation time before the first of them, seconds.
         connects: Connections made when the latest of them was sent.
         queued: Whether the server said that it has queued steps.
-        wrenches: What the steps carried, which the server takes once.
+        carried: What steps carried, each with the number of steps that must have been executed for it to have acted.
         reset: Whether a reset is among them.
         keyframe: Compiled keyframe of that reset.
         mode: Step mode that was asked for, or None.
+        play: Whether a start of play was broken off, so that another world may be playing than the client knows.
     """
 
     def __init__(self) -> None:
         self.connects = 0
         self.mode: StepMode | None = None
+        self.play = False
         self.clear()
 
     def __bool__(self) -> bool:
@@ -60,32 +65,37 @@ class PendingOutcomes:
         self.time = 0.0
         self.queued = self.reset = False
         self.keyframe: str | None = None
-        self.wrenches: list[tuple[MirroredEntity, Wrenches]] = []
+        self.carried: list[tuple[int, Carried]] = []
 
-    def add_steps(
-        self, state: SimState, error: BaseException, steps: int, carried: list[tuple[MirroredEntity, Wrenches]]
-    ) -> None:
+    def add_steps(self, state: SimState, error: BaseException, steps: int, carried: Carried) -> None:
         """Note that steps were sent and `error` came instead of their reply."""
-        if _open(error):
-            self._note(state)
-            self.steps += steps
-            self.wrenches += carried
-            self.queued = self.queued or isinstance(error, StepTimeout)
+        self._note(state)
+        self.steps += steps
+        if carried:
+            self.carried.append((self.steps, carried))
+        self.queued = self.queued or isinstance(error, StepTimeout)
 
-    def add_reset(self, state: SimState, error: BaseException, keyframe: str | None) -> None:
-        """Note that a reset was sent and `error` came instead of its reply."""
-        if _open(error):
-            self._note(state)
-            self.reset = True
-            self.keyframe = keyframe
+    def add_reset(self, state: SimState, keyframe: str | None) -> None:
+        """Note that a reset was sent and an error came instead of its reply."""
+        self._note(state)
+        self.reset = True
+        self.keyframe = keyframe
+
+    def give_back(self, applied: int) -> None:
+        """Buffer again what was carried by steps that were not executed."""
+        for needed, carried in reversed(self.carried):
+            if needed > applied:
+                give_back(carried)
 
     @contextmanager
     def about_mode(self, mode: StepMode) -> Generator[None]:
-        """Note, unless the body succeeds or is refused, that the step mode may be `mode` now."""
+        """Note, unless the body succeeds or is refused, that the server is to be brought into `mode`."""
         try:
             yield
         except BaseException as error:
-            if _open(error):
+            if isinstance(error, ModeLocked):
+                self.mode = None
+            elif leaves_open(error):
                 self.mode = mode
             raise
         self.mode = None
@@ -96,7 +106,8 @@ class PendingOutcomes:
         self.connects = state.session.transport.stats.connects
 
 
-def _open(error: BaseException) -> bool:
+def leaves_open(error: BaseException) -> bool:
+    """Return whether a request that left and failed in this way may have been executed."""
     if isinstance(error, URLabRPCError):
         return isinstance(error, _UNDECIDED)
     return not isinstance(error, (ServerUnreachable, TypeError, ValueError))
@@ -108,24 +119,25 @@ async def resync(state: SimState, *, timeout: Timeout = DEFAULT) -> Resync:
     `forward` is the only op that tells both in every mode. It integrates nothing and warm-starts nothing: the
     trajectory after it is the same, bit for bit.
     """
-    left = shared(timeout)
-    pending, state.pending = state.pending, PendingOutcomes()
-    try:
-        return await _resync(state, pending, left)
-    except BaseException:
-        state.pending = pending  # for the next attempt
-        raise
+    async with state.session.turn(Forward, timeout=timeout) as turn:
+        pending, state.pending = state.pending, PendingOutcomes()
+        try:
+            return await _resync(state, pending, turn)
+        except BaseException:
+            pending.mode = state.pending.mode or pending.mode
+            state.pending = pending  # for the next attempt
+            raise
 
 
-async def _resync(state: SimState, pending: PendingOutcomes, left: Callable[[], Timeout]) -> Resync:
+async def _resync(state: SimState, pending: PendingOutcomes, turn: Turn) -> Resync:
     sent = pending.steps
     applied: int | None = None if sent else 0
     was_reset: bool | None = None
     before: ForwardOk | None = None
     held, renewed = True, False
     try:
-        reply = before = await _look(state, left())
-    except SessionTakenOver:
+        reply = before = await _look(turn)
+    except (SessionTakenOver, NoSession):
         reply, held, renewed = None, False, True
     if before is not None:
         applied, was_reset = _compare(pending, before)
@@ -134,22 +146,22 @@ async def _resync(state: SimState, pending: PendingOutcomes, left: Callable[[], 
         # the next push overrides it anyway; elsewhere it is shut out with the session it belongs to.
         late = pending.connects != state.session.transport.stats.connects and state.mode is not StepMode.PUPPET
         renewed = late and not (applied == sent and (was_reset or not pending.reset))
-    if renewed:
-        await state.open(state.level, timeout=left())
-        reply = await _look(state, left())
+    if renewed or pending.play:
+        renewed = True
+        await state.open(turn, state.level)
+        reply = await _look(turn)
         if before is not None and reply is not None and applied is not None and reply.time != before.time:
             applied = _slipped_in(state, applied, reply.time - before.time)
     if reply is not None and pending.mode is not None:
-        await state.ask_mode(pending.mode, timeout=left())
-        reply = await _look(state, left())  # in live mode it has moved on meanwhile
+        await state.ask_mode(turn, pending.mode)
+        reply = await _look(turn)  # in live mode it has moved on meanwhile
     if reply is not None:
         if was_reset:
             state.absorb_reset(reply, pending.keyframe)
         else:
             state.absorb(reply, "forward", into_mirror=state.mode is not StepMode.PUPPET)
-    if applied == sent:
-        for record, wrenches in pending.wrenches:
-            record.drop_wrenches(wrenches)
+    if applied is not None:
+        pending.give_back(applied)
     return Resync(
         session_held=held,
         session_renewed=renewed,
@@ -163,10 +175,10 @@ async def _resync(state: SimState, pending: PendingOutcomes, left: Callable[[], 
     )
 
 
-async def _look(state: SimState, timeout: Timeout) -> ForwardOk | None:
+async def _look(turn: Turn) -> ForwardOk | None:
     """Return where the simulation stands, None where no play runs."""
     try:
-        return await state.session.call(Forward(), timeout=timeout)
+        return await turn.call(Forward())
     except (NoActiveManager, NotReady):
         return None
 

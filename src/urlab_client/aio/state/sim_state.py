@@ -20,19 +20,20 @@ import numpy as np
 
 from urlab_client.aio.articulation import URLabArticulation, URLabEntity
 from urlab_client.aio.cameras import URLabCameraView
-from urlab_client.aio.deadline import DEFAULT, Timeout, shared
 from urlab_client.aio.live.live_state import LatestPicture, LiveState
 from urlab_client.aio.live.publishers import Publishers
-from urlab_client.aio.model.articulation_state import MirroredArticulation, MirroredEntity, Wrenches
+from urlab_client.aio.model.articulation_state import Carried, MirroredArticulation, MirroredEntity
 from urlab_client.aio.model.mirror import Mirror, write_options
-from urlab_client.aio.session import Session
+from urlab_client.aio.session import Session, Turn
 from urlab_client.aio.state.handshake import Examined, examine
-from urlab_client.aio.state.recovery import PendingOutcomes
+from urlab_client.aio.state.recovery import PendingOutcomes, leaves_open
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.enums import LATER_MODE_NAMES, CameraMode, StepMode
 from urlab_client.protocol.errors import (
     BadMode,
+    ModeLocked,
     NoActiveManager,
+    NoSession,
     ProtocolError,
     SessionTakenOver,
     URLabError,
@@ -98,6 +99,7 @@ class SimState:
         publishers: What the server publishes.
         mirror: Local model and data.
         wanted_mode: Step mode the user asked for.
+        mode_assumed: Whether nothing the server said shows yet that `mode` is in force.
         promoted_from: Mode to go back to on close, after a promotion of our own.
         level: Observation level of the session.
         sent_level: Observation level the server has, which an earlier step may have changed.
@@ -130,6 +132,7 @@ class SimState:
         self.mirror = Mirror()
         self.wanted_mode = wanted_mode
         self._mode = StepMode.LIVE
+        self.mode_assumed = False
         self._live = LiveState(publishers.state(), self._absorb_live, self.mirror.lock)
         self.promoted_from: StepMode | None = None
         self.level = "standard"
@@ -148,6 +151,7 @@ class SimState:
         self._local_model = local_model
         self._check_version = check_version
         self._mismatch_said = False
+        session.on_opened = self._note_session
         session.on_refusal = self._note_refusal
         session.control.resolve = self._articulation_key
         self._promote = promote
@@ -167,6 +171,7 @@ class SimState:
 
     @mode.setter
     def mode(self, mode: StepMode) -> None:
+        self.mode_assumed = False
         self._mode = mode
         live = mode is StepMode.LIVE and self.hello is not None and self.hello.manager_present
         receivers: list[LiveState | LatestPicture] = [self._live]
@@ -177,6 +182,11 @@ class SimState:
                 receiver.start()
             else:
                 receiver.stop()
+
+    def assume_mode(self, mode: StepMode) -> None:
+        """Go by a step mode until a reply shows which one is in force: no op tells it without changing it."""
+        self.mode = mode
+        self.mode_assumed = True
 
     @property
     def live(self) -> bool:
@@ -198,57 +208,72 @@ class SimState:
         """Records of the plain entities, by name."""
         return self._entity_records
 
+    @property
+    def local_time(self) -> float:
+        """Simulation time of the local data, or without them of the last reply, seconds."""
+        return self.sim_time if self.mirror.data is None else self.mirror.data.time
+
     def _articulation_key(self, name: str) -> str | None:
         articulation = self.articulations.get(name)
         return None if articulation is None else articulation.prefix
 
-    def direct_commands(self) -> dict[str, ArticulationCommand]:
-        """Return what a step tells the articulations and entities, wrenches included."""
-        claims = self.session.features.claims
-        # A server whose robots have owners refuses a step that writes to others' robots, so it hears of ours only.
-        commands = {
-            key: record.direct_command() for key, record in self._records.items() if record.driven or not claims
-        }
+    def direct_commands(self, carried: Carried) -> dict[str, ArticulationCommand]:
+        """Return what a step tells the articulations and entities, with the wrenches that it carries."""
+        commands = {record.name: record.direct_command(carried.get(record)) for record in self._ours()}
         for name, record in self._entity_records.items():
-            if not record.wrenches:
+            if record not in carried:
                 continue
-            if not claims:
+            if not self.session.features.claims:
                 # Under its own name: the server tries the body's name alone after `<key>_<body>`.
-                commands[name] = record.wrench_command()
-            elif self._records:
+                commands[name] = record.wrench_command(carried[record])
+            else:
                 # An entity has no owner, so one of the robots takes it along.
                 key = next(iter(commands or self._records))
                 carrier = commands.setdefault(key, ArticulationCommand())
-                carrier.xfrc_applied = {**(carrier.xfrc_applied or {}), **record.wrenches}
+                carrier.xfrc_applied = {**(carrier.xfrc_applied or {}), **carried[record]}
         return commands
 
-    def live_commands(self) -> dict[str, ArticulationCommand]:
+    def live_commands(self, carried: Carried) -> dict[str, ArticulationCommand]:
         """Return what a step in live mode tells the articulations."""
         if self.session.features.live_pictures_in_steps:
-            return self.direct_commands()
+            return self.direct_commands(carried)
+        return {record.name: record.live_command() for record in self._ours()}
+
+    def _ours(self) -> list[MirroredArticulation]:
+        # A server whose robots have owners refuses a step that writes to others' robots, so it hears of ours only.
         claims = self.session.features.claims
-        return {key: record.live_command() for key, record in self._records.items() if record.driven or not claims}
+        return [record for record in self._records.values() if record.driven or not claims]
 
-    def buffered_wrenches(self) -> list[tuple[MirroredEntity, Wrenches]]:
-        """Return what a direct step is about to carry."""
-        records: list[MirroredEntity] = [*self._records.values(), *self._entity_records.values()]
-        return [(record, dict(record.wrenches)) for record in records if record.wrenches]
+    def take_wrenches(self) -> Carried:
+        """Take what the step that is being built carries out of its buffers."""
+        records: list[MirroredEntity] = [*self._ours()]
+        if self._records or not self.session.features.claims:
+            records.extend(self._entity_records.values())
+        return {record: record.take_wrenches() for record in records if record.wrenches}
 
-    async def open(self, observations: str, *, timeout: Timeout = DEFAULT) -> HelloOk:
-        """Open a session and take over what the server says."""
-        left = shared(timeout)
-        hello = await self.session.hello(Hello(observations=observations), timeout=left())
-        self.pending.clear()  # what belonged to the session before is refused now
-        self.publishers.events.publish(
-            SessionOpened(
-                session_id=hello.session_id, urlab_version=hello.urlab_version, mujoco_version=hello.mujoco_version
+    def require_handshake(self, op: str) -> None:
+        """Refuse an op that goes by what a handshake said, when that is not known.
+
+        Raises:
+            NoSession: The handshake of the session, or of a new play, was given up.
+        """
+        if self.hello is None and self.session.greeted:
+            raise NoSession("discover() did not finish. Nothing was sent.", op=op)
+        if self.pending.play:
+            raise NoSession(
+                "sim.start() was broken off, so it is not known what plays now. Nothing was sent.",
+                op=op,
+                hint="Call sim.start(), discover() or resync().",
             )
-        )
+
+    async def open(self, turn: Turn, observations: str) -> HelloOk:
+        """Open a session and take over what the server says."""
+        hello = await self.session.hello(turn, Hello(observations=observations))
         self.level = self.sent_level = observations
-        await self.adopt(hello, timeout=left())
+        await self.adopt(turn, hello)
         return hello
 
-    async def _loadable(self, hello: HelloOk, timeout: Timeout) -> HelloOk:
+    async def _loadable(self, turn: Turn, hello: HelloOk) -> HelloOk:
         """Return a handshake whose model this process can and may load.
 
         Raises:
@@ -266,12 +291,28 @@ class SimState:
                     stacklevel=2,
                 )
             if hello.mjcf_compiled is None:
-                hello = await self.session.hello(Hello(observations=self.level, include_assets=True), timeout=timeout)
+                hello = await self._hello_with_assets(turn)
         if hello.mjb is not None and not self._trusted:
-            hello = await self._without_binary(hello, timeout)
+            hello = await self._without_binary(turn, hello)
         return hello
 
-    async def _without_binary(self, hello: HelloOk, timeout: Timeout) -> HelloOk:
+    async def _hello_with_assets(self, turn: Turn) -> HelloOk:
+        hello = await self.session.hello(turn, Hello(observations=self.level, include_assets=True))
+        self.sent_level = self.level
+        return hello
+
+    def _note_session(self, hello: HelloOk) -> None:
+        """Note that a session was opened, maybe by a handshake that its caller had given up."""
+        self.pending.clear()  # what belonged to the session before is refused now
+        self.step_count = 0
+        self.sent_level = ""
+        self.publishers.events.publish(
+            SessionOpened(
+                session_id=hello.session_id, urlab_version=hello.urlab_version, mujoco_version=hello.mujoco_version
+            )
+        )
+
+    async def _without_binary(self, turn: Turn, hello: HelloOk) -> HelloOk:
         """Return the handshake with a model in XML alone: MuJoCo's binary loader is no match for a hostile model.
 
         Raises:
@@ -279,7 +320,7 @@ class SimState:
         """
         if hello.mjcf_compiled is None:
             log.info("the server is not trusted with binary models: the local model is compiled here from XML")
-            hello = await self.session.hello(Hello(observations=self.level, include_assets=True), timeout=timeout)
+            hello = await self._hello_with_assets(turn)
         if hello.manager_present and hello.mjcf_compiled is None:
             raise URLabError(
                 "The server offers its model only in MuJoCo's binary format, which is loaded from servers on this "
@@ -291,16 +332,16 @@ class SimState:
         hello.mjb = None
         return hello
 
-    async def adopt(self, hello: HelloOk, *, timeout: Timeout = DEFAULT) -> None:
+    async def adopt(self, turn: Turn, hello: HelloOk) -> None:
         """Take over a handshake: load its model, bind the wrappers, bring the server into the wanted step mode."""
         hello.mjb_base64 = NOT_SENT  # it keeps the whole reply in memory
         await self.session.transport.follow(hello)
         loaded = None
         if self._local_model:
             if hello.mjb is not None:
-                hello = await self._loadable(hello, timeout)
+                hello = await self._loadable(turn, hello)
             load = partial(self.mirror.load, hello, trusted=self._trusted)
-            loaded = await anyio.to_thread.run_sync(load, abandon_on_cancel=True)
+            loaded = await turn.aside(anyio.to_thread.run_sync(load, abandon_on_cancel=True))
         examined = examine(hello, None if loaded is None else loaded.model)
         self.publishers.check_open()
         # From here on nothing waits until all is taken over: cancelled or not, model and wrappers belong together.
@@ -318,6 +359,7 @@ class SimState:
                 {n: self._global_camera(n, info) for n, info in cameras.items()}, kind="camera"
             )
             self.step_count = 0
+        self.pending.play = False
         self._views()  # binds the cameras to what the handshake says of them
         self.publishers.refresh()
         if self.publishers.camera_switch is not None:
@@ -328,39 +370,66 @@ class SimState:
             self.on_adopted()
         if not hello.manager_present:
             self.mode = StepMode.LIVE
-        elif self._promote and self.wanted_mode in (StepMode.DIRECT, StepMode.PUPPET):
-            previous = await self.ask_mode(self.wanted_mode, timeout=timeout)
-            if previous is not self.mode:
-                self.promoted_from = previous
+        elif self._promote and self.wanted_mode is not StepMode.AUTO:
+            await self._promote_to(turn, self.wanted_mode)
         else:
-            self.mode = StepMode.LIVE if self.wanted_mode is StepMode.AUTO else self.wanted_mode
+            self.assume_mode(StepMode.LIVE if self.wanted_mode is StepMode.AUTO else self.wanted_mode)
         log.info(
             "session with %s, MuJoCo %s: %d articulations, mode %s",
             hello.urlab_version, hello.mujoco_version, len(self.articulations), self.mode,
         )  # fmt: skip
 
-    async def ask_mode(self, mode: StepMode, *, timeout: Timeout = DEFAULT) -> StepMode:
-        """Bring the server into a step mode, take over the one in force, and return the one before."""
-        left = shared(timeout)
-        with self.pending.about_mode(mode):
-            try:
-                reply = await self.session.call(SetMode(mode=mode), timeout=left())
-            except BadMode:
-                # Servers after the beta call the modes by other names.
-                reply = await self.session.call(SetMode(mode=LATER_MODE_NAMES.get(mode, mode)), timeout=left())
+    async def _promote_to(self, turn: Turn, mode: StepMode) -> None:
+        self.pending.mode = mode  # until the server has agreed, whatever comes between
+        try:
+            previous = await self.ask_mode(turn, mode)
+        except ModeLocked as locked:
+            if locked.pinned is not None:
+                raise
+            self.assume_mode(mode)  # which mode it is pinned to shows in the reply to the first step
+            return
+        except BaseException as error:
+            if leaves_open(error) and self.promoted_from is None:
+                self.promoted_from = StepMode.LIVE  # what play begins in; the reply would have told
+            raise
+        if previous is not self.mode:
+            self.promoted_from = previous
+
+    async def ask_mode(self, turn: Turn, mode: StepMode) -> StepMode:
+        """Bring the server into a step mode, take over the one in force, and return the one before.
+
+        Raises:
+            ModeLocked: The project pins another one, which has been taken over if its name is known.
+        """
+        try:
+            with self.pending.about_mode(mode):
+                try:
+                    reply = await turn.call(SetMode(mode=mode))
+                except BadMode:
+                    # Servers after the beta call the modes by other names.
+                    reply = await turn.call(SetMode(mode=LATER_MODE_NAMES.get(mode, mode)))
+        except ModeLocked as locked:
+            if locked.pinned is not None:
+                self.mode = locked.pinned
+            if locked.pinned is not mode:
+                raise
+            if mode is StepMode.DIRECT:
+                # Play starts paused, and no change of mode can resume it where the mode is pinned.
+                await turn.call(SetPaused(paused=False))
+            return mode
         try:
             if self.session.features.idles_in_puppet:
-                await self._still_puppet(reply.previous_mode, reply.current_mode, left())
+                await self._still_puppet(turn, reply.previous_mode, reply.current_mode)
         finally:
             self.mode = reply.current_mode
         return reply.previous_mode
 
-    async def _still_puppet(self, previous: StepMode, current: StepMode, timeout: Timeout) -> None:
+    async def _still_puppet(self, turn: Turn, previous: StepMode, current: StepMode) -> None:
         """Keep physics from taking steps of its own between the pushes of puppet mode, and undo that afterwards."""
         if current is StepMode.PUPPET:
-            await self.session.call(SetPaused(paused=True), timeout=timeout)
+            await turn.call(SetPaused(paused=True))
         elif previous is StepMode.PUPPET and current is StepMode.LIVE:  # direct mode takes the pause back itself
-            await self.session.call(SetPaused(paused=False), timeout=timeout)
+            await turn.call(SetPaused(paused=False))
 
     def _global_camera(self, name: str, info: CameraInfo) -> URLabCameraView:
         view = self.global_cameras.get(name)

@@ -61,7 +61,9 @@ class StepPictures:
         return _RENDER_S if self._features.renders_sync else _BLOCKING_S * len(self._sync)
 
     def ask(self, request: Step) -> None:
-        """Write into a request what it is to ask for."""
+        """Write into a request what it is to ask for, if anything."""
+        if not self:
+            return
         request.include_cameras = True if self._all else dict(self._wanted)
         if self._sync and self._features.renders_sync:
             request.render = "sync"

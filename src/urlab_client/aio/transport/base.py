@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 from msgspec import Struct
 
@@ -11,7 +12,11 @@ from urlab_client.protocol.base import Op
 from urlab_client.protocol.messages.session import HelloOk
 from urlab_client.protocol.messages.streams import ClientEvent
 
-__all__ = ["RequestTransport", "TransportStats"]
+__all__ = ["LateReply", "RequestTransport", "TransportStats"]
+
+LateReply: TypeAlias = Callable[[asyncio.Future[bytes]], None]
+"""Told of a request that left and whose caller gave up: the future gets the reply, or is cancelled when none can come.
+"""
 
 
 class TransportStats(Struct):
@@ -56,7 +61,9 @@ class RequestTransport(Protocol):
         """Whether a server is on the line."""
         ...
 
-    async def request(self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None) -> bytes:
+    async def request(
+        self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
+    ) -> bytes:
         """Send `frame` and return the reply's bytes.
 
         Args:
@@ -64,6 +71,7 @@ class RequestTransport(Protocol):
             op: Its op: named in errors, and decides what a lost reply means.
             deadline: Loop time at which to give up; None waits.
             connect_by: Loop time by which a connection must stand; None waits.
+            late: Told, when this is cancelled or times out after sending, where the reply will be; None drops it.
 
         Raises:
             ServerUnreachable: No connection by `connect_by`; nothing was sent.

@@ -21,7 +21,7 @@ import msgspec
 from msgspec import Struct
 
 from urlab_client._windows import NamedEvent
-from urlab_client.aio.transport.base import RequestTransport
+from urlab_client.aio.transport.base import LateReply, RequestTransport
 from urlab_client.aio.transport.busy_poll import BusyPoll
 from urlab_client.aio.transport.mapped_region import MappedRegion, RegionInUse
 from urlab_client.aio.transport.poller import Doorbell, Poller, ReplyPoll
@@ -360,8 +360,10 @@ class ShmTransport:
         while self._settling(channel) and loop.time() < give_up:  # noqa: ASYNC110 - a region has no event
             await asyncio.sleep(0.001)
 
-    async def request(self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None) -> bytes:
-        """See `RequestTransport.request`."""
+    async def request(
+        self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
+    ) -> bytes:
+        """See `RequestTransport.request`. Where late replies come is told of what goes over ZMQ, as handshakes do."""
         detour = self._detour(frame, op)
         channel = None
         if not detour:
@@ -379,7 +381,7 @@ class ShmTransport:
                 self._learn(frame, op, answer)
                 return answer
         self.stats.over_zmq[detour] = self.stats.over_zmq.get(detour, 0) + 1
-        answer = await self._inner.request(frame, op, deadline=deadline, connect_by=connect_by)
+        answer = await self._inner.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
         self._learn(frame, op, answer)
         return answer
 

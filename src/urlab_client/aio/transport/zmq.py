@@ -21,7 +21,7 @@ from zmq.utils.monitor import recv_monitor_message
 from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.transport import connection_status
 from urlab_client.aio.transport import context as shared_context
-from urlab_client.aio.transport.base import TransportStats
+from urlab_client.aio.transport.base import LateReply, TransportStats
 from urlab_client.aio.transport.busy_poll import BusyPoll
 from urlab_client.aio.transport.curve import ClientKeys
 from urlab_client.aio.transport.readiness import Readiness, watch_socket
@@ -100,6 +100,7 @@ class ZmqTransport:
         self._due = 0.0
         self._busy_poll = BusyPoll(_SPIN_S, _LONGEST_SPIN_S)
         self._sent: dict[bytes, _Sent] = {}
+        self._late: dict[bytes, asyncio.Future[bytes]] = {}
         self._waiting: set[asyncio.Future[None]] = set()
         self._last_id = 0
         self._connected = False
@@ -126,8 +127,10 @@ class ZmqTransport:
         """Whether a server is on the line."""
         return self._connected
 
-    async def request(self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None) -> bytes:
-        """See `Transport.request`."""
+    async def request(
+        self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
+    ) -> bytes:
+        """See `RequestTransport.request`."""
         loop, socket, replies = self._open()
         send = socket.send
         while True:
@@ -163,6 +166,10 @@ class ZmqTransport:
             if not entry.reply.done():
                 replies.expect()
             answer = await entry.reply
+        except (asyncio.CancelledError, URLabTimeoutError):
+            if late is not None:
+                late(self._reply_to_come(key, entry))
+            raise
         finally:
             self._sent.pop(key, None)
         self._busy_poll.note(op.name, time.perf_counter() - sent)
@@ -224,9 +231,22 @@ class ZmqTransport:
         loop.call_soon(self._on_event)
         return loop, socket, self._replies
 
+    def _reply_to_come(self, key: bytes, entry: _Sent) -> asyncio.Future[bytes]:
+        """Return what becomes of a request that its caller no longer waits for."""
+        reply = entry.reply
+        if reply.done() and not reply.cancelled() and reply.exception() is None:
+            return reply  # it came in the turn of the loop in which the caller was cancelled
+        coming: asyncio.Future[bytes] = reply.get_loop().create_future()
+        if self._connected:
+            self._late[key] = coming
+        else:
+            coming.cancel()
+        return coming
+
     def _awaited(self) -> bool:
         """Whether a reply is to come, perhaps to a request that has given up."""
-        return self._silent_since is not None or any(not entry.reply.done() for entry in self._sent.values())
+        pending = self._late or any(not entry.reply.done() for entry in self._sent.values())
+        return self._silent_since is not None or bool(pending)
 
     async def _wait_connected(self, loop: asyncio.AbstractEventLoop, op: Op, connect_by: float | None) -> None:
         waiter: asyncio.Future[None] = loop.create_future()
@@ -312,7 +332,11 @@ class ZmqTransport:
         entry = self._sent.get(frames[0]) if len(frames) == 3 else None
         if entry is None or entry.reply.done():
             self.stats.late += 1
-            log.debug("%s: dropped a reply that nobody waits for any more", self._endpoint)
+            late = self._late.pop(frames[0], None) if len(frames) == 3 else None
+            if late is not None:
+                late.set_result(frames[2])
+            else:
+                log.debug("%s: dropped a reply that nobody waits for any more", self._endpoint)
             return
         self.stats.received += 1
         entry.reply.set_result(frames[2])
@@ -423,6 +447,9 @@ class ZmqTransport:
         )
 
     def _fail_sent(self, error: Callable[[_Sent], URLabError]) -> None:
+        for late in self._late.values():
+            late.cancel()
+        self._late.clear()
         for entry in self._sent.values():
             if not entry.reply.done():
                 entry.reply.set_exception(error(entry))

@@ -11,6 +11,7 @@ from urlab_client.server.handlers import (
     scene,
     session,
     sim,
+    uploads,
     viewport,
 )
 from urlab_client.server.rpc.dispatch import HANDLERS
@@ -27,5 +28,6 @@ __all__ = [
     "scene",
     "session",
     "sim",
+    "uploads",
     "viewport",
 ]

@@ -64,6 +64,9 @@ SLICE_S: Final = 0.05
 MAX_SLICE: Final = 1000
 """Sub-steps in such a slice at most, for models that get slower while they run."""
 
+LEAST_PATIENCE_S: Final = 1.0
+"""A call of MuJoCo does not count as overdue before; a slice of a long request may take a while on a busy machine."""
+
 INLINE_SHARE: Final = 0.02
 """A direct step expected to take less than this share of the step timeout runs on the calling thread."""
 
@@ -142,7 +145,7 @@ class Engine:
         """
         self.scene = scene
         self.dialect = dialect
-        self._call = _MujocoCall(step_timeout_s)
+        self._call = _MujocoCall(max(step_timeout_s, LEAST_PATIENCE_S))
         self.lock = DataLock(step_timeout_s, self._call)
         self.on_substep: list[Hook] = []
         self.on_tick: list[Hook] = []
@@ -282,7 +285,7 @@ class Engine:
 
     @property
     def overdue(self) -> Overdue | None:
-        """The call of MuJoCo that has not come back for longer than the step timeout, or None."""
+        """The call of MuJoCo that has not come back for longer than a step may take, or None."""
         return self._call.overdue
 
     @contextmanager
@@ -774,7 +777,7 @@ class Engine:
 
 @dataclass(frozen=True)
 class Overdue:
-    """A call of MuJoCo that takes longer than the step timeout.
+    """A call of MuJoCo that takes longer than a step may.
 
     Attributes:
         thread: The thread that is in it.

@@ -1,0 +1,175 @@
+"""One step: what it sends in each step mode, and what becomes of that. Everything happens within the caller's turn."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+
+from urlab_client.aio.model.articulation_state import Carried, give_back
+from urlab_client.aio.session import Turn
+from urlab_client.aio.state.recovery import leaves_open
+from urlab_client.aio.state.sim_state import SimState
+from urlab_client.aio.state.step_pictures import StepPictures
+from urlab_client.protocol.codec import op_of
+from urlab_client.protocol.enums import CameraTiming, StepMode
+from urlab_client.protocol.errors import StepTimeout, URLabError
+from urlab_client.protocol.messages.session import Step, StepOk
+
+__all__ = ["take_steps"]
+
+Cameras = bool | Mapping[str, "str | CameraTiming"]
+
+
+async def take_steps(state: SimState, turn: Turn, n_steps: int, cameras: Cameras, level: str | None) -> StepOk:
+    """Advance physics as the step mode says, and take over the state.
+
+    Args:
+        state: The client's state.
+        turn: The turn in which all of it happens.
+        n_steps: Physics steps.
+        cameras: Pictures to bring.
+        level: Observation level of the reply, None for the session's.
+    """
+    state.require_handshake("step")
+    if state.pending.mode is not None:
+        await state.ask_mode(turn, state.pending.mode)
+    mode = state.mode
+    if n_steps < (0 if mode is StepMode.PUPPET else 1):
+        raise ValueError(_too_few(n_steps, mode))
+    if mode is StepMode.LIVE and not state.mode_assumed:
+        return await _live_step(state, turn, _pictures(state, cameras, n_steps))
+    pictures = _pictures(state, cameras, n_steps)
+    request, carried = _puppet_step(state, n_steps) if mode is StepMode.PUPPET else _direct_step(state, n_steps)
+    pictures.ask(request)
+    assumed, before, session = state.mode_assumed, state.step_count, state.session.session_id
+    try:
+        reply = await _exchange(state, turn, request, level or state.level, pictures)
+        state.absorb(reply, "step", into_mirror=mode is not StepMode.PUPPET)
+    except BaseException as error:
+        if turn.sent and leaves_open(error):
+            state.pending.add_steps(state, error, 1 if mode is StepMode.PUPPET else n_steps, carried)
+        else:
+            give_back(carried)
+        if isinstance(error, StepTimeout):
+            state.mode = StepMode.DIRECT  # no other mode lets a step wait
+        raise
+    state.pending.clear()
+    if assumed:
+        # A handshake that was given up and answered meanwhile let the server count anew.
+        _learn_mode(state, request, reply, reply.step - (before if state.session.session_id == session else 0))
+        if state.mode is StepMode.PUPPET and mode is not StepMode.PUPPET:
+            return await take_steps(state, turn, n_steps, cameras, level)  # all it has done is to set the clock
+    if pictures and state.mode is not StepMode.LIVE:
+        state.note_missing_frames(pictures.names, reply)
+    if state.mode is StepMode.PUPPET:
+        with state.mirror.lock:
+            state.mirror.perturb(reply.perturbation)
+    return reply
+
+
+async def _exchange(state: SimState, turn: Turn, request: Step, level: str, pictures: StepPictures) -> StepOk:
+    if level != state.sent_level:
+        request.observations = level
+    session = state.session.session_id
+    state.sent_level = ""  # unknown to us until the server has answered
+    reply = await turn.call(request, takes=_seconds(pictures))
+    if state.session.session_id == session:  # else it has the level of a handshake that was given up
+        state.sent_level = level if state.session.features.level_sticks else state.level
+    pictures.take(reply)
+    return reply
+
+
+async def _live_step(state: SimState, turn: Turn, pictures: StepPictures) -> StepOk:
+    drawn = bool(pictures) and state.session.features.live_pictures_in_steps
+    carried = state.take_wrenches()  # of no effect on servers that do not take them in this mode
+    try:
+        request = Step(per_articulation=state.live_commands(carried) or None)
+        if drawn:
+            pictures.ask(request)
+        reply = await turn.call(request, takes=_seconds(pictures) if drawn else None)
+        pictures.take(reply)
+        state.absorb(reply, "step")
+    except BaseException as error:
+        if not (turn.sent and leaves_open(error)):
+            give_back(carried)
+        raise
+    if drawn:
+        state.note_missing_frames(pictures.names, reply)
+    return reply
+
+
+def _direct_step(state: SimState, n_steps: int) -> tuple[Step, Carried]:
+    carried = state.take_wrenches()
+    try:
+        commands = state.direct_commands(carried)
+    except ValueError:
+        give_back(carried)
+        raise
+    # A server in puppet mode, which it may be as long as the mode is only assumed, sets its clock to what a step says.
+    time = state.local_time if state.mode_assumed else None
+    return Step(n_steps=n_steps, per_articulation=commands or None, time=time), carried
+
+
+def _puppet_step(state: SimState, n_steps: int) -> tuple[Step, Carried]:
+    mirror = state.mirror
+    model, data = mirror.model, mirror.data
+    if model is None or data is None:
+        raise URLabError(
+            "step: puppet mode integrates the local model, which this client does not have.",
+            op="step",
+            hint="Make the client with local_model=True and call discover() during play.",
+        )
+    if state.take_wrenches():
+        warnings.warn("apply_xfrc() is inert in puppet mode: write client.data.xfrc_applied instead.", stacklevel=4)
+    with mirror.lock:
+        for record in state.records.values():
+            record.write_set_points()
+        mirror.check_finite()
+        if n_steps > 0:
+            import mujoco  # noqa: PLC0415
+
+            mujoco.mj_step(model, data, n_steps)
+        return Step(qpos=data.qpos.copy(), qvel=data.qvel.copy(), ctrl=data.ctrl.copy(), time=data.time), {}
+
+
+def _learn_mode(state: SimState, request: Step, reply: StepOk, advanced: int) -> None:
+    """Take over the step mode that a reply shows, if it does: in each the server counts steps in another way.
+
+    In live mode it does not count. In puppet mode it counts one for each request, and its clock says what it was told.
+
+    Raises:
+        URLabError: It is not the mode that the client was made with, and was told not to switch.
+    """
+    expected = state.mode
+    if advanced == 0:
+        state.mode = StepMode.LIVE
+        state.sent_level = ""  # where it is not looked at
+    elif advanced == 1 and reply.time == request.time and state.mirror.model is not None:
+        state.mode = StepMode.PUPPET
+    elif advanced == request.n_steps:
+        state.mode = StepMode.DIRECT
+    if state.mode is not expected and state.wanted_mode is not StepMode.AUTO:
+        raise URLabError(
+            f"step: the server is in step mode {state.mode}, in which it has handled this step, and not in {expected}.",
+            op="step",
+            hint=f"Call runtime.set_mode({str(expected)!r}), or leave auto_promote_step_mode on.",
+        )
+
+
+def _pictures(state: SimState, cameras: Cameras, n_steps: int) -> StepPictures:
+    asked: bool | dict[str, str | None]
+    asked = cameras if isinstance(cameras, bool) else {name: str(CameraTiming(how)) for name, how in cameras.items()}
+    for observer in state.observers:
+        asked = observer.wanted_pictures(asked, n_steps)
+    return StepPictures(state, asked)
+
+
+def _too_few(n_steps: int, mode: StepMode) -> str:
+    if mode is StepMode.PUPPET:
+        return f"step: n_steps is at least 0, got {n_steps}"
+    return f"step: n_steps is at least 1 in step mode {mode}, got {n_steps}; only a puppet step may take none"
+
+
+def _seconds(pictures: StepPictures) -> float | None:
+    """Return how long a step may take the server that has to wait for pictures; None for as long as any other."""
+    return (op_of(Step).timeout or 0.0) + pictures.seconds if pictures.seconds else None
