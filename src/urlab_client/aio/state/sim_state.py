@@ -54,7 +54,7 @@ from urlab_client.protocol.messages.session import (
     StepOk,
 )
 from urlab_client.protocol.messages.streams import PlayEnded, PlayStarted, SessionLost, SessionOpened, StateSnapshot
-from urlab_client.protocol.names import NameMap, unknown_name
+from urlab_client.protocol.names import NameMap
 from urlab_client.protocol.rows import Pixels, decode_camera
 from urlab_client.protocol.sim_options import check_sim_options
 from urlab_client.protocol.types import SimOptions
@@ -690,12 +690,10 @@ class SimState:
             found = [f"{art.prefix}/{short}"] if art is not None and short in art.cameras else []
         else:
             found = [known for known in names if known == name or known.endswith(f"/{name}")]
-        if len(found) != 1:
-            raise (
-                unknown_name("camera", name, names)
-                if not found
-                else KeyError(f"camera {name!r} is ambiguous: it could mean {' or '.join(map(repr, found))}")
-            )
+        if not found:
+            raise KeyError(f"no camera {name!r}; there are: {', '.join(names) or 'none'}")
+        if len(found) > 1:
+            raise KeyError(f"camera {name!r} is ambiguous: it could mean {' or '.join(map(repr, found))}")
         return found[0]
 
     @property
