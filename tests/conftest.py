@@ -1,5 +1,6 @@
 """What holds for every test."""
 
+import gc
 import importlib.metadata
 import importlib.util
 import os
@@ -97,3 +98,18 @@ def pytest_report_header(config: pytest.Config) -> list[str]:
         f"tests marked `mujoco` need the release that they name, or a later one; this is {MUJOCO}",
         *([f"{len(IMPOSSIBLE)} entries of tests/not_on_windows.toml are left out"] if IMPOSSIBLE else []),
     ]
+
+
+def pytest_collection_finish() -> None:
+    """Spare the garbage collector the tests themselves, which stay: some tests collect again and again."""
+    gc.freeze()
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Collect no garbage meanwhile: Python 3.11 fails where a finaliser's traceback is told within another's."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.enable()

@@ -23,6 +23,7 @@ import urlab_client
 from urlab_client import (
     ControllerSchemaViolation,
     NoActiveManager,
+    NotReady,
     PIEState,
     ProtocolError,
     UnknownKeyframe,
@@ -252,6 +253,26 @@ async def test_a_wrench_applied_while_a_step_travels_goes_with_the_next(plugin: 
         await client.step()
         sent = [request.get("per_articulation", {}).get(body) for request in plugin.requests]
         assert sent == [None, {"xfrc_applied": {body: [2, 0, 0, 0, 0, 0]}}, None]
+
+
+async def test_a_wrench_whose_step_is_refused_gives_way_to_a_newer_one(plugin: Any, connect: Any) -> None:
+    async with connect() as client:
+        await client.discover()
+        body = "crate_MjBody"
+        crate = client.entities[body]
+        plugin.scripted.on("step", None)
+        crate.apply_xfrc(force=(1, 0, 0))
+        travelling = asyncio.create_task(client.step())
+        await until(plugin.scripted.held.qsize)
+        crate.apply_xfrc(force=(2, 0, 0))
+        plugin.scripted.on("step", plugin.step)
+        plugin.scripted.release({"op": "error", "code": "not_ready", "message": "not now"})
+        with pytest.raises(NotReady):
+            await travelling
+        await client.step()
+        await client.step()
+        sent = [request.get("per_articulation", {}).get(body) for request in plugin.requests]
+        assert sent == [{"xfrc_applied": {body: [2, 0, 0, 0, 0, 0]}}, None]
 
 
 async def test_engine_names_are_found_by_what_users_know(plugin: Any, connect: Any) -> None:

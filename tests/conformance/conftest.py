@@ -17,7 +17,7 @@ import pytest
 import urlab_client
 import urlab_client.aio
 from urlab_client.server import SimulatedServer
-from urlab_client.sync._portal import Facade, aio_of
+from urlab_client.sync._facade import Facade, aio_of
 
 GYMNASIUM = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 

@@ -79,6 +79,26 @@ def test_servers_and_batch_agree_bit_for_bit(servers: list[str], made: list[Any]
     assert ends >= 2
 
 
+def test_a_reset_by_itself_and_one_by_hand_tell_the_same_episodes(made: list[Any]) -> None:
+    options: Any = {"n_substeps": 3, "reset_noise": 0.1, "max_episode_steps": 3}
+    same, by_hand = (
+        URLabBatchEnv("sim://arm", 2, autoreset_mode=mode, **options)
+        for mode in (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED)
+    )
+    made += [same, by_hand]
+    assert np.array_equal(same.reset(seed=5)[0], by_hand.reset(seed=5)[0])
+    for step, action in enumerate(actions_of(same, 7), start=1):
+        seen, _, _, truncated, infos = same.step(action)
+        last, _, _, ended, _ = by_hand.step(action)
+        assert truncated.tolist() == ended.tolist() == [step % 3 == 0] * 2
+        if not ended.any():
+            assert np.array_equal(seen, last)
+            continue
+        assert np.array_equal(np.stack(infos["final_obs"]), last), "the last observation of the episode that ended"
+        assert np.array_equal(seen, by_hand.reset(options={"reset_mask": ended})[0]), "the first one of the next"
+        assert not np.array_equal(seen, last)
+
+
 def test_environment_i_equals_a_single_one_with_its_seed(servers: list[str], made: list[Any]) -> None:
     env = URLabVectorEnv(servers, reset_noise=0.1, n_substeps=2)
     made.append(env)

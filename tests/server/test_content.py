@@ -4,7 +4,6 @@ import contextlib
 import errno
 import json
 import os
-import resource
 import shutil
 import threading
 from collections.abc import Generator
@@ -319,6 +318,8 @@ def test_a_content_root_that_cannot_be_written_refuses_imports(tmp_path: Path) -
 @contextlib.contextmanager
 def files_of_at_most(size: int) -> Generator[None]:
     """Let no file of this process grow beyond a size: to a program that is much like a full disk."""
+    import resource
+
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:

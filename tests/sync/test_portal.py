@@ -29,7 +29,8 @@ from urlab_client import URLabClient
 from urlab_client.protocol.errors import ClientClosed, ForkedError, URLabError, URLabRPCError
 from urlab_client.protocol.names import NameMap
 from urlab_client.sync import _loop
-from urlab_client.sync._portal import Facade, FacadeRoot, Portal
+from urlab_client.sync._facade import Facade, FacadeRoot, wrap
+from urlab_client.sync._portal import Portal
 
 
 async def answer(value: object = 42) -> object:
@@ -493,7 +494,7 @@ def child(script: str, *flags: str) -> subprocess.Popen[str]:
     prelude = """
         import asyncio, logging, os, signal, sys, threading
         from urlab_client.protocol.errors import ClientClosed, ForkedError
-        from urlab_client.sync import _loop, _portal
+        from urlab_client.sync import _facade, _loop
         from urlab_client.sync._portal import Portal
 
         # A busy machine: in development mode asyncio says so, and clean-up takes longer than it is given.
@@ -850,7 +851,7 @@ class TestFork:
     def test_a_child_forked_while_locks_are_held_does_not_hang(self) -> None:
         process = child(
             """
-            class Twin(_portal.Facade, twin=object):
+            class Twin(_facade.Facade, twin=object):
                 pass
 
             portal = Portal()
@@ -868,7 +869,7 @@ class TestFork:
             held.wait()
             pid = os.fork()
             if pid == 0:
-                for attempt in (lambda: portal.call(answer), lambda: portal.wrap(Twin, object())):
+                for attempt in (lambda: portal.call(answer), lambda: _facade.wrap(portal, Twin, object())):
                     try:
                         attempt()
                     except ForkedError:
@@ -892,7 +893,7 @@ class TestFork:
                 async def close(self):
                     say("closed")
 
-            class Client(_portal.FacadeRoot):
+            class Client(_facade.FacadeRoot):
                 def __enter__(self):
                     self._portal.call(answer)
                     return self
@@ -980,7 +981,7 @@ class TestExit:
                 async def close(self):
                     say("closed")
 
-            class Client(_portal.FacadeRoot):
+            class Client(_facade.FacadeRoot):
                 def use(self):
                     return self._portal.call(answer)
 
@@ -1034,19 +1035,19 @@ class FleetTwin(Facade, twin=Fleet):
 class TestTwins:
     def test_are_the_same_while_held(self, portal: Portal) -> None:
         robot = Robot()
-        twin = portal.wrap(RobotTwin, robot)
-        assert portal.wrap(RobotTwin, robot) is twin
-        assert portal.wrap(RobotTwin, Robot()) is not twin
+        twin = wrap(portal, RobotTwin, robot)
+        assert wrap(portal, RobotTwin, robot) is twin
+        assert wrap(portal, RobotTwin, Robot()) is not twin
 
     def test_of_none_is_none(self, portal: Portal) -> None:
-        assert portal.wrap(RobotTwin, None) is None
+        assert wrap(portal, FleetTwin, Fleet())._wrap(RobotTwin, None) is None
 
     def test_have_the_most_derived_class(self, portal: Portal) -> None:
         class Unlisted(WalkingRobot):
             pass
 
-        assert type(portal.wrap(RobotTwin, WalkingRobot())) is WalkingRobotTwin
-        assert type(portal.wrap(RobotTwin, Unlisted())) is WalkingRobotTwin
+        assert type(wrap(portal, RobotTwin, WalkingRobot())) is WalkingRobotTwin
+        assert type(wrap(portal, RobotTwin, Unlisted())) is WalkingRobotTwin
 
     def test_are_made_once_under_races(self, portal: Portal) -> None:
         with ThreadPoolExecutor(8) as pool:
@@ -1056,14 +1057,14 @@ class TestTwins:
 
                 def get(_: int, robot: Robot = robot, ready: threading.Barrier = ready) -> Facade:
                     ready.wait()
-                    return portal.wrap(RobotTwin, robot)
+                    return wrap(portal, RobotTwin, robot)
 
                 assert len(set(pool.map(get, range(8)))) == 1
 
     def test_keep_neither_themselves_nor_the_portal_alive(self) -> None:
         robot = Robot()
         portal = Portal()
-        twin = portal.wrap(RobotTwin, robot)
+        twin = wrap(portal, RobotTwin, robot)
         dead = [weakref.ref(twin), weakref.ref(portal)]
         del portal
         assert dead[1]() is not None, "a twin in use keeps its connection"
@@ -1072,16 +1073,16 @@ class TestTwins:
 
     def test_of_a_map_keep_identity_and_aliases(self, portal: Portal) -> None:
         fleet = Fleet()
-        twin = portal.wrap(FleetTwin, fleet)
+        twin = wrap(portal, FleetTwin, fleet)
         assert twin.robots is twin.robots
-        assert twin.robots["arm"] is twin.robots["arm_1"] is portal.wrap(RobotTwin, fleet.robots["arm"])
+        assert twin.robots["arm"] is twin.robots["arm_1"] is wrap(portal, RobotTwin, fleet.robots["arm"])
         assert type(twin.robots["dog"]) is WalkingRobotTwin
         with pytest.raises(KeyError, match=r"no robot 'dgo'\. Did you mean 'dog'"):
             twin.robots["dgo"]
 
     def test_of_a_map_follow_its_replacement(self, portal: Portal) -> None:
         fleet = Fleet()
-        twin = portal.wrap(FleetTwin, fleet)
+        twin = wrap(portal, FleetTwin, fleet)
         arm = twin.robots["arm"]
         fleet.robots = NameMap({"arm": fleet.robots["arm"]}, {}, "robot")
         assert list(twin.robots) == ["arm"]
@@ -1091,24 +1092,24 @@ class TestTwins:
         fleet = Fleet()
         portal = Portal()
         alive = weakref.ref(portal)
-        twin = portal.wrap(FleetTwin, fleet)
+        twin = wrap(portal, FleetTwin, fleet)
         assert len(twin.robots) == 2
         del portal, twin
         assert alive() is None
 
     def test_refuse_attributes_that_do_not_exist(self, portal: Portal) -> None:
-        twin = portal.wrap(RobotTwin, Robot())
+        twin = wrap(portal, RobotTwin, Robot())
         with pytest.raises(AttributeError):
             twin.contrl_mode = "raw"  # pyright: ignore[reportAttributeAccessIssue]
 
     def test_show_what_they_stand_for(self, portal: Portal) -> None:
-        assert repr(portal.wrap(RobotTwin, Robot("arm"))) == "Robot('arm')"
-        assert "PlainTwin" in repr(portal.wrap(PlainTwin, Plain()))
+        assert repr(wrap(portal, RobotTwin, Robot("arm"))) == "Robot('arm')"
+        assert "PlainTwin" in repr(wrap(portal, PlainTwin, Plain()))
 
     @pytest.mark.parametrize("action", [pickle.dumps, copy.copy, copy.deepcopy])
     def test_cannot_be_pickled_or_copied(self, portal: Portal, action: Callable[[object], object]) -> None:
         with pytest.raises(TypeError, match="RobotTwin cannot be pickled"):
-            action(portal.wrap(RobotTwin, Robot()))
+            action(wrap(portal, RobotTwin, Robot()))
 
 
 class AioClient:
@@ -1174,4 +1175,4 @@ class TestRoot:
 
     def test_is_the_twin_of_its_own_async_client(self) -> None:
         client = Client()
-        assert client._portal.wrap(Client, client._aio) is client
+        assert wrap(client._portal, Client, client._aio) is client

@@ -167,8 +167,8 @@ class CallerDrivenLoop:
                 self._submit(job)
             signals.on_arrival = lambda: self._call_away(job)
             while not job.finished:
+                job.leave = False  # before looking why it was set
                 if signals.arrived:
-                    job.leave = False
                     if (raised := signals.let_in()) is not None:
                         raise raised  # noqa: TRY301  # another frame would only lengthen the traceback
                 elif drives:
@@ -252,7 +252,7 @@ class CallerDrivenLoop:
         if self._ended:
             job.wait(_CLAIM_SLICE)
             return
-        if not self._claim(job):
+        if not self._claim(job, deadline):
             return
         try:
             if self._ended:
@@ -269,10 +269,10 @@ class CallerDrivenLoop:
         finally:
             self._give_back()
 
-    def _claim(self, job: Job[Any]) -> bool:
-        """Get the turn; return False if `job` was finished, or its caller called away, before."""
+    def _claim(self, job: Job[Any], deadline: float | None) -> bool:
+        """Get the turn; return False if `job` was finished, its caller called away or the deadline past before."""
         while not self._turn.acquire(blocking=False):
-            if job.finished or job.leave:
+            if job.finished or job.leave or (deadline is not None and time.monotonic() >= deadline):
                 return False
             self._poke(self._yield)
             if self._turn.acquire(timeout=_CLAIM_SLICE):

@@ -1,34 +1,26 @@
-"""What the generated façade stands on: the way from blocking code into an event loop, and the base of its classes.
-
-Everything blocking-only lives here and in the modules beside this one that begin with an underscore; the other modules
-of `urlab_client.sync` are generated and hold no behaviour.
-"""
+"""The way from blocking code into an event loop."""
 
 from __future__ import annotations
 
 import contextlib
-import inspect
 import os
 import sys
 import threading
-import warnings
 import weakref
 from collections.abc import Callable, Coroutine
 from types import TracebackType
-from typing import Any, ParamSpec, Protocol, TypeVar, cast, overload
+from typing import Any, ParamSpec, Protocol, TypeVar
 
 from urlab_client.protocol.errors import ClientClosed, ForkedError, URLabError, URLabRPCError
-from urlab_client.protocol.names import NameMap
 from urlab_client.sync._loop import CallerDrivenLoop, Job, client_closed
 from urlab_client.sync._signals import DeferredSignals
 
-__all__ = ["Facade", "FacadeRoot", "Portal", "aio_of", "portal_of"]
+__all__ = ["Portal"]
 
 P = ParamSpec("P")
 T = TypeVar("T")
 A = TypeVar("A")
 A_co = TypeVar("A_co", covariant=True)
-F = TypeVar("F", bound="Facade")
 
 
 class _Stream(Protocol[A_co]):
@@ -64,7 +56,7 @@ class Portal:
         self._finalizer: weakref.finalize[[], Portal] | None = None
         self._closed = False
         # Weak: twins refer to the portal, so a strong reference back would leave closing to the cycle collector.
-        self._twins: weakref.WeakValueDictionary[int, Facade] = weakref.WeakValueDictionary()
+        self._twins: weakref.WeakValueDictionary[int, Any] = weakref.WeakValueDictionary()
 
     @property
     def is_open(self) -> bool:
@@ -146,36 +138,17 @@ class Portal:
         if error is not None and not isinstance(error, ClientClosed):
             raise error
 
-    # None is an object, too; the first match wins.
-    @overload
-    def wrap(self, cls: type[F], aio: None) -> None: ...  # type: ignore[overload-overlap]  # pyright: ignore[reportOverlappingOverload]
-    @overload
-    def wrap(self, cls: type[F], aio: object) -> F: ...
-    def wrap(self, cls: type[F], aio: object) -> F | None:
-        """Return the façade twin of `aio`, always the same one; None for None.
-
-        Args:
-            cls: Façade class of the declared type; the twin's is that of `aio`'s own class, which may be derived.
-            aio: The asynchronous object.
-        """
-        if aio is None:
-            return None
-        twin = self._twins.get(id(aio))
-        if twin is None:
+    def twin(self, aio: object, make: Callable[[], A]) -> A:
+        """Return what stands for `aio` in blocking code: always the same object while it is held, made if need be."""
+        found = self._twins.get(id(aio))
+        if found is None:
             if os.getpid() != self._pid:
                 raise _forked()  # Another thread may have held the lock at the fork.
             with self._lock:
-                twin = self._twins.get(id(aio))
-                if twin is None:
-                    actual = next((_FACADES[base] for base in type(aio).__mro__ if base in _FACADES), cls)
-                    twin = cast("Facade", object.__new__(actual))
-                    self.adopt(twin, aio)
-        return cast("F", twin)
-
-    def adopt(self, twin: Facade, aio: object) -> None:
-        """Make `twin` the façade of `aio`."""
-        Facade.__init__(twin, aio, self)
-        self._twins[id(aio)] = twin
+                found = self._twins.get(id(aio))
+                if found is None:
+                    found = self._twins[id(aio)] = make()
+        return found
 
     def _ready(self) -> CallerDrivenLoop:
         """Return the running loop, or raise the reason why there cannot be one."""
@@ -247,92 +220,3 @@ def _without_earlier_raise(trace: TracebackType | None) -> TracebackType | None:
         last = last.tb_next
     last.tb_next = None
     return trace
-
-
-_FACADES: dict[type, type[Facade]] = {}
-
-
-class Facade:
-    """Base of the generated classes: the blocking twin of one asynchronous object.
-
-    A subclass names the class it stands for: `class Scene(Facade, twin=aio.Scene)`. It is made by `Portal.wrap` only.
-    """
-
-    __slots__ = ("__weakref__", "_aio", "_maps", "_portal")
-
-    _aio: Any
-    _maps: dict[str, tuple[NameMap[Any], NameMap[Any]]]
-    _portal: Portal
-
-    def __init_subclass__(cls, *, twin: type | None = None, **kwargs: Any) -> None:
-        super().__init_subclass__(**kwargs)
-        if twin is not None:
-            _FACADES[twin] = cls
-
-    def __init__(self, aio: object, portal: Portal) -> None:
-        self._aio = aio
-        self._portal = portal
-        self._maps = {}
-
-    def _map(self, name: str, cls: type[F], source: NameMap[Any]) -> NameMap[F]:
-        """Return the twins of the entries of `source`, as the same map as long as property `name` has this `source`.
-
-        Remembered here, not in the map: the loop's tasks keep `source` alive, which must not keep the twins.
-        """
-        known, twins = self._maps.get(name, (None, None))
-        if twins is None or known is not source:
-            entries = cast("NameMap[object]", source).items()
-            twins = NameMap({key: self._portal.wrap(cls, entry) for key, entry in entries}, source.aliases, source.kind)
-            self._maps[name] = source, twins
-        return twins
-
-    def __repr__(self) -> str:
-        if type(self._aio).__repr__ is object.__repr__:
-            return super().__repr__()
-        return repr(self._aio)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        raise TypeError(
-            f"{type(self).__name__} cannot be pickled or copied: it belongs to a connection of this process. "
-            "Make a client where it is needed."
-        )
-
-
-class _Twin(Protocol[A_co]):
-    @property
-    def _aio(self) -> A_co: ...
-
-
-def aio_of(twin: _Twin[A_co]) -> A_co:
-    """Return the async object that a façade object stands for."""
-    return twin._aio  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
-
-
-def portal_of(twin: Facade) -> Portal:
-    """Return the way into the event loop of a façade object's client."""
-    return twin._portal  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
-
-
-class FacadeRoot(Facade):
-    """Base of a generated class that users construct: owns the portal."""
-
-    __slots__ = ("_opened_at",)
-
-    def __init__(self, aio: Any) -> None:
-        Portal(aio.close).adopt(self, aio)
-        self._opened_at = _first_line_outside_package()
-
-    def __del__(self) -> None:
-        portal: Portal | None = getattr(self, "_portal", None)  # None if the constructor failed.
-        if portal is not None and portal.is_open:
-            file, line = self._opened_at
-            message = f"unclosed {self!r}, opened at {file}:{line}; use `with` or call close()"
-            warnings.warn_explicit(message, ResourceWarning, file, line)
-
-
-def _first_line_outside_package() -> tuple[str, int]:
-    package = __name__.partition(".")[0]
-    frame = inspect.currentframe()
-    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] == package:
-        frame = frame.f_back
-    return (frame.f_code.co_filename, frame.f_lineno) if frame is not None else ("<unknown>", 0)

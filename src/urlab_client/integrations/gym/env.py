@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from urlab_client.integrations.gym.episode import EnvEpisode
 from urlab_client.integrations.gym.spaces import Observation, SpaceMapping, SpaceMode
 from urlab_client.protocol.enums import CameraMode
-from urlab_client.sync._portal import aio_of, portal_of
+from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
 
 __all__ = ["RewardFn", "TerminationFn", "URLabEnv", "keyframe_option"]

@@ -18,7 +18,7 @@ from urlab_client.integrations.policy.policy import Policy
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.enums import ActuatorType, ControllerKind, ControlMode, StepMode
 from urlab_client.protocol.errors import URLabError
-from urlab_client.sync._portal import aio_of, portal_of
+from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
 
 __all__ = ["PolicyRun", "require", "run", "run_blocking"]

@@ -15,7 +15,7 @@ from urlab_client.integrations._feed.blocking import BlockingTwin
 from urlab_client.integrations._feed.follower import Follower
 from urlab_client.integrations.record.writer import RecorderStats, WriterOptions, WriterThread
 from urlab_client.protocol.errors import URLabError
-from urlab_client.sync._portal import aio_of, portal_of
+from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
 
 __all__ = ["AsyncRecorder", "Recorder", "record"]

@@ -24,7 +24,7 @@ from urlab_client.protocol.base import Floats
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import EntityState, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.sync._portal import aio_of, portal_of
+from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
 
 __all__ = ["AsyncView", "Moment", "View", "ViewBackend", "ViewOptions", "ViewStats", "make_view"]

@@ -39,6 +39,7 @@ from urlab_client.server.system.temporary_folder import sweep, working_in
 
 __all__ = [
     "PARENT_CLASS",
+    "WINDOWS_DEVICES",
     "Blueprint",
     "ContentRoot",
     "level_package",
@@ -49,6 +50,8 @@ __all__ = [
 logger = logging.getLogger("urlab_client.server")
 
 IMPORTS: Final = "MuJoCoImports"
+UPLOADED: Final = "uploaded"
+"""In place of the source of a blueprint that came over the wire."""
 PARENT_CLASS: Final = "MjArticulation"
 
 _UNDER_WAY: Final = ".import-"
@@ -57,8 +60,8 @@ _UNDER_WAY: Final = ".import-"
 _DEFAULT_LIMITS: Final = Limits()
 _LEVEL_SEGMENT: Final = re.compile(r"\w(?:[\w\- ]*[\w\-])?")
 _MAX_SEGMENT_BYTES: Final = 240
-_RESERVED: Final = {IMPORTS.casefold(): "holds blueprints", "urlab": "holds recordings"}
-_WINDOWS_DEVICES: Final = frozenset(
+_RESERVED: Final = {IMPORTS.casefold(): "holds blueprints", "urlab": "holds recordings", "uploads": "holds uploads"}
+WINDOWS_DEVICES: Final = frozenset(
     ("CON", "PRN", "AUX", "NUL", *(f"{kind}{number}" for kind in ("COM", "LPT") for number in range(1, 10)))
 )
 
@@ -83,7 +86,7 @@ def level_package(name: str) -> str:
         if (
             not _LEVEL_SEGMENT.fullmatch(part)
             or len(part.encode()) > _MAX_SEGMENT_BYTES
-            or part.upper() in _WINDOWS_DEVICES
+            or part.upper() in WINDOWS_DEVICES
         ):
             raise ValueError(
                 f"'{name}' is not a level's name: use letters, digits, spaces, '-' and '_', "
@@ -285,6 +288,23 @@ class ContentRoot:
         if not path:
             raise Refusal("missing_field", "path: name the MJCF file to import")
         file, source = self._locate(path, trusted=trusted)
+        roots = None if trusted else (*self.model_roots, bundled_root())
+        return self._import_file(file, source, roots, force_reimport=force_reimport)
+
+    def import_uploaded(self, document: Path) -> Blueprint:
+        """Import a model that a client has sent, always anew; it reads files of its own folder only.
+
+        Raises:
+            Refusal: `import_failed`.
+        """
+        document = document.resolve()
+        return self._import_file(document, UPLOADED, (document.parent,), force_reimport=True)[0]
+
+    def _import_file(
+        self, file: Path, source: str, roots: tuple[Path, ...] | None, *, force_reimport: bool
+    ) -> tuple[Blueprint, bool]:
+        """Import a file that may read others below `roots`; with None anywhere, as who runs the server named it."""
+        trusted = roots is None
         stem = sanitized(file.stem)
         try:
             size = file.stat().st_size
@@ -301,7 +321,7 @@ class ContentRoot:
             _warn_if_stale(known, source, text)
             return known, False
         try:
-            blueprint = self._import(file, stem, source, hashlib.sha256(text).hexdigest(), trusted=trusted)
+            blueprint = self._import(file, stem, source, hashlib.sha256(text).hexdigest(), roots)
         except OSError as error:
             raise Refusal("import_failed", f"cannot store the snapshot of {file} in {self.root}: {error}") from None
         finally:
@@ -403,7 +423,9 @@ class ContentRoot:
     def _roots_text(self) -> str:
         return ", ".join(map(str, self.model_roots)) or "none but the bundled models"
 
-    def _import(self, file: Path, stem: str, source: str, source_digest: str, *, trusted: bool) -> Blueprint:
+    def _import(
+        self, file: Path, stem: str, source: str, source_digest: str, roots: tuple[Path, ...] | None
+    ) -> Blueprint:
         home = self.root / IMPORTS / stem
         home.mkdir(parents=True, exist_ok=True)
         with (
@@ -411,7 +433,7 @@ class ContentRoot:
             tempfile.TemporaryDirectory(dir=home, prefix=_UNDER_WAY) as temporary_folder,
         ):
             snapshot = Path(temporary_folder) / "snapshot"
-            compiled = self._build(file, snapshot, trusted=trusted)
+            compiled = self._build(file, snapshot, roots)
             for message in compiled.messages:
                 logger.warning("%s: %s", file, one_line(message))
             digest = _digest(snapshot)
@@ -442,15 +464,15 @@ class ContentRoot:
                 shutil.rmtree(folder, ignore_errors=True)
             raise
 
-    def _build(self, file: Path, snapshot: Path, *, trusted: bool) -> Compiled:
-        if trusted or file.is_relative_to(bundled_root()):
+    def _build(self, file: Path, snapshot: Path, roots: tuple[Path, ...] | None) -> Compiled:
+        if roots is None or file.is_relative_to(bundled_root()):
             try:
                 return build_snapshot(file, snapshot, self.limits)[0]
             except (ValueError, mujoco.FatalError) as error:
                 raise Refusal("import_failed", f"MuJoCo rejects {file}: {one_line(error)}") from None
         from urlab_client.server.assets.sandbox import build_confined  # noqa: PLC0415 - it imports this module
 
-        return build_confined(file, snapshot, (*self.model_roots, bundled_root()), self.limits)
+        return build_confined(file, snapshot, roots, self.limits)
 
     def _register(self, home: Path, folder: Path, record: _Record) -> Blueprint:
         known = self._blueprints.get(record.stem)
