@@ -43,9 +43,7 @@ def test_every_thread_is_in_the_architecture_page() -> None:
         for path in PACKAGE.rglob(f"{part}/**/*.py")
     ]
     threads = {
-        name
-        for source in sources
-        for name in re.findall(r'(?:name=|Thread\()"(urlab-[a-z]+)", (?:daemon|self)', source)
+        name for source in sources for name in re.findall(r'(?:name=|ServingThread\()"(urlab-[a-z]+)", ', source)
     }
     page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     assert threads >= {"urlab-io", "urlab-rpc", "urlab-physics"}
