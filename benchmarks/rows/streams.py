@@ -66,7 +66,7 @@ def _state() -> Iterator[Pair]:
 
         async def paced() -> tuple[float, int, int]:
             """Return the share of a core, messages that got lost, and those overtaken by a newer one in their batch."""
-            stats = client._state._reception.stats  # noqa: SLF001  # the client shows no more than what came last
+            stats = client._state._live.stats  # noqa: SLF001  # the client shows no more than what came last
             received, absorbed = stats.received, stats.absorbed
             source.send(0, _PACED, _HZ)
             busy, wall = time.process_time(), time.perf_counter()

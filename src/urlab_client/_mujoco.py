@@ -168,6 +168,19 @@ def export_model(spec: mujoco.MjSpec) -> tuple[str, dict[str, bytes]]:
     return files.pop(MODEL_FILE).decode(), files
 
 
+def flat_model(spec: mujoco.MjSpec) -> tuple[str, dict[str, bytes]]:
+    """Return a compiled spec as MJCF whose files all have bare names, and their contents by these names.
+
+    Raises:
+        ValueError: One of its files is not where this MuJoCo looks; see `check_copy`.
+    """
+    copied = spec.copy()
+    compiler: Any = copied.compiler
+    if _writes_archives(copied):
+        compiler.savecompiled = False
+    return _written_by_hand(copied)
+
+
 def _writes_archives(spec: mujoco.MjSpec) -> bool:
     """Whether MuJoCo writes a spec with its files: before 3.16 it names those in folders of their own wrongly."""
     return hasattr(spec.compiler, "savecompiled")

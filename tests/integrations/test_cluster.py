@@ -268,8 +268,8 @@ async def test_a_cancelled_run_leaves_no_worker_and_no_server(cluster: Any, tmp_
 @pytest.mark.parametrize(
     ("scenes", "options", "problem"),
     [
-        ([], {}, "scenes are one or more"),
-        ("tcp://editor", {}, "scenes are one or more sim://"),
+        ([], {}, "scenes must be one or more"),
+        ("tcp://editor", {}, "scenes must be one or more sim://"),
         ("sim://arm", {"retries": -1}, "retries are 0 or more"),
         ("sim://arm", {"episode_timeout": 0}, "above 0 seconds"),
         ("sim://arm", {"env_options": {"space_mode": "dict"}}, "env_options cannot have space_mode"),

@@ -283,6 +283,20 @@ class PIEStartResult(Struct):
         return self.state == PIEState.READY
 
 
+class UploadProgress(Struct, frozen=True, kw_only=True):
+    """How far `scene.upload_model` is.
+
+    Attributes:
+        file: File that a piece was sent of.
+        sent_bytes: Bytes sent so far.
+        total_bytes: Bytes to send altogether: what the server lacks of the model.
+    """
+
+    file: str
+    sent_bytes: int
+    total_bytes: int
+
+
 class PIEStatus(Struct, frozen=True):
     """Where Play-In-Editor stands.
 

@@ -21,6 +21,7 @@ from urlab_client.protocol.dialects import ALPHA, Dialect
 from urlab_client.protocol.enums import CameraMode, PIEState, StepMode
 from urlab_client.protocol.messages.session import ErrorReply, Hello, InstanceInfo, Step
 from urlab_client.server.assets.actors import Actor
+from urlab_client.server.assets.uploads import UPLOADS, Uploads
 from urlab_client.server.compile.scene import ArticulationIndex, CompiledScene, compile_scene
 from urlab_client.server.editor.jobs import EditorJobs
 from urlab_client.server.editor.markers import Drawings
@@ -102,6 +103,7 @@ class ServerCore:
         compiled: What the last play session was started with.
         jobs: Editor ops that are carried out beside the requests.
         lease: The driver lease.
+        uploads: Models that clients send in pieces.
         instance: Which of several servers it is; None in dialects that do not tell.
     """
 
@@ -119,6 +121,7 @@ class ServerCore:
     jobs: EditorJobs = field(default_factory=EditorJobs)
     lease: DriverLease = field(default_factory=DriverLease)
     instance: Callable[[], InstanceInfo] | None = None
+    uploads: Uploads = field(init=False)
 
     def refuse(self, code: str, message: str) -> bytes:
         """Return the frame of an error reply."""
@@ -126,6 +129,7 @@ class ServerCore:
 
     def __post_init__(self) -> None:
         self.drawings = Drawings(limit=self.limits.markers)
+        self.uploads = Uploads(self.world.content.root / UPLOADS, self.limits.upload_cache_bytes)
 
     @property
     def limits(self) -> Limits:

@@ -36,6 +36,7 @@ class Limits:
         model_memory_bytes: Memory its compilation may take besides.
         model_cpu_s: Processor time its compilation may take, seconds.
         model_wall_s: Seconds it may take altogether.
+        upload_cache_bytes: Size of the cache of files that clients have sent.
         camera_side: Width and height of a camera's pictures, pixels.
     """
 
@@ -58,6 +59,7 @@ class Limits:
     model_memory_bytes: int = 1024 * _MIB
     model_cpu_s: int = 10
     model_wall_s: int = 20
+    upload_cache_bytes: int = 1024 * _MIB
     camera_side: int = 8192
 
     def __post_init__(self) -> None:

@@ -715,6 +715,7 @@ class _Opened:
             idle = self._registration.join(max(0.0, deadline - time.monotonic()))
         if self._core is not None:
             self._core.jobs.close()
+            self._core.uploads.close()
             idle = self._core.play.close(CLOSE_S / 2) and idle
         for served in self._served():
             idle = served.join(max(0.0, deadline - time.monotonic())) and idle

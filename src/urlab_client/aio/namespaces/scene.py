@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import os
+from collections.abc import Awaitable, Callable, Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+import anyio
 
 from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.model.upload import flatten, upload
 from urlab_client.aio.namespaces._base import Vector, as_quat, as_vec3, target_by
 from urlab_client.aio.namespaces._ops import SceneOps
-from urlab_client.protocol.errors import CreateLevelFailed
+from urlab_client.protocol.base import Reply, Request
+from urlab_client.protocol.errors import CreateLevelFailed, ImportFailed, UnknownOp
 from urlab_client.protocol.messages.outliner import ListActors
 from urlab_client.protocol.messages.scene import (
     DestroyActor,
@@ -25,13 +32,19 @@ from urlab_client.protocol.types import (
     JobStatus,
     SceneActor,
     SceneSnapshot,
+    UploadProgress,
     URLabAsset,
     URLabBlueprint,
     URLabLightHandle,
     URLabSpawnHandle,
 )
 
+if TYPE_CHECKING:
+    import mujoco
+
 __all__ = ["SceneNamespace"]
+
+R = TypeVar("R", bound=Reply)
 
 
 class SceneNamespace(SceneOps):
@@ -293,12 +306,55 @@ class SceneNamespace(SceneOps):
             for cell in reply.actors
         }
 
+    async def upload_model(
+        self,
+        model: str | os.PathLike[str] | mujoco.MjSpec,
+        *,
+        on_progress: Callable[[UploadProgress], object] | None = None,
+        timeout: Timeout = DEFAULT,
+    ) -> URLabBlueprint:
+        """Bring a model of this machine to the server and turn it into a blueprint for `spawn_actor`.
+
+        Files that the server has got before, from any client, are not sent again. Each upload replaces the blueprint of
+        the one before: to have two uploaded robots in one level, combine them in one MJCF.
+
+        Args:
+            model: An MJCF file, with whatever it includes, or a spec.
+            on_progress: Told after each piece that was sent.
+            timeout: Seconds to wait for each request; None waits without limit. By default the import may take ten
+                minutes.
+
+        Raises:
+            UnknownOp: The server takes no models over the wire; nothing was sent.
+            FileNotFoundError: There is no such file.
+            ValueError: MuJoCo rejects the model, or it is larger than servers accept; nothing was sent.
+            ImportFailed: The server rejects it.
+            OutcomeUnknown: The connection broke during the import.
+        """
+        if not self._session.features.uploads:
+            raise UnknownOp(
+                "unknown_op",
+                "this server takes no models over the wire. Nothing was sent.",
+                op="upload_model_manifest",
+                hint="Put the file on the server's machine and use import_xml().",
+            )
+        flat = await anyio.to_thread.run_sync(flatten, model, abandon_on_cancel=True)
+
+        def send(request: Request[R]) -> Awaitable[R]:
+            return self._call(request, timeout)
+
+        reply = await upload(flat, send, on_progress)
+        return URLabBlueprint(
+            class_path=reply.blueprint_class_path, short_name=reply.blueprint_short_name, imported_now=reply.imported
+        )
+
     async def apply_scene(
         self, level_name: str, assets: Iterable[URLabAsset], *, save: bool = True, timeout: Timeout = DEFAULT
     ) -> dict[str, URLabSpawnHandle]:
         """Bring a level into a described state: load or create it, import each MJCF once, place each asset, save.
 
-        Safe to repeat: an actor whose id exists is moved, not spawned again.
+        Safe to repeat: an actor whose id exists is moved, not spawned again. An MJCF that is on this machine only is
+        uploaded to servers that take models over the wire, one at most.
 
         Args:
             level_name: Short name or `/Game/` path.
@@ -310,7 +366,7 @@ class SceneNamespace(SceneOps):
             Handles by actor id.
 
         Raises:
-            ValueError: Two assets share an actor id; nothing was done.
+            ValueError: Two assets share an actor id; nothing was done. Or two MJCF files would have to be uploaded.
             URLabRPCError: From the op that failed; what was placed before it stays.
         """
         wanted = list(assets)
@@ -323,9 +379,7 @@ class SceneNamespace(SceneOps):
         except CreateLevelFailed:
             await self.load_level(level_name, timeout=timeout)
         await self.ensure_manager(timeout=timeout)
-        blueprints = {
-            xml: await self.import_xml(xml, timeout=timeout) for xml in dict.fromkeys(asset.xml for asset in wanted)
-        }
+        blueprints = await self._imported(list(dict.fromkeys(asset.xml for asset in wanted)), timeout)
         handles = {
             asset.actor_id: await self.spawn_actor(
                 blueprints[asset.xml],
@@ -341,6 +395,25 @@ class SceneNamespace(SceneOps):
         if save:
             await self.save_level(timeout=timeout)
         return handles
+
+    async def _imported(self, files: list[str], timeout: Timeout) -> dict[str, URLabBlueprint]:
+        """Import models from the server's disk, or else from this machine's where the server takes them so."""
+        blueprints: dict[str, URLabBlueprint] = {}
+        uploaded = ""
+        for xml in files:
+            try:
+                blueprints[xml] = await self.import_xml(xml, timeout=timeout)
+            except ImportFailed as refusal:
+                if not self._session.features.uploads or not await anyio.to_thread.run_sync(Path(xml).is_file):
+                    raise
+                if uploaded:
+                    raise ValueError(
+                        f"apply_scene: the server has neither {uploaded} nor {xml} on its disk, and an uploaded model "
+                        "replaces the one before: combine them in one MJCF"
+                    ) from refusal
+                blueprints[xml] = await self.upload_model(xml, timeout=timeout)
+                uploaded = xml
+        return blueprints
 
 
 def _class_path(blueprint: URLabBlueprint | str) -> str:

@@ -100,6 +100,16 @@ class EditorWorld:
         self._refresh(blueprint)
         return blueprint, imported_now
 
+    def import_uploaded(self, document: Path) -> Blueprint:
+        """Import a model that a client has sent; see `ContentRoot.import_uploaded`.
+
+        Raises:
+            Refusal: `import_failed`.
+        """
+        blueprint = self.content.import_uploaded(document)
+        self._refresh(blueprint)
+        return blueprint
+
     def list_blueprints(self) -> list[BlueprintInfo]:
         """Return the imported blueprints, sorted by short name."""
         return [

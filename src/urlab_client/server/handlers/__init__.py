@@ -10,6 +10,7 @@ from urlab_client.server.handlers import (
     scene,
     session,
     sim,
+    uploads,
     viewport,
 )
 from urlab_client.server.rpc.dispatch import HANDLERS
@@ -25,5 +26,6 @@ __all__ = [
     "scene",
     "session",
     "sim",
+    "uploads",
     "viewport",
 ]

@@ -4,7 +4,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING
 
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.namespaces import scene as aio
@@ -12,12 +14,16 @@ from urlab_client.aio.namespaces._base import Vector
 from urlab_client.protocol.types import (
     JobStatus,
     SceneSnapshot,
+    UploadProgress,
     URLabAsset,
     URLabBlueprint,
     URLabLightHandle,
     URLabSpawnHandle,
 )
 from urlab_client.sync.namespaces._ops import SceneOps
+
+if TYPE_CHECKING:
+    import mujoco
 
 __all__ = ["SceneNamespace"]
 
@@ -223,12 +229,40 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
             timeout=timeout,
         )
 
+    def upload_model(
+        self,
+        model: str | os.PathLike[str] | mujoco.MjSpec,
+        *,
+        on_progress: Callable[[UploadProgress], object] | None = None,
+        timeout: Timeout = DEFAULT,
+    ) -> URLabBlueprint:
+        """Bring a model of this machine to the server and turn it into a blueprint for `spawn_actor`.
+
+        Files that the server has got before, from any client, are not sent again. Each upload replaces the blueprint of
+        the one before: to have two uploaded robots in one level, combine them in one MJCF.
+
+        Args:
+            model: An MJCF file, with whatever it includes, or a spec.
+            on_progress: Told after each piece that was sent.
+            timeout: Seconds to wait for each request; None waits without limit. By default the import may take ten
+                minutes.
+
+        Raises:
+            UnknownOp: The server takes no models over the wire; nothing was sent.
+            FileNotFoundError: There is no such file.
+            ValueError: MuJoCo rejects the model, or it is larger than servers accept; nothing was sent.
+            ImportFailed: The server rejects it.
+            OutcomeUnknown: The connection broke during the import.
+        """
+        return self._portal.call(self._aio.upload_model, model, on_progress=on_progress, timeout=timeout)
+
     def apply_scene(
         self, level_name: str, assets: Iterable[URLabAsset], *, save: bool = True, timeout: Timeout = DEFAULT
     ) -> dict[str, URLabSpawnHandle]:
         """Bring a level into a described state: load or create it, import each MJCF once, place each asset, save.
 
-        Safe to repeat: an actor whose id exists is moved, not spawned again.
+        Safe to repeat: an actor whose id exists is moved, not spawned again. An MJCF that is on this machine only is
+        uploaded to servers that take models over the wire, one at most.
 
         Args:
             level_name: Short name or `/Game/` path.
@@ -240,7 +274,7 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
             Handles by actor id.
 
         Raises:
-            ValueError: Two assets share an actor id; nothing was done.
+            ValueError: Two assets share an actor id; nothing was done. Or two MJCF files would have to be uploaded.
             URLabRPCError: From the op that failed; what was placed before it stays.
         """
         return self._portal.call(self._aio.apply_scene, level_name, assets, save=save, timeout=timeout)

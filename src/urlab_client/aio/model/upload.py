@@ -1,0 +1,156 @@
+"""Bringing a model to the server over the wire: what it consists of, and sending what the server lacks.
+
+For `client.scene.upload_model`. Files are named by their hashes, so the server asks for those it has not seen yet, and
+an upload that broke off goes on where it was: with a new manifest.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import os
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar, cast
+
+from urlab_client.protocol.base import Reply, Request
+from urlab_client.protocol.errors import ConnectionLost, OutcomeUnknown, UnknownUpload
+from urlab_client.protocol.messages.uploads import (
+    MAX_ASSETS,
+    MAX_BLOB_BYTES,
+    MAX_CHUNK_BYTES,
+    MAX_MODEL_BYTES,
+    AssetDigest,
+    UploadModelChunk,
+    UploadModelCommit,
+    UploadModelCommitOk,
+    UploadModelManifest,
+)
+from urlab_client.protocol.types import UploadProgress
+
+if TYPE_CHECKING:
+    import mujoco
+
+__all__ = ["FlatModel", "OnUpload", "flatten", "upload"]
+
+R = TypeVar("R", bound=Reply)
+
+OnUpload = Callable[[UploadProgress], object]
+"""Told how far an upload is, on the client's event loop."""
+
+_ATTEMPTS: Final = 3
+
+
+class _Call(Protocol):
+    def __call__(self, request: Request[R]) -> Awaitable[R]: ...
+
+
+@dataclass(frozen=True)
+class FlatModel:
+    """A model as it is sent: one document, and its files under bare names.
+
+    Attributes:
+        xml: The document.
+        files: Contents by name.
+    """
+
+    xml: bytes
+    files: dict[str, bytes]
+
+    @property
+    def size(self) -> int:
+        """Bytes altogether."""
+        return len(self.xml) + sum(map(len, self.files.values()))
+
+    @cached_property
+    def manifest(self) -> UploadModelManifest:
+        """What the server is told first."""
+        return UploadModelManifest(
+            xml_sha256=_digest(self.xml),
+            total_bytes=self.size,
+            assets=[AssetDigest(name=name, sha256=_digest(data), size=len(data)) for name, data in self.files.items()],
+        )
+
+
+def flatten(model: str | os.PathLike[str] | mujoco.MjSpec) -> FlatModel:
+    """Read a model and everything it includes, check it, and put it in the form in which it is sent. Blocking.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: MuJoCo rejects it, or it is larger than servers accept.
+    """
+    import mujoco  # noqa: PLC0415
+
+    from urlab_client._mujoco import flat_model  # noqa: PLC0415
+
+    given = cast("Any", model)
+    path = None if isinstance(given, mujoco.MjSpec) else Path(given)
+    if path is not None and not path.is_file():
+        raise FileNotFoundError(f"upload_model: {path} does not exist or is not a file")
+    source = "the spec" if path is None else str(path)
+    try:
+        spec: mujoco.MjSpec = given.copy() if path is None else mujoco.MjSpec.from_file(source)
+        spec.compile()
+        xml, files = flat_model(spec)
+    except (ValueError, mujoco.FatalError) as error:
+        raise ValueError(f"upload_model: MuJoCo rejects {source}: {' '.join(str(error).split())}") from None
+    flat = FlatModel(xml.encode(), files)
+    for name, data in {"the document": flat.xml, **files}.items():
+        if len(data) > MAX_BLOB_BYTES:
+            raise ValueError(f"upload_model: {name} of {source} has {len(data)} bytes; servers take {MAX_BLOB_BYTES}")
+    if len(files) > MAX_ASSETS:
+        raise ValueError(f"upload_model: {source} has {len(files)} files; servers take {MAX_ASSETS}")
+    if flat.size > MAX_MODEL_BYTES:
+        raise ValueError(f"upload_model: {source} has {flat.size} bytes; servers take {MAX_MODEL_BYTES}")
+    return flat
+
+
+async def upload(model: FlatModel, call: _Call, on_progress: OnUpload | None) -> UploadModelCommitOk:
+    """Send what the server lacks of a model, and have it imported.
+
+    A piece whose reply was lost is not sent again: the server counts bytes. A new manifest tells what is missing then.
+    The commit is sent once.
+
+    Args:
+        model: The model.
+        call: Sends a request, within the caller's deadline.
+        on_progress: Told after each piece.
+    """
+    for attempt in range(1, _ATTEMPTS + 1):
+        try:
+            upload_id = await _send_files(model, call, on_progress)
+            break
+        except (UnknownUpload, ConnectionLost, OutcomeUnknown):
+            if attempt == _ATTEMPTS:
+                raise
+    else:
+        raise AssertionError("the last attempt returns or raises")
+    return await call(UploadModelCommit(upload_id=upload_id))
+
+
+async def _send_files(model: FlatModel, call: _Call, on_progress: OnUpload | None) -> str:
+    opened = await call(model.manifest)
+    missing = [("asset", name, model.files[name]) for name in dict.fromkeys(opened.need_assets)]
+    if opened.need_xml:
+        missing.insert(0, ("xml", "", model.xml))
+    total = sum(len(data) for _, _, data in missing)
+    sent = 0
+    for kind, name, data in missing:
+        for offset in range(0, max(1, len(data)), MAX_CHUNK_BYTES):
+            piece = data[offset : offset + MAX_CHUNK_BYTES]
+            await call(
+                UploadModelChunk(
+                    upload_id=opened.upload_id, kind=kind, name=name, offset=offset, total=len(data), data=piece
+                )
+            )
+            sent += len(piece)
+            if on_progress is not None:
+                on_progress(UploadProgress(file=name or "model.xml", sent_bytes=sent, total_bytes=total))
+            await asyncio.sleep(0)  # a canceller gets its turn between two pieces
+    return opened.upload_id
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()

@@ -1,0 +1,299 @@
+"""Models that clients send in pieces: what is under way, and a cache of the files by their hashes.
+
+A manifest names every file with its hash and size. Files that the cache holds are not sent again, by whichever client
+they came. Names are bare file names and hashes are checked, so nothing that a client says leads out of the folder.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import re
+import shutil
+import tempfile
+import time
+import uuid
+from collections.abc import Callable, Generator, Iterable
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from urlab_client.protocol.enums import StepMode
+from urlab_client.protocol.messages.uploads import (
+    MAX_ASSETS,
+    MAX_BLOB_BYTES,
+    MAX_MODEL_BYTES,
+    UploadModelChunk,
+    UploadModelManifest,
+)
+from urlab_client.server.assets.content import WINDOWS_DEVICES
+from urlab_client.server.refusal import Refusal
+from urlab_client.server.system.temporary_folder import sweep, working_in
+
+__all__ = ["DOCUMENT", "UPLOADS", "Uploads"]
+
+DOCUMENT: Final = "model.xml"
+"""What the document is called when it is imported; so no other file may be."""
+
+UPLOADS: Final = "Uploads"
+"""Folder of the content root for the cache and for uploads under way; no level can be called so."""
+
+MAX_OPEN: Final = 16
+IDLE_S: Final = 300.0
+
+_UNDER_WAY: Final = ".upload-"
+"""What the folders of uploads under way begin with."""
+
+_DOCUMENT_IN_REPLIES: Final = "<xml>"
+_HASH: Final = re.compile(r"[0-9a-f]{64}")
+_MAX_NAME_BYTES: Final = 240
+
+
+@dataclass
+class _File:
+    """A file of an upload, by its hash and, unless it is the document, its size."""
+
+    sha256: str
+    size: int | None
+    received: int = 0
+    partial: Path | None = None
+
+
+@dataclass
+class _Upload:
+    """One upload under way."""
+
+    document: _File
+    assets: dict[str, _File]
+    step_mode: StepMode | None
+    touched: float
+    folder: Path
+
+    def file(self, kind: str, name: str) -> tuple[str, _File]:
+        """Return a file and what replies call it."""
+        if kind == "xml":
+            return _DOCUMENT_IN_REPLIES, self.document
+        if name not in self.assets:
+            raise Refusal("bad_request", f"the manifest names no asset '{name}'")
+        return name, self.assets[name]
+
+
+@dataclass
+class Uploads:
+    """The uploads of a server. For the dispatcher's thread.
+
+    Attributes:
+        root: Folder for the cache and for what is under way; made when something is first sent.
+        cache_bytes: Size of the cache; what was used longest ago gives way.
+        clock: Tells the time, seconds.
+    """
+
+    root: Path
+    cache_bytes: int
+    clock: Callable[[], float] = time.monotonic
+    _open: dict[str, _Upload] = field(default_factory=dict[str, _Upload])
+    _working: contextlib.ExitStack | None = None
+
+    def __post_init__(self) -> None:
+        sweep(self.root, f"{_UNDER_WAY}*")
+
+    @property
+    def _cache(self) -> Path:
+        return self.root / "cache"
+
+    def begin(self, manifest: UploadModelManifest) -> tuple[str, bool, list[str]]:
+        """Open an upload.
+
+        Returns:
+            Its id, whether the document is needed, and the names of the assets that are.
+
+        Raises:
+            Refusal: `bad_request`, `payload_too_large`.
+        """
+        assets, total_bytes = manifest.assets, manifest.total_bytes
+        _check_hash(manifest.xml_sha256, "xml_sha256")
+        if len(assets) > MAX_ASSETS:
+            raise Refusal("bad_request", f"a model has at most {MAX_ASSETS} assets, not {len(assets)}")
+        if not 0 <= total_bytes <= MAX_MODEL_BYTES:
+            raise Refusal("payload_too_large", f"a model has at most {MAX_MODEL_BYTES} bytes, not {total_bytes}")
+        for asset in assets:
+            _check_name(asset.name)
+            _check_hash(asset.sha256, f"the sha256 of '{asset.name}'")
+            if not 0 <= asset.size <= MAX_BLOB_BYTES:
+                raise Refusal(
+                    "payload_too_large", f"'{asset.name}' has {asset.size} bytes; a file has at most {MAX_BLOB_BYTES}"
+                )
+        named = {asset.name: _File(asset.sha256, asset.size) for asset in assets}
+        total = sum(asset.size or 0 for asset in named.values())
+        if total > MAX_MODEL_BYTES:
+            raise Refusal("payload_too_large", f"the assets have {total} bytes together, more than {MAX_MODEL_BYTES}")
+        self._forget_idle()
+        if len(self._open) >= MAX_OPEN:
+            raise Refusal(
+                "bad_request", f"{MAX_OPEN} uploads are open: commit one, or wait until one is {IDLE_S:g} s idle"
+            )
+        if self._working is None:  # from now on no other server takes what is under way here for left behind
+            self.root.mkdir(parents=True, exist_ok=True)
+            self._working = contextlib.ExitStack()
+            self._working.enter_context(working_in(self.root))
+        upload_id = str(uuid.uuid4()).upper()
+        folder = Path(tempfile.mkdtemp(dir=self.root, prefix=_UNDER_WAY))
+        self._open[upload_id] = upload = _Upload(
+            _File(manifest.xml_sha256, None), named, _step_mode(manifest.step_mode), self.clock(), folder
+        )
+        needed = [name for name, file in named.items() if not self._cached(file)]
+        return upload_id, not self._cached(upload.document), needed
+
+    def receive(self, chunk: UploadModelChunk) -> tuple[str, int, bool]:
+        """Take a piece of a file.
+
+        Returns:
+            What replies call the file, how many bytes of it were received, and whether it is complete.
+
+        Raises:
+            Refusal: `bad_request`, `payload_too_large`, `unknown_upload`, `hash_mismatch`.
+        """
+        kind, offset, total, data = chunk.kind, chunk.offset, chunk.total, chunk.data
+        if kind not in ("xml", "asset"):
+            raise Refusal("bad_request", f"kind must be 'xml' or 'asset', not '{kind}'")
+        if offset < 0 or total < 0:
+            raise Refusal("bad_request", f"offset and total must be 0 or more, not {offset} and {total}")
+        if total > MAX_BLOB_BYTES:
+            raise Refusal("payload_too_large", f"a file has at most {MAX_BLOB_BYTES} bytes, not {total}")
+        if not data and total:
+            raise Refusal("bad_request", "the chunk holds no data")
+        if offset + len(data) > total:
+            raise Refusal(
+                "bad_request", f"{len(data)} bytes at {offset} reach beyond the end of the file, {total} bytes"
+            )
+        upload = self._find(chunk.upload_id)
+        label, file = upload.file(kind, chunk.name)
+        if file.size is not None and total != file.size:
+            raise Refusal("bad_request", f"'{label}' has {file.size} bytes in the manifest, not {total}")
+        if self._cached(file):
+            return label, total, True
+        if file.partial is None:
+            handle, partial = tempfile.mkstemp(dir=upload.folder)
+            os.close(handle)
+            file.partial = Path(partial)
+        try:
+            with file.partial.open("r+b") as stream:
+                stream.seek(offset)
+                stream.write(data)
+        except OSError as error:
+            raise Refusal("internal_error", f"'{label}' cannot be stored: {error.strerror or error}") from None
+        file.received += len(data)
+        if file.received < total:
+            return label, file.received, False
+        self._complete(label, file, total)
+        return label, total, True
+
+    @contextmanager
+    def committed(self, upload_id: str) -> Generator[tuple[Path, StepMode | None]]:
+        """Lay the files of an upload out in a folder, and close the upload at the end, however that comes.
+
+        Yields:
+            The document, and the step mode to go into.
+
+        Raises:
+            Refusal: `bad_request`, with the upload still open; `unknown_upload`.
+        """
+        if not upload_id:
+            raise Refusal("bad_request", "upload_id is empty")
+        upload = self._find(upload_id)
+        missing = [] if self._cached(upload.document) else [_DOCUMENT_IN_REPLIES]
+        missing += [name for name, file in upload.assets.items() if not self._cached(file)]
+        if missing:
+            raise Refusal("bad_request", f"the upload is incomplete: {', '.join(missing[:5])} must be sent first")
+        try:
+            laid_out = upload.folder / "model"
+            laid_out.mkdir()
+            for name, file in {DOCUMENT: upload.document, **upload.assets}.items():
+                shutil.copyfile(self._cache / file.sha256, laid_out / name)
+            yield laid_out / DOCUMENT, upload.step_mode
+        except OSError as error:
+            raise Refusal("import_failed", f"the upload cannot be laid out: {error.strerror or error}") from None
+        finally:
+            self._close(upload_id)
+
+    def close(self) -> None:
+        """Forget every upload under way. Idempotent."""
+        for upload_id in list(self._open):
+            self._close(upload_id)
+        if self._working is not None:
+            self._working.close()
+            self._working = None
+
+    def _close(self, upload_id: str) -> None:
+        shutil.rmtree(self._open.pop(upload_id).folder, ignore_errors=True)
+
+    def _find(self, upload_id: str) -> _Upload:
+        self._forget_idle()
+        upload = self._open.get(upload_id)
+        if upload is None:
+            raise Refusal("unknown_upload", f"no upload '{upload_id}' is open: send the manifest again")
+        upload.touched = self.clock()
+        return upload
+
+    def _forget_idle(self) -> None:
+        now = self.clock()
+        for upload_id in [key for key, upload in self._open.items() if now - upload.touched > IDLE_S]:
+            self._close(upload_id)
+
+    def _cached(self, file: _File) -> bool:
+        try:
+            size = (self._cache / file.sha256).stat().st_size
+        except OSError:
+            return False
+        return file.size is None or size == file.size
+
+    def _complete(self, label: str, file: _File, total: int) -> None:
+        """Move a file whose bytes are all there into the cache, if they are the right ones."""
+        partial = file.partial
+        assert partial is not None  # noqa: S101 - what was received is in it
+        file.partial, file.received = None, 0
+        with partial.open("rb") as stream:
+            found = hashlib.file_digest(stream, "sha256").hexdigest()
+        if found != file.sha256 or partial.stat().st_size != total:
+            partial.unlink()
+            raise Refusal("hash_mismatch", f"'{label}' has the hash {found}, the manifest says {file.sha256}")
+        self._cache.mkdir(exist_ok=True)
+        os.replace(partial, self._cache / file.sha256)
+        self._make_room()
+
+    def _make_room(self) -> None:
+        """Drop what was used longest ago, but nothing that an open upload needs."""
+        needed = {file.sha256 for upload in self._open.values() for file in (upload.document, *upload.assets.values())}
+        files = sorted(_files(self._cache.iterdir()), key=lambda item: item[1].st_mtime)
+        held = sum(about.st_size for _, about in files)
+        for path, about in files:
+            if held <= self.cache_bytes:
+                return
+            if path.name not in needed:
+                path.unlink(missing_ok=True)
+                held -= about.st_size
+
+
+def _files(paths: Iterable[Path]) -> list[tuple[Path, os.stat_result]]:
+    return [(path, path.stat()) for path in paths if path.is_file()]
+
+
+def _step_mode(text: str | None) -> StepMode | None:
+    """Return the step mode to go into; None for what is not one, as the plugin ignores it."""
+    return next((mode for mode in (StepMode.LIVE, StepMode.DIRECT, StepMode.PUPPET) if mode == text), None)
+
+
+def _check_hash(text: str, what: str) -> None:
+    if not _HASH.fullmatch(text):
+        raise Refusal("bad_request", f"{what} must be 64 lower-case hexadecimal digits, not '{text[:80]}'")
+
+
+def _check_name(name: str) -> None:
+    """Refuse what is not a bare file name on every system, and the document's own name."""
+    bare = name not in ("", ".", "..") and not any(c in '/\\:*?"<>|' or ord(c) < 32 for c in name)
+    if not bare or len(name.encode()) > _MAX_NAME_BYTES or name.partition(".")[0].upper() in WINDOWS_DEVICES:
+        raise Refusal("bad_request", f"'{name[:80]}' is not a bare file name")
+    if name.casefold() == DOCUMENT:
+        raise Refusal("bad_request", f"an asset must not be called '{name}', which is what the document is called")

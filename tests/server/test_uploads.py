@@ -1,0 +1,205 @@
+"""Models over the wire, over a raw socket: what a client of the beta may send, and what is refused."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from wire import Wire
+
+from urlab_client.server import SimulatedServer
+from urlab_client.server.assets.uploads import IDLE_S, MAX_OPEN
+
+MESH = b"v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
+XML = b"""
+<mujoco model="sent">
+  <asset><mesh name="part" file="part.obj"/></asset>
+  <worldbody><body><joint name="j" type="hinge"/><geom type="mesh" mesh="part"/></body></worldbody>
+</mujoco>
+"""
+
+
+def digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def manifest(xml: bytes = XML, **files: bytes) -> dict[str, Any]:
+    assets = [
+        {"name": name.replace("_", "."), "sha256": digest(data), "size": len(data)} for name, data in files.items()
+    ]
+    return {"xml_sha256": digest(xml), "total_bytes": len(xml) + sum(map(len, files.values())), "assets": assets}
+
+
+def chunk(upload: str, data: bytes, name: str = "", **fields: Any) -> dict[str, Any]:
+    kind = "asset" if name else "xml"
+    return {"upload_id": upload, "kind": kind, "name": name, "offset": 0, "total": len(data), "data": data, **fields}
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[SimulatedServer]:
+    with SimulatedServer(dialect="beta", saved_dir=tmp_path / "saved") as server:
+        yield server
+
+
+@pytest.fixture
+def wire(server: SimulatedServer) -> Iterator[Wire]:
+    with Wire(server) as wire:
+        wire.hello()
+        yield wire
+
+
+def test_a_model_is_sent_and_spawned(wire: Wire) -> None:
+    """Beta statements 59 and 62."""
+    said = manifest(part_obj=MESH)
+    opened = wire.ask("upload_model_manifest", **said)
+    assert (opened["need_xml"], opened["need_assets"]) == (True, ["part.obj"])
+    upload = opened["upload_id"]
+    half = len(MESH) // 2
+    first = wire.ask("upload_model_chunk", **chunk(upload, MESH[:half], "part.obj", total=len(MESH)))
+    assert (first["received"], first["complete"]) == (half, False)
+    last = wire.ask("upload_model_chunk", **chunk(upload, MESH[half:], "part.obj", total=len(MESH), offset=half))
+    assert (last["name"], last["received"], last["complete"]) == ("part.obj", len(MESH), True)
+    assert wire.ask("upload_model_chunk", **chunk(upload, XML))["name"] == "<xml>"
+
+    again = wire.ask("upload_model_manifest", **said)
+    assert (again["need_xml"], again["need_assets"]) == (False, [])
+
+    done = wire.ask("upload_model_commit", upload_id=upload)
+    assert done["imported"] is True
+    assert "nq" not in done
+    assert wire.refused("upload_model_commit", upload_id=upload) == "unknown_upload"
+    (blueprint,) = wire.ask("list_blueprints")["blueprints"]
+    assert blueprint["blueprint_class_path"] == done["blueprint_class_path"]
+    job = wire.raw(
+        {
+            "op": "spawn_actor",
+            "session_id": wire.session_id,
+            "blueprint": done["blueprint_class_path"],
+            "actor_id": "sent",
+        }
+    )
+    for status in wire.until("op_status", job_id=job["job_id"]):
+        if status["state"] != "running":
+            assert status["result"]["op"] == "spawn_actor_ok"
+            break
+
+
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [
+        ({"xml_sha256": "abc"}, "bad_request"),
+        ({"xml_sha256": digest(XML).upper()}, "bad_request"),
+        ({"total_bytes": 2**30}, "payload_too_large"),
+        *(
+            ({"assets": [{"name": name, "sha256": digest(b""), "size": 0}]}, "bad_request")
+            for name in ("a/b.stl", "..", "", "a\\b.stl", "C:x.stl", "model.xml", "Model.XML", "nul.stl", "a\nb")
+        ),
+        ({"assets": [{"name": "a.stl", "sha256": "0" * 63, "size": 0}]}, "bad_request"),
+        ({"assets": [{"name": "a.stl", "sha256": digest(b""), "size": 2**27}]}, "payload_too_large"),
+        ({"assets": [{"name": "a.stl", "sha256": digest(b""), "size": -1}]}, "payload_too_large"),
+        (
+            {"assets": [{"name": f"{i}.stl", "sha256": digest(b""), "size": 2**26} for i in range(9)]},
+            "payload_too_large",
+        ),
+        ({"assets": [{"name": f"{i}.stl", "sha256": digest(b""), "size": 0} for i in range(4097)]}, "bad_request"),
+    ],
+)
+def test_manifests_that_are_refused(wire: Wire, tmp_path: Path, change: dict[str, Any], code: str) -> None:
+    """Beta statement 58."""
+    assert wire.refused("upload_model_manifest", **{**manifest(), **change}) == code
+    assert not list(tmp_path.glob("saved/Uploads/.upload-*"))
+
+
+def test_uploads_that_are_open(wire: Wire, server: SimulatedServer) -> None:
+    """Beta statement 58: the seventeenth is refused, until one was idle for long enough."""
+    for _ in range(MAX_OPEN):
+        wire.ask("upload_model_manifest", **manifest())
+    assert wire.refused("upload_model_manifest", **manifest()) == "bad_request"
+    core = server._running._core  # type: ignore[union-attr]
+    now = core.uploads.clock()
+    core.uploads.clock = lambda: now + IDLE_S + 1
+    upload = wire.ask("upload_model_manifest", **manifest())["upload_id"]
+    assert wire.ask("upload_model_chunk", **chunk(upload, XML))["complete"]
+
+
+def test_chunks_that_are_refused(wire: Wire) -> None:
+    """Beta statements 60 and 61."""
+    said = manifest(part_obj=MESH)
+    upload = wire.ask("upload_model_manifest", **said)["upload_id"]
+
+    def refused(**change: Any) -> str:
+        return wire.refused("upload_model_chunk", **{**chunk(upload, MESH, "part.obj"), **change})
+
+    assert refused(kind="mesh") == "bad_request"
+    assert refused(offset=-1) == "bad_request"
+    assert refused(total=2**27) == "payload_too_large"
+    assert refused(data=b"") == "bad_request"
+    assert refused(offset=1) == "bad_request"
+    assert refused(upload_id="x") == "unknown_upload"
+    assert refused(name="other.obj") == "bad_request"
+    assert refused(total=len(MESH) + 1) == "bad_request"
+    assert refused(data=bytes(len(MESH))) == "hash_mismatch"
+    assert wire.refused("upload_model_commit", upload_id=upload) == "bad_request"
+    assert wire.ask("upload_model_chunk", **chunk(upload, MESH, "part.obj"))["complete"]
+    assert wire.ask("upload_model_chunk", **chunk(upload, MESH, "part.obj"))["received"] == len(MESH)
+    assert wire.refused("upload_model_commit", upload_id=upload) == "bad_request"
+    assert wire.refused("upload_model_commit", upload_id="") == "bad_request"
+    assert wire.ask("upload_model_chunk", **chunk(upload, XML))["complete"]
+    assert wire.ask("upload_model_commit", upload_id=upload)["imported"]
+
+
+@pytest.mark.parametrize(
+    "xml",
+    [
+        b"no XML",
+        b"<mujoco><include file='/etc/hostname'/></mujoco>",
+        b"<mujoco><include file='../../secret.xml'/></mujoco>",
+        b"<mujoco><asset><mesh name='m' file='missing.obj'/></asset></mujoco>",
+        b"<mujoco><worldbody>"
+        + b"".join(b"<replicate count='500'>" for _ in range(3))
+        + b"<geom size='1'/>"
+        + b"</replicate>" * 3
+        + b"</worldbody></mujoco>",
+    ],
+    ids=["text", "absolute include", "include outside", "missing", "bomb"],
+)
+def test_documents_that_are_refused(wire: Wire, tmp_path: Path, xml: bytes) -> None:
+    (tmp_path / "saved").mkdir(exist_ok=True)
+    (tmp_path / "saved" / "secret.xml").write_text("<mujoco/>")
+    upload = wire.ask("upload_model_manifest", **manifest(xml))["upload_id"]
+    wire.ask("upload_model_chunk", **chunk(upload, xml))
+    assert wire.refused("upload_model_commit", upload_id=upload) == "import_failed"
+    assert wire.refused("upload_model_commit", upload_id=upload) == "unknown_upload"
+    assert wire.ask("list_blueprints")["blueprints"] == []
+    assert not list(tmp_path.glob("saved/Uploads/.upload-*"))
+
+
+def test_a_model_that_runs_is_described(wire: Wire) -> None:
+    xml = b"<mujoco model='plain'><worldbody><body><joint/><geom size='.1'/></body></worldbody></mujoco>"
+    wire.raw({"op": "ensure_manager", "session_id": wire.session_id})
+    wire.ask("begin_pie", timeout_s=20)
+    upload = wire.ask("upload_model_manifest", **manifest(xml), step_mode="direct")["upload_id"]
+    wire.ask("upload_model_chunk", **chunk(upload, xml))
+    done = wire.ask("upload_model_commit", upload_id=upload)
+    assert (done["nq"], done["nbody"]) == (0, 1)  # of the empty level
+    assert done["mjb"]
+    assert wire.ask("set_mode", mode="live")["previous_mode"] == "direct"
+
+
+def test_the_cache_gives_way(tmp_path: Path) -> None:
+    from urlab_client.server import Limits
+
+    with (
+        SimulatedServer(dialect="beta", saved_dir=tmp_path, limits=Limits(upload_cache_bytes=len(XML))) as server,
+        Wire(server) as wire,
+    ):
+        wire.hello()
+        for data in (XML, XML + b" "):
+            upload = wire.ask("upload_model_manifest", **manifest(data))["upload_id"]
+            wire.ask("upload_model_chunk", **chunk(upload, data))
+            wire.refused("upload_model_commit", upload_id=upload)  # the mesh is missing, the upload is closed
+        assert sum(file.stat().st_size for file in (tmp_path / "Uploads" / "cache").iterdir()) <= 2 * len(XML) + 1
+        assert wire.ask("upload_model_manifest", **manifest(XML))["need_xml"] is True
