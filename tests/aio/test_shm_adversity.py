@@ -32,7 +32,7 @@ STEP = {"op": "step_ok", "time": 0.5, "step": 1.0, "per_articulation": {}}
 @pytest.fixture
 def directory() -> Iterator[Path]:
     """A short path: Unix sockets have room for about a hundred bytes."""
-    with tempfile.TemporaryDirectory(prefix="urlab-test-", dir="/tmp") as base:
+    with tempfile.TemporaryDirectory(prefix="urlab-test-", dir="/tmp" if os.name == "posix" else None) as base:
         yield Path(base) / "live"
 
 

@@ -100,7 +100,7 @@ async def test_clients_killed_while_they_step(tmp_path: Path) -> None:
                 sys.executable, "-c", CLIENT, str(port), stdout=asyncio.subprocess.PIPE
             )
             assert victim.stdout is not None
-            assert await victim.stdout.readline() == b"stepping\n"
+            assert (await victim.stdout.readline()).strip() == b"stepping"
             killed = asyncio.get_running_loop().create_future()
             asyncio.get_running_loop().call_later(chance.uniform(0.0, 0.02), killed.set_result, None)
             await killed

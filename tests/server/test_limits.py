@@ -198,6 +198,29 @@ def test_connections_that_never_become_peers_are_closed(monkeypatch: pytest.Monk
                     pass
 
 
+GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x01" + b"NULL".ljust(20, b"\0") + bytes(32)
+
+
+def ready(kind: bytes) -> bytes:
+    """Return the command with which a ZeroMQ peer of some socket type ends its handshake."""
+    body = b"\x05READY\x0bSocket-Type" + struct.pack(">I", len(kind)) + kind
+    return b"\x04" + bytes([len(body)]) + body
+
+
+def test_peers_that_answer_no_heartbeat_are_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(endpoint, "HEARTBEAT_MS", 50)
+    monkeypatch.setattr(endpoint, "SILENCE_MS", 200)
+    with SimulatedServer() as server:
+        ports = [(server.step_port, b"DEALER"), (server.state_port, b"SUB"), (server.ctrl_port, b"PUB")]
+        for port, kind in [*ports, (server.info_port, b"SUB"), (server.camera_port, b"SUB")]:
+            with sockets.create_connection(("127.0.0.1", port), timeout=30) as connection:
+                connection.sendall(GREETING + ready(kind))
+                heard = b""
+                while received := connection.recv(1024):
+                    heard += received
+            assert b"\x04PING" in heard, "it was a peer"
+
+
 @contextmanager
 def _watched(kind: int, address: str) -> Generator[tuple[zmq.Socket[bytes], zmq.Socket[bytes]]]:
     """Open a socket whose monitor tells of a connection that is closed."""

@@ -446,6 +446,25 @@ def test_a_bad_message_disturbs_nothing(play: Play, frames: list[bytes]) -> None
     assert next(True for reply in bench.wire.until("forward") if reply["per_articulation"]["bot"]["ctrl"] == [0.5])
 
 
+def test_of_too_many_commands_that_wait_for_physics_the_oldest_go(play: Play, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(publishing, "WAITING_COMMANDS", 3)
+    bench = play("bot", "limited")
+    publisher = bench.open(zmq.XPUB, bench.server.ctrl_port)
+    assert len({publisher.recv() for _ in range(4)}) == 4
+    waiting = bench.server._running.streams._commands
+    commands = [(1, 0.9), (0, 0.1), (0, 0.2), (0, 0.3)]
+    with bench.engine.lock:
+        for actuator, value in commands:
+            payload = ControlPayload(np.array([actuator]), np.array([value]))
+            publisher.send_multipart([b"bot/control ", payload.encode()])
+        eventually(lambda: len(waiting) == 3 and waiting[-1].values[0] == np.float32(0.3))
+    for reply in bench.wire.until("forward"):
+        ctrl = {key: state["ctrl"] for key, state in reply["per_articulation"].items()}
+        if ctrl["bot"] != [0.0]:
+            break
+    assert ctrl == {"bot": [float32(0.3)], "bot_1": [0.0]}
+
+
 def test_streamed_gains_reach_the_controller(play: Play) -> None:
     bench = play(controllers={"*": ControllerConfig()})
     gains = {"m": {"kp": 7.0, "torque_limit": 0.1}}

@@ -35,7 +35,7 @@ Rpc = Callable[..., dict[str, Any]]
 @pytest.fixture
 def base() -> Iterator[Path]:
     """A short path: Unix sockets have room for about a hundred bytes."""
-    with tempfile.TemporaryDirectory(prefix="urlab-test-", dir="/tmp") as directory:
+    with tempfile.TemporaryDirectory(prefix="urlab-test-", dir="/tmp" if os.name == "posix" else None) as directory:
         yield Path(directory)
 
 

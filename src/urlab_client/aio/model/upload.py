@@ -13,7 +13,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar, cast
 
 from urlab_client.protocol.base import Reply, Request
 from urlab_client.protocol.errors import ConnectionLost, OutcomeUnknown, UnknownUpload
@@ -85,11 +85,11 @@ def flatten(model: str | os.PathLike[str] | mujoco.MjSpec) -> FlatModel:
 
     from urlab_client._mujoco import flat_model  # noqa: PLC0415
 
-    path = Path(model) if isinstance(model, (str, os.PathLike)) else None  # pyright: ignore[reportUnknownArgumentType]
+    given = cast("Any", model)
+    path = None if isinstance(given, mujoco.MjSpec) else Path(given)
     if path is not None and not path.is_file():
         raise FileNotFoundError(f"upload_model: {path} does not exist or is not a file")
     source = "the spec" if path is None else str(path)
-    given: Any = model
     try:
         spec: mujoco.MjSpec = given.copy() if path is None else mujoco.MjSpec.from_file(source)
         spec.compile()

@@ -107,6 +107,8 @@ class MappedRegion:
             about = self.path.stat()
         except OSError:
             return True
+        if not about.st_ino:  # Windows may not say which file it is while that is in use; then it is the same
+            return False
         return (about.st_dev, about.st_ino) != self._identity
 
     def laid_out_anew(self) -> bool:

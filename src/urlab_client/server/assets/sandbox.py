@@ -28,7 +28,7 @@ from urlab_client._children import APART
 from urlab_client._confined import limit_process
 from urlab_client._landlock import confine_files
 from urlab_client.server.assets.confinement import Outside, check_references
-from urlab_client.server.assets.content import Compiled, build_snapshot, mujoco_messages, one_line
+from urlab_client.server.assets.importer import Compiled, build_snapshot, mujoco_messages, one_line
 from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
 

@@ -31,8 +31,9 @@ from urlab_client.protocol.base import Vec3
 from urlab_client.protocol.controller_text import CUSTOM_TEXT, ControllerText
 from urlab_client.protocol.rotation import rotate, wxyz
 from urlab_client.server.assets.actors import Actor, Mesh, scene_problem
-from urlab_client.server.assets.content import Blueprint, mujoco_messages, one_line
+from urlab_client.server.assets.content import Blueprint
 from urlab_client.server.assets.decomposition import convex_parts
+from urlab_client.server.assets.importer import mujoco_messages, one_line
 from urlab_client.server.assets.option_ranges import options_problem
 from urlab_client.server.limits import Limits
 

@@ -1,0 +1,260 @@
+"""What becomes of an MJCF when it is imported: a self-contained copy in which everything has a name.
+
+For `ContentRoot` and the sandbox, which say where files lie and what a model may ask for. Names and keyframes are those
+that the plugin's importer makes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import re
+import threading
+from collections.abc import Callable, Generator, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+import mujoco
+
+from urlab_client._mujoco import actuator_count, actuator_kind, check_copy, write_model
+from urlab_client.server.assets.option_ranges import options_problem
+from urlab_client.server.limits import Limits
+
+__all__ = ["Compiled", "build_snapshot", "mujoco_messages", "named_kinds", "one_line"]
+
+logger = logging.getLogger("urlab_client.server")
+
+DEFAULT_MODEL_NAMES: Final = frozenset({"", "MuJoCo Model"})
+"""What MuJoCo calls a model whose file gives no name."""
+
+
+def one_line(error: object) -> str:
+    """Return MuJoCo's message, which may span lines, on one line."""
+    return " ".join(str(error).split())
+
+
+class Compiled(msgspec.Struct, frozen=True, kw_only=True):
+    """What is learnt from compiling a model; see `Blueprint` for the fields it shares.
+
+    Attributes:
+        messages: MuJoCo's warnings.
+        n_bytes: Size of the compiled model.
+        n_data_bytes: Memory of its simulation, without an arena of MuJoCo's own choice.
+        n_arena_bytes: Memory of its arena.
+        n_sensor_values: Numbers that its sensors give.
+        options_problem: What is wrong with its `<option>`, if anything.
+        largest_image: Largest width or height of its cameras, pixels.
+    """
+
+    model_name: str
+    joints: tuple[str, ...]
+    actuators: tuple[str, ...]
+    actuator_types: dict[str, str]
+    sensors: tuple[str, ...]
+    cameras: tuple[str, ...]
+    messages: tuple[str, ...]
+    n_bytes: int
+    n_data_bytes: int
+    n_arena_bytes: int
+    n_sensor_values: int
+    options_problem: str
+    largest_image: int
+
+
+def build_snapshot(file: Path, snapshot: Path, limits: Limits) -> tuple[Compiled, mujoco.MjModel]:
+    """Compile an MJCF file, write what is kept of it, and return what was learnt and the model.
+
+    Args:
+        file: The file.
+        snapshot: Folder to write, which must not exist.
+        limits: For the ranges of its options; nothing is refused here.
+
+    Raises:
+        ValueError, mujoco.FatalError: MuJoCo rejects it.
+    """
+    with mujoco_messages() as messages:
+        spec = mujoco.MjSpec.from_file(str(file))
+        # Compiles the file itself, so that an error names the source's own line.
+        original = mujoco.MjModel.from_xml_path(str(file))
+        prepared = _prepared(spec)
+        kinds = {actuator.name: _actuator_kind(actuator) for actuator in prepared.actuators}
+        _write_snapshot(prepared, snapshot, messages)
+        model = mujoco.MjModel.from_xml_path(str(snapshot / "model.xml"))
+        data = mujoco.MjData(model)
+        check_copy(original, model)
+    compiled = Compiled(
+        model_name="" if spec.modelname in DEFAULT_MODEL_NAMES else spec.modelname,
+        joints=_names(model.njnt, model.joint),
+        actuators=_names(actuator_count(model), model.actuator),
+        actuator_types=kinds,
+        sensors=_names(model.nsensor, model.sensor),
+        cameras=_names(model.ncam, model.camera),
+        messages=tuple(dict.fromkeys(messages)),
+        n_bytes=mujoco.mj_sizeModel(model),
+        n_data_bytes=data.nbuffer + max(prepared.memory, 0),
+        n_arena_bytes=data.narena,
+        n_sensor_values=model.nsensordata,
+        options_problem=options_problem(model.opt, limits),
+        largest_image=int(model.cam_resolution.max(initial=0)),
+    )
+    return compiled, model
+
+
+_hook_lock = threading.Lock()
+
+
+@contextlib.contextmanager
+def mujoco_messages() -> Generator[list[str]]:
+    """Collect the warnings that MuJoCo gives this thread, instead of letting it print and write `MUJOCO_LOG.TXT`.
+
+    MuJoCo has one handler per process. Warnings that other threads cause meanwhile go to the handler that was there,
+    or else to the log.
+    """
+    thread = threading.get_ident()
+    messages: list[str] = []
+    with _hook_lock:
+        previous: Callable[[str], None] | None = mujoco.get_mju_user_warning()
+
+        def collect(text: str) -> None:
+            if threading.get_ident() == thread:
+                messages.append(text)
+            elif previous is not None:
+                previous(text)
+            else:
+                logger.warning("MuJoCo: %s", text)
+
+        mujoco.set_mju_user_warning(collect)
+        try:
+            yield messages
+        finally:
+            mujoco.set_mju_user_warning(previous)
+
+
+def _write_snapshot(spec: mujoco.MjSpec, folder: Path, messages: list[str]) -> None:
+    """Write a spec and every file it needs to `folder`, as `model.xml` and what is beside it."""
+    before = len(messages)
+    try:
+        write_model(spec, folder)
+    except mujoco.FatalError:
+        # A model made of attached parts is written only once compilation has assembled its keyframes.
+        del messages[before:]
+        spec.compile()
+        write_model(spec, folder)
+
+
+def _names(count: int, element: Callable[[int], Any]) -> tuple[str, ...]:
+    return tuple(element(index).name for index in range(count))
+
+
+def _prepared(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """Return a copy of a parsed spec as the importer of the plugin would leave it: all named, keyframes complete."""
+    prepared = spec.copy()  # a copy no longer repeats the warnings of parsing when it is compiled
+    prepared.compiler.settotalmass = -1.0  # has no effect once attached, and warns at every compilation
+    _name_elements(prepared)
+    _complete_keyframes(prepared)
+    return prepared
+
+
+_SENSOR_TAGS: Final = {
+    "JOINTACTFRC": "Jointactuatorfrc",
+    "TENDONACTFRC": "Tendonactuatorfrc",
+    "GEOMDIST": "Distance",
+    "GEOMNORMAL": "Normal",
+    "GEOMFROMTO": "Fromto",
+}
+"""Sensors whose MJCF element is called differently from MuJoCo's constant."""
+
+
+def _constant(value: Any) -> str:
+    """Return the last part of an enumeration member: `SPHERE` for `mjGEOM_SPHERE`."""
+    return str(value.name).partition("_")[2]
+
+
+def _actuator_kind(actuator: Any) -> str:
+    kind = actuator_kind(actuator)
+    return "motor" if kind == "general" else kind
+
+
+def _file_stem(asset: Any) -> str:
+    return re.split(r"[/\\]", asset.file)[-1].rpartition(".")[0]
+
+
+def named_kinds(spec: mujoco.MjSpec) -> list[tuple[Sequence[Any], Callable[[Any], str]]]:
+    """Return each kind of element that MJCF allows without a name, and what the plugin's importer calls one."""
+    return [
+        (spec.bodies[1:], lambda body: f"{body.parent.name if body.parent.id else 'worldbody'}_Body"),
+        (spec.joints, lambda joint: f"{_constant(joint.type).capitalize()}Joint"),
+        (spec.geoms, lambda geom: f"Geom_{_constant(geom.type).capitalize()}"),
+        (spec.sites, lambda _: "Site"),
+        (spec.cameras, lambda _: "Camera"),
+        (spec.lights, lambda _: "Light"),
+        (spec.actuators, lambda actuator: f"{actuator_kind(actuator).capitalize()}Actuator"),
+        (
+            spec.sensors,
+            lambda sensor: f"{_SENSOR_TAGS.get(_constant(sensor.type), _constant(sensor.type).capitalize())}Sensor",
+        ),
+        (spec.tendons, lambda _: "Tendon"),
+        (spec.equalities, lambda equality: f"{_constant(equality.type).capitalize()}Equality"),
+        (spec.pairs, lambda _: "Pair"),
+        (spec.excludes, lambda _: "Exclude"),
+        (spec.keys, lambda _: "Keyframe"),
+        (spec.meshes, lambda mesh: _file_stem(mesh) or "Mesh"),
+        (spec.hfields, lambda hfield: _file_stem(hfield) or "Hfield"),
+        (spec.textures, lambda texture: _file_stem(texture) or "Texture"),
+        (spec.skins, lambda _: "Skin"),
+    ]
+
+
+def _name_elements(spec: mujoco.MjSpec) -> None:
+    """Give every unnamed element a name that no other of its kind has: `HingeJoint`, then `HingeJoint1`, …"""
+    for elements, base in named_kinds(spec):
+        taken = {element.name for element in elements}
+        following: dict[str, int] = {}
+        for element in elements:
+            if element.name:
+                continue
+            stem = base(element)
+            count = following.get(stem, 0)
+            name = stem if count == 0 else f"{stem}{count}"
+            while name in taken:
+                count += 1
+                name = f"{stem}{count}"
+            following[stem] = count + 1
+            taken.add(name)
+            element.name = name
+
+
+def _complete_keyframes(spec: mujoco.MjSpec) -> None:
+    """Bring keyframes to the form in which the plugin merges them.
+
+    Vectors that leave out the free joints get an identity block for each. Mocap poses are dropped: every key of a
+    merged scene holds the compiled poses.
+    """
+    free = mujoco.mjtJoint.mjJNT_FREE
+    widths = {free: (7, 6), mujoco.mjtJoint.mjJNT_BALL: (4, 3)}
+    joints = [(joint.type == free, *widths.get(joint.type, (1, 1))) for joint in spec.joints]
+    for key in spec.keys:
+        key.qpos = _with_free_joints(list(key.qpos), [(is_free, nq) for is_free, nq, _ in joints], _REST_POSE)
+        key.qvel = _with_free_joints(list(key.qvel), [(is_free, nv) for is_free, _, nv in joints], _REST_VELOCITY)
+        key.mpos = []
+        key.mquat = []
+
+
+_REST_POSE: Final = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+_REST_VELOCITY: Final = (0.0,) * 6
+
+
+def _with_free_joints(values: list[float], joints: list[tuple[bool, int]], block: Sequence[float]) -> list[float]:
+    """Return `values` with `block` put in for each free joint, if it has exactly the other joints' coordinates."""
+    if not values or len(values) != sum(width for is_free, width in joints if not is_free):
+        return values
+    complete: list[float] = []
+    position = 0
+    for is_free, width in joints:
+        if is_free:
+            complete += block
+        else:
+            complete += values[position : position + width]
+            position += width
+    return complete

@@ -1,0 +1,99 @@
+#!/usr/bin/env bash
+# A CPython for Windows under Wine, with this project in it: make_python.sh FOLDER
+#
+# FOLDER gets the interpreter (python311.dll and extension modules as published for Windows, the standard library of
+# this machine's Python 3.11, a launcher of ten lines), the Windows wheels of the test dependencies, and the project's
+# wheel. Run programs with FOLDER/winpy:
+#
+#     FOLDER/winpy -m urlab_client --version
+#     FOLDER/winpy -m pytest tests/protocol
+#
+# What it shows: Proactor loop, Windows' sockets, processes, named events, file mapping and paths, as Wine implements
+# them. What it does not: times, OpenGL, the console's Ctrl-C, and whatever Wine does differently from Windows. Needs
+# wine, x86_64-w64-mingw32-gcc and /usr/lib/python3.11, all of which Debian 12 has.
+set -euo pipefail
+target=$(mkdir -p "$1" && cd "$1" && pwd)
+here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
+project=$(cd "$here/../.." && pwd)
+site=$target/py/Lib/site-packages
+
+fetch() { # fetch FOLDER PACKAGE...: download wheels for Windows
+    local folder=$1
+    shift
+    python3 -m pip --disable-pip-version-check download -q -d "$folder" --platform win_amd64 --python-version 3.11 \
+        --implementation cp --only-binary=:all: "$@"
+}
+
+if [[ ! -e $target/py/python.exe ]]; then
+    work=$(mktemp -d)
+    # Panda3D's wheel for Windows carries CPython's own DLL and extension modules, to put them beside frozen programs.
+    fetch "$work" --no-deps panda3d
+    python3 -m zipfile -e "$work"/panda3d-*.whl "$work/x"
+    rm -rf "$target/py" && mkdir -p "$target/py/DLLs"
+    cp "$work"/x/deploy_libs/*.pyd "$work"/x/deploy_libs/*.dll "$target/py/DLLs/"
+    rm -f "$target"/py/DLLs/api-ms* "$target"/py/DLLs/VCRUNTIME140.dll
+    mv "$target/py/DLLs/python311.dll" "$target/py/"
+    cp -r /usr/lib/python3.11 "$target/py/Lib"
+    rm -rf "$target"/py/Lib/{lib-dynload,dist-packages,test} "$target"/py/Lib/config-*
+    # Debian's 3.11.2 has it without the decorator that later releases of 3.11, as this interpreter, count on.
+    metadata=$target/py/Lib/importlib/metadata/__init__.py
+    grep -B 1 'def invalidate_caches(cls)' "$metadata" | grep -q classmethod ||
+        sed -i 's/^    def invalidate_caches(cls):/    @classmethod\n&/' "$metadata"
+    mkdir -p "$site"
+    x86_64-w64-mingw32-gcc -municode -O2 -o "$target/py/python.exe" "$here/launcher.c"
+    # Wine 8 lacks the C runtime's complex functions, which NumPy imports: a DLL of our own has them.
+    python3 "$here/complex_runtime.py" "$work" "$work/x/deploy_libs/api-ms-win-crt-math-l1-1-0.dll"
+    x86_64-w64-mingw32-gcc -shared -O2 -w -fno-builtin -static-libgcc -o "$target/py/xpi-ms-win-crt-math-l1-1-0.dll" \
+        "$work/shim.c" "$work/shim.def"
+    rm -rf "$work"
+fi
+
+# Under Wine the interpreter starts only where its output is a pipe.
+cat >"$target/winpy" <<EOF
+#!/usr/bin/env bash
+export WINEPREFIX=$target/prefix WINEDEBUG=\${WINEDEBUG:--all} WINEARCH=win64 PYTHONDONTWRITEBYTECODE=1
+set -o pipefail
+wine "$target/py/python.exe" "\$@" 2>&1 </dev/null | cat
+EOF
+chmod +x "$target/winpy"
+
+# What pyproject.toml asks for, but for a browser's driver, whose dependencies have no wheels here.
+mapfile -t packages < <(
+    python3 - "$project/pyproject.toml" <<'EOF'
+import sys
+import tomllib
+
+with open(sys.argv[1], "rb") as file:
+    project = tomllib.load(file)["project"]
+for requirement in [*project["dependencies"], *project["optional-dependencies"]["test"], "cffi", "colorama"]:  # pip asks Linux what Windows needs
+    if not requirement.startswith(("selenium", "uvloop")):
+        print(requirement)
+EOF
+)
+if [[ $(cat "$site/.packages" 2>/dev/null) != "${packages[*]}" ]]; then
+    wheels=$(mktemp -d)
+    fetch "$wheels" "${packages[@]}"
+    for wheel in "$wheels"/*.whl; do
+        python3 -m zipfile -e "$wheel" "$site/"
+    done
+    rm -rf "$wheels"
+    python3 - "$site" <<'EOF'
+import pathlib
+import sys
+
+for path in pathlib.Path(sys.argv[1]).rglob("*"):
+    if path.suffix.lower() in {".pyd", ".dll"}:
+        old = path.read_bytes()
+        new = old.replace(b"api-ms-win-crt-math-l1-1-0.dll", b"xpi-ms-win-crt-math-l1-1-0.dll")
+        if new != old:
+            path.write_bytes(new)
+EOF
+    printf '%s' "${packages[*]}" >"$site/.packages"
+fi
+built=$(mktemp -d)
+python3 -m pip --disable-pip-version-check wheel -q --no-deps -w "$built" "$project"
+rm -rf "$site"/{urlab_client,pytest_urlab,urlab_client-*.dist-info}
+python3 -m zipfile -e "$built"/*.whl "$site/"
+rm -rf "$built"
+[[ -d $target/prefix ]] || WINEPREFIX=$target/prefix WINEDEBUG=-all WINEARCH=win64 wineboot -i </dev/null >/dev/null 2>&1
+"$target/winpy" -c 'import sys, numpy, zmq, mujoco; print(sys.version, numpy.__version__, zmq.__version__, mujoco.__version__)'
