@@ -403,6 +403,7 @@ EYE = ("articulations", 0, "camera_topics", "eye")
         ((*EYE, "resolution"), [1e9, 1e9], "each side has 1 to 16384"),
         (("global_cameras", "sky", "resolution"), [0.0, 1.0], "camera 'sky' of the scene: pictures of 0x1"),
         (("articulations", 0, "prefix"), "", "keys are not empty"),
+        (("instance",), {"state_port": 70000.0}, "its state stream is on port 70000"),
         (("articulations", 0, "controller", "params", "kp"), [1.0], "kp of the controller of 'bot'"),
         (("articulations", 0, "controller", "schema", "kp", "min"), "low", "as the least kp"),
     ],

@@ -11,9 +11,11 @@ from typing import Any
 import mujoco
 import pytest
 from commands import GYMNASIUM_MODELS, Server, served
+from ports import free_port
 
 from urlab_client import SessionTakenOver, URLabClient
 from urlab_client.cli import main
+from urlab_client.server import SimulatedServer
 
 
 @pytest.fixture(scope="module")
@@ -126,3 +128,36 @@ def test_somebody_who_does_not_answer(capsys: pytest.CaptureFixture[str]) -> Non
 @pytest.mark.parametrize("address", ["robot", "http://localhost", "sim://nothing.xml", "tcp://"])
 def test_an_address_that_is_none(address: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert address.removeprefix("sim://") in refused(capsys, address)
+
+
+def test_the_registry_is_listed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Beta statement 99: an entry counts, whatever says when it was written."""
+    monkeypatch.setenv("URLAB_REGISTRY_DIR", str(tmp_path))
+    assert main(["ping", "--all"]) == 0
+    assert "lists no servers" in capsys.readouterr().out
+    with SimulatedServer("ball", dialect="beta", instance_id="bench") as server:
+        entry = {"instance_id": "gone", "host": socket.gethostname(), "step_port": free_port(), "pid": 1}
+        for name, said in (
+            ("text", "2026-11-22T10:00:00+00:00"),
+            ("number", 1.0e9),
+            ("odd", "yesterday"),
+            ("none", None),
+        ):
+            content = entry | ({} if said is None else {"registry_written_at": said})
+            (tmp_path / f"{name}_1.json").write_text(json.dumps(content))
+        (tmp_path / "broken_1.json").write_text("{")
+        (tmp_path / "far_1.json").write_text(json.dumps(entry | {"host": "elsewhere.example", "instance_id": "far"}))
+        assert main(["ping", "--all", "--json", "--timeout", "2"]) == 0
+        listed = json.loads(capsys.readouterr().out)
+        assert {(row["instance_id"], row["answers"]) for row in listed} == {
+            ("bench", True),
+            ("gone", False),
+            ("far", None),
+        }
+        assert len(listed) == 6
+        assert main(["ping", "--all", "--timeout", "2"]) == 0
+        text = capsys.readouterr().out
+        assert f"bench  tcp://127.0.0.1:{server.step_port}" in text
+        assert "does not answer" in text

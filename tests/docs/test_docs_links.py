@@ -42,7 +42,9 @@ def test_every_thread_is_in_the_architecture_page() -> None:
         for part in ("aio", "sync", "server")
         for path in PACKAGE.rglob(f"{part}/**/*.py")
     ]
-    threads = {name for source in sources for name in re.findall(r'name="(urlab-[a-z]+)", daemon', source)}
+    threads = {
+        name for source in sources for name in re.findall(r'(?:name=|ServingThread\()"(urlab-[a-z]+)", ', source)
+    }
     page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     assert threads >= {"urlab-io", "urlab-rpc", "urlab-physics"}
     assert sorted(threads - set(re.findall(r"`(urlab-[a-z]+)`", page))) == []

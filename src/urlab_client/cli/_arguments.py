@@ -23,6 +23,7 @@ __all__ = [
     "count",
     "hertz",
     "image_size",
+    "index",
     "make_client",
     "port",
     "seconds",
@@ -164,6 +165,11 @@ def add_keys(parser: argparse.ArgumentParser) -> None:
 def port(text: str) -> int:
     """Parse a TCP port, 0 to 65535."""
     return _whole(text, 0, 65535, "a port is a whole number from 0 (any free one) to 65535")
+
+
+def index(text: str) -> int:
+    """Parse the number of a server among several, 0 or more."""
+    return _whole(text, 0, 5000, "an index is a whole number from 0 to 5000")
 
 
 def count(text: str) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import socket
 import statistics
 import time
 from typing import TYPE_CHECKING
@@ -25,7 +26,14 @@ from urlab_client.cli._arguments import (
 )
 from urlab_client.cli._mujoco import import_mujoco
 from urlab_client.cli._output import counted
-from urlab_client.protocol.errors import ModeLocked, URLabRPCError, URLabVersionMismatch
+from urlab_client.protocol.errors import (
+    ModeLocked,
+    URLabConnectionError,
+    URLabRPCError,
+    URLabTimeoutError,
+    URLabVersionMismatch,
+)
+from urlab_client.protocol.instances import decode, registry_directory
 from urlab_client.protocol.messages.runtime import SetMode
 
 if TYPE_CHECKING:
@@ -41,6 +49,7 @@ class PingArguments(ServerArguments):
     timeout: float
     count: int
     no_session: bool
+    all: bool
     json: bool
 
 
@@ -116,6 +125,12 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument("--count", type=count, default=5, metavar="N", help="round trips to time (default: 5)")
     parser.add_argument("--no-session", action="store_true", help="disturb nobody: do not open a session")
+    parser.add_argument(
+        "--all",
+        action="store_true",
+        help="list the servers that this machine's registry knows (the plugin's beta keeps one), and ask each whether "
+        "it answers; nobody is disturbed",
+    )
     parser.add_argument("--json", action="store_true", help="print one line of JSON")
     add_keys(parser)
     parser.set_defaults(run=run)
@@ -128,11 +143,80 @@ def run(arguments: PingArguments) -> int:
         CommandError: The address is malformed.
         URLabError: Nothing answers, or it answers nonsense.
     """
+    if arguments.all:
+        servers = asyncio.run(_registered(arguments))
+        print(json.dumps(msgspec.to_builtins(servers)) if arguments.json else _list(servers))
+        return 0
     if not arguments.no_session:
         import_mujoco()  # beforehand, as the event loop had better not wait for it
     report = asyncio.run(_ping(arguments))
     print(json.dumps(msgspec.to_builtins(report)) if arguments.json else _text(report))
     return 0
+
+
+class RegisteredServer(Struct):
+    """A server of the registry; `answers` is None for one on another machine, which is not asked."""
+
+    instance_id: str
+    address: str
+    pid: int
+    seen_s_ago: float
+    busy: bool
+    answers: bool | None
+
+
+async def _registered(arguments: PingArguments) -> list[RegisteredServer]:
+    from urlab_client.aio import URLabClient  # noqa: PLC0415
+
+    found: list[RegisteredServer] = []
+    here = socket.gethostname()
+    for path in sorted(registry_directory().glob("*.json")):
+        try:
+            instance, written = decode(path.read_bytes()), path.stat().st_mtime
+        except (OSError, ValueError):  # gone meanwhile, or not a server's
+            continue
+        address = f"tcp://{'127.0.0.1' if instance.host in ('', here) else instance.host}"
+        answers: bool | None = None
+        if instance.host in ("", here):
+            timeout_ms = max(1, round(arguments.timeout * 1000))
+            client = URLabClient(address, step_port=instance.step_port, rcv_timeout_ms=timeout_ms, local_model=False)
+            async with client:
+                try:
+                    await client.meta(timeout=arguments.timeout)
+                    answers = True
+                except (URLabConnectionError, URLabTimeoutError):
+                    answers = False
+        found.append(
+            RegisteredServer(
+                instance_id=instance.instance_id,
+                address=f"{address}:{instance.step_port}",
+                pid=instance.pid,
+                seen_s_ago=round(max(0.0, time.time() - written), 1),
+                busy=instance.busy,
+                answers=answers,
+            )
+        )
+    return found
+
+
+def _list(servers: list[RegisteredServer]) -> str:
+    if not servers:
+        return f"The registry {registry_directory()} lists no servers."
+    said = {True: "answers", False: "does not answer", None: "on another machine"}
+    rows = [
+        (
+            server.instance_id,
+            server.address,
+            f"pid {server.pid}",
+            said[server.answers] + (", in use" if server.busy else ""),
+            f"registered {server.seen_s_ago:.0f} s ago",
+        )
+        for server in servers
+    ]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+    )
 
 
 async def _ping(arguments: PingArguments) -> Report:

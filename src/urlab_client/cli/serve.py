@@ -16,7 +16,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, cast
 
 from urlab_client._windows import read_aside
-from urlab_client.cli._arguments import Commands, image_size, port
+from urlab_client.cli._arguments import Commands, image_size, index, port
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._mujoco import import_mujoco
 from urlab_client.protocol.controller_text import ControllerText
@@ -76,6 +76,9 @@ class ServeArguments(argparse.Namespace):
     render_quality: Literal["auto", "fast", "high"]
     mjcf_options: bool
     actor_names: Literal["model", "plugin"]
+    dialect: Literal["alpha", "beta"]
+    instance_id: str
+    instance_index: int | None
     json: bool
     until_eof: bool
 
@@ -126,8 +129,22 @@ def add_parser(commands: Commands) -> None:
     )
     for name, default in _PORTS.items():
         network.add_argument(
-            f"--{name}-port", type=port, default=default, metavar="PORT", help="default %(default)s; 0: any free one"
+            f"--{name}-port", type=port, default=None, metavar="PORT", help=f"default {default}; 0: any free one"
         )
+    network.add_argument(
+        "--dialect",
+        choices=("alpha", "beta"),
+        default="alpha",
+        metavar="NAME",
+        help="generation of the plugin to speak for: alpha (June 2026) or beta (August 2026) (default: alpha)",
+    )
+    network.add_argument(
+        "--instance-index",
+        type=index,
+        metavar="N",
+        help="number of this server among several: ports 5559 + 10 N and the two after it, for those not given",
+    )
+    network.add_argument("--instance-id", default="", metavar="NAME", help="what this server is called among several")
     memory = network.add_mutually_exclusive_group()
     memory.add_argument(
         "--shm-dir",
@@ -216,6 +233,7 @@ def run(arguments: ServeArguments) -> int:
         CommandError: An option cannot be honoured, a model cannot be used, or a thread of the server died.
         OSError: A port is in use, or a folder cannot be used.
     """
+    _settle_ports(arguments)
     _check_ports(arguments)
     events: _Events = queue.SimpleQueue()
     _stop_on_signals(events, ignore_interrupt=arguments.until_eof and not os.isatty(0))
@@ -338,6 +356,9 @@ def _server(arguments: ServeArguments, saved_dir: Path) -> SimulatedServer:
             mjcf_options=arguments.mjcf_options,
             actor_names=arguments.actor_names,
             shm_dir=arguments.shm_dir,
+            dialect=arguments.dialect,
+            instance_id=arguments.instance_id,
+            instance_index=arguments.instance_index,
         )
     except ValueError as error:
         raise CommandError(str(error)) from None
@@ -374,6 +395,18 @@ def _announce(server: SimulatedServer, arguments: ServeArguments) -> None:
         f"Serving {models} at {server.address}:{ports['step']} ({others}), open to {server.open_to}; {end} ends it.",
         flush=True,
     )
+
+
+def _settle_ports(arguments: ServeArguments) -> None:
+    """Fill in the ports that were not given: an index takes the place of those of the plugin's first server."""
+    from urlab_client.protocol.dialects import DIALECTS  # noqa: PLC0415
+
+    defaults = {**_PORTS, "camera": DIALECTS[arguments.dialect].first_camera_port}
+    if arguments.instance_index is not None:
+        defaults = dict.fromkeys(_PORTS, 0)
+    for name, default in defaults.items():
+        if getattr(arguments, f"{name}_port") is None:
+            setattr(arguments, f"{name}_port", default)
 
 
 def _check_ports(arguments: ServeArguments) -> None:

@@ -167,6 +167,7 @@ class MirroredArticulation(MirroredEntity):
         """Take over what a handshake says; set-points and control mode are kept when they still fit."""
         n_ctrl = len(info.actuator_types) if self.mirror.model is None else len(layout.ctrl_adr)
         self.info, self.layout = info, layout
+        self._lengths = len(layout.qpos_adr), len(layout.qvel_adr), len(layout.ctrl_adr)
         self._sensor_names = [*layout.sensor_dims]
         self._sensor_dims = [*layout.sensor_dims.values()]
         if len(self.ctrl) != n_ctrl:
@@ -176,6 +177,8 @@ class MirroredArticulation(MirroredEntity):
         self._bind_controller(info.controller)
         self._bind_root()
         data = self.mirror.data
+        # Asking MuJoCo's structure for its arrays takes as long as writing to them.
+        self._mirrored = None if data is None else (data.qpos, data.qvel, data.ctrl, data.act)
         self.qpos: Floats = np.zeros(0) if data is None else data.qpos[layout.qpos_adr]
         self.qvel: Floats = np.zeros(0) if data is None else data.qvel[layout.qvel_adr]
         self.applied: Floats = np.zeros(n_ctrl)
@@ -225,18 +228,27 @@ class MirroredArticulation(MirroredEntity):
         """
         if self.mirror.model is None:
             return
-        layout = self.layout
-        n_ctrl = len(layout.ctrl_adr)
-        self._fits(op, "qpos", state.qpos, len(layout.qpos_adr))
-        self._fits(op, "qvel", state.qvel, len(layout.qvel_adr))
-        self._fits(op, "ctrl", state.ctrl, n_ctrl)
-        self._fits(op, "act", state.act, n_ctrl)
-        self._fits(op, "actuator_force", state.actuator_force, layout.n_out)
-        sensors = state.sensors
-        # Every reply has these: two comparisons of lists, and a look at each sensor only where they differ.
-        if sensors and ([*sensors] != self._sensor_names or [*map(len, sensors.values())] != self._sensor_dims):
-            for name, reading in sensors.items():
-                self._fits(op, f"sensor {name!r}", reading, layout.sensor_dims.get(name, len(reading)))
+        # For each robot of each reply: what is wrong, and with what, is found out only where something is.
+        n_qpos, n_qvel, n_ctrl = self._lengths
+        ctrl, act, force, sensors = state.ctrl, state.act, state.actuator_force, state.sensors
+        if (
+            len(state.qpos) == n_qpos
+            and len(state.qvel) == n_qvel
+            and (ctrl is None or len(ctrl) == n_ctrl)
+            and (act is None or len(act) == n_ctrl)
+            and (force is None or len(force) == self.layout.n_out)
+            and (
+                not sensors or ([*map(len, sensors.values())] == self._sensor_dims and [*sensors] == self._sensor_names)
+            )
+        ):
+            return
+        self._fits(op, "qpos", state.qpos, n_qpos)
+        self._fits(op, "qvel", state.qvel, n_qvel)
+        self._fits(op, "ctrl", ctrl, n_ctrl)
+        self._fits(op, "act", act, n_ctrl)
+        self._fits(op, "actuator_force", force, self.layout.n_out)
+        for name, reading in (sensors or {}).items():
+            self._fits(op, f"sensor {name!r}", reading, self.layout.sensor_dims.get(name, len(reading)))
 
     def check_written(self, qpos: Floats) -> None:
         """Refuse positions that `set_qpos` cannot have written.
@@ -275,15 +287,16 @@ class MirroredArticulation(MirroredEntity):
 
     def write_mirror(self, state: ArticulationState) -> None:
         """Write a checked state into the mirror's data. Call under the mirror's lock."""
-        data, layout = self.mirror.data, self.layout
-        if data is None:
+        if self._mirrored is None:
             return
-        data.qpos[layout.qpos_adr] = state.qpos
-        data.qvel[layout.qvel_adr] = state.qvel
+        qpos, qvel, ctrl, act = self._mirrored
+        layout = self.layout
+        qpos[layout.qpos_adr] = state.qpos
+        qvel[layout.qvel_adr] = state.qvel
         if state.ctrl is not None:
-            data.ctrl[layout.ctrl_adr] = state.ctrl
+            ctrl[layout.ctrl_adr] = state.ctrl
         if state.act is not None and len(layout.act_adr):
-            data.act[layout.act_adr] = state.act[layout.act_from]
+            act[layout.act_adr] = state.act[layout.act_from]
 
     def write_set_points(self) -> None:
         """Write set-points that changed since the last time into the mirror's `ctrl`, for a puppet step.

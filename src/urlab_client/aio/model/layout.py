@@ -15,7 +15,15 @@ from urlab_client.protocol.names import split_prefix
 if TYPE_CHECKING:
     import mujoco
 
-__all__ = ["FREE", "JOINT_TRANSMISSIONS", "QPOS_WIDTH", "QVEL_WIDTH", "ArticulationLayout", "articulation_layouts"]
+__all__ = [
+    "FREE",
+    "JOINT_TRANSMISSIONS",
+    "QPOS_WIDTH",
+    "QVEL_WIDTH",
+    "ArticulationLayout",
+    "Ints",
+    "articulation_layouts",
+]
 
 FREE = 0  # mjJNT_FREE
 JOINT_TRANSMISSIONS = (0, 1)  # mjTRN_JOINT, mjTRN_JOINTINPARENT

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Examined", "examine"]
 
+_LAST_PORT = 65535
+
 
 class Examined(Struct, frozen=True):
     """What follows from a handshake and its model.
@@ -46,6 +48,8 @@ def examine(hello: HelloOk, model: mujoco.MjModel | None) -> Examined:
     keys = [info.prefix for info in hello.articulations]
     if "" in keys or len(set(keys)) < len(keys):
         raise _refused(f"its articulations are called {', '.join(map(repr, keys))}: keys are not empty and differ")
+    if hello.instance is not None and not 0 <= hello.instance.state_port <= _LAST_PORT:
+        raise _refused(f"its state stream is on port {hello.instance.state_port}")
     for info in hello.articulations:
         _check_cameras(f"articulation {info.prefix!r}", info.camera_topics)
         if info.controller is not None:

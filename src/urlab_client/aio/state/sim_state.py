@@ -12,7 +12,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import anyio.to_thread
 import numpy as np
@@ -69,13 +69,12 @@ _OVERTAKEN_S = 1.0
 _ENGINE_NAME = re.compile(r"(?P<stem>.+)_C_(?:\d+|UAID_\w+)")
 
 
-class _Checked(NamedTuple):
-    """A state that fits, and what each part of it is about."""
-
-    reply: StateReply | StateSnapshot
-    articulations: list[tuple[MirroredArticulation, ArticulationState]]
-    entities: list[tuple[MirroredEntity, EntityState]]
-    pictures: list[tuple[URLabCameraView, Pixels]]
+_Parts = tuple[
+    list[tuple[MirroredArticulation, ArticulationState]],
+    list[tuple[MirroredEntity, EntityState]],
+    list[tuple[URLabCameraView, Pixels]],
+]
+"""The parts of a state that fits, each with what it is about."""
 
 
 class StateObserver(Protocol):
@@ -240,15 +239,17 @@ class SimState:
 
     def _ours(self) -> list[MirroredArticulation]:
         # A server whose robots have owners refuses a step that writes to others' robots, so it hears of ours only.
-        claims = self.session.features.claims
-        return [record for record in self._records.values() if record.driven or not claims]
+        records = self._records.values()
+        return [record for record in records if record.driven] if self.session.features.claims else [*records]
 
     def take_wrenches(self) -> Carried:
         """Take what the step that is being built carries out of its buffers."""
-        records: list[MirroredEntity] = [*self._ours()]
+        carried: Carried = {record: record.take_wrenches() for record in self._ours() if record.wrenches}
         if self._records or not self.session.features.claims:
-            records.extend(self._entity_records.values())
-        return {record: record.take_wrenches() for record in records if record.wrenches}
+            for record in self._entity_records.values():
+                if record.wrenches:
+                    carried[record] = record.take_wrenches()
+        return carried
 
     def require_handshake(self, op: str) -> None:
         """Refuse an op that goes by what a handshake said, when that is not known.
@@ -473,12 +474,12 @@ class SimState:
     def absorb_reset(self, reply: StateReply, keyframe: str | None) -> None:
         """Take over the state after a reset, whole or not at all; raises as `absorb` does."""
         received = time.time_ns()
-        checked = self._checked(reply, "reset")
+        parts = self._checked(reply, "reset")
         with self.mirror.lock:
             self.mirror.reset(keyframe)
             for record in self._entity_records.values():
                 record.pose = None
-            self._take_over(checked, received, into_mirror=True)
+            self._take_over(reply, parts, received, into_mirror=True)
 
     def matches(self, snapshot: StateSnapshot) -> bool:
         """Whether a published state is of the world that the handshake described, as far as that can be seen."""
@@ -515,9 +516,9 @@ class SimState:
             ProtocolError: Something in it does not fit the model or the cameras; nothing was taken over.
         """
         received = time.time_ns()
-        self._take_over(self._checked(reply, op), received, into_mirror=into_mirror)
+        self._take_over(reply, self._checked(reply, op), received, into_mirror=into_mirror)
 
-    def _checked(self, reply: StateReply | StateSnapshot, op: str) -> _Checked:
+    def _checked(self, reply: StateReply | StateSnapshot, op: str) -> _Parts:
         """Compare a state with the model and the cameras, and return it with what each part of it is about.
 
         Raises:
@@ -536,20 +537,22 @@ class SimState:
                 record.check_pose(state, op)
         pictures: list[tuple[URLabCameraView, Pixels]] = []
         if isinstance(reply, StepOk):
-            self._check_perturbation(reply.perturbation, op)
-            pictures = [(view, _pixels(view, frame)) for view, frame in self._frames(reply.cameras or {})]
-        return _Checked(reply, articulations, entities, pictures)
+            if reply.perturbation is not None:
+                self._check_perturbation(reply.perturbation, op)
+            if reply.cameras:
+                pictures = [(view, _pixels(view, frame)) for view, frame in self._frames(reply.cameras)]
+        return articulations, entities, pictures
 
-    def _take_over(self, checked: _Checked, received: int, *, into_mirror: bool) -> None:
-        reply = checked.reply
+    def _take_over(self, reply: StateReply | StateSnapshot, parts: _Parts, received: int, *, into_mirror: bool) -> None:
+        articulations, entities, pictures = parts
         with self.mirror.lock:
-            for record, state in checked.articulations:
+            for record, state in articulations:
                 record.absorb(state)
                 if into_mirror:
                     record.write_mirror(state)
-            for record, state in checked.entities:
+            for record, state in entities:
                 record.absorb_pose(state, into_mirror=into_mirror)
-            for view, pixels in checked.pictures:
+            for view, pixels in pictures:
                 view.pictures.deliver(pixels, reply.time)
             if into_mirror and self.mirror.data is not None:
                 self.mirror.data.time = reply.time
@@ -558,11 +561,11 @@ class SimState:
         for observer in self.observers:
             observer.on_state(reply)
 
-    def _check_perturbation(self, drag: Perturbation | None, op: str) -> None:
+    def _check_perturbation(self, drag: Perturbation, op: str) -> None:
         model = self.mirror.model
-        if drag is None or model is None:
-            return
-        if not (0 < drag.body_id < model.nbody and len(drag.xfrc) == 6 and np.isfinite(drag.xfrc).all()):
+        if model is not None and not (
+            0 < drag.body_id < model.nbody and len(drag.xfrc) == 6 and np.isfinite(drag.xfrc).all()
+        ):
             raise ProtocolError(
                 f"{op}: a perturbation of body {drag.body_id} by {drag.xfrc.tolist()}: "
                 f"bodies are 1 to {model.nbody - 1}, a wrench is six numbers.",
