@@ -17,7 +17,7 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 # A test that is slow because the machine is busy has not failed; pytest's own limit ends those that hang.
 settings.register_profile("urlab", deadline=None, suppress_health_check=[HealthCheck.too_slow], max_examples=30)
-settings.register_profile("thorough", settings.get_profile("urlab"), max_examples=300)
+settings.register_profile("thorough", settings.get_profile("urlab"), max_examples=150)
 settings.load_profile("urlab")
 
 # Marker -> modules without which its tests are left out, and the extras to install.

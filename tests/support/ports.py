@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import random
 import socket
 
 __all__ = ["free_port", "free_ports"]
 
 
-# None that the system gives to whoever asks for any.
-_UNTRIED = iter(random.SystemRandom().sample(range(20_000, 32_000), 12_000))
+# Each test process has its own, and none that the system gives to whoever asks for any.
+_WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+_OWN = range(20_000 + _WORKER, 32_000, int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")))
+_UNTRIED = iter(random.SystemRandom().sample(_OWN, len(_OWN)))
 
 
 def free_port() -> int:

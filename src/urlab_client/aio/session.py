@@ -238,7 +238,7 @@ class Session:
 
     async def exchange(self, request: Request[R], op: Op, limits: Limits) -> R | OpStarted:
         """Send a request and return its answer; for whoever holds the line."""
-        if isinstance(request, ControlRequest):
+        if self.features.claims and isinstance(request, ControlRequest):
             return await self.control.send(request, self._ask, limits)
         return await self._answer(request, op, limits)
 
@@ -390,7 +390,7 @@ class Turn:
         sent: Whether the request of the latest `call` left, so that the server may have executed it.
     """
 
-    __slots__ = ("_began", "_each", "_first", "_op", "_ready", "_session", "_timeout", "sent")
+    __slots__ = ("_asked", "_began", "_each", "_first", "_op", "_ready", "_session", "_timeout", "sent")
 
     def __init__(self, session: Session, op: Op, timeout: Timeout, *, each: bool) -> None:
         self.sent = False
@@ -398,6 +398,7 @@ class Turn:
         self._op = op
         self._timeout: Timeout = timeout
         self._each = each
+        self._asked: Limits | None = None
         self._began = 0.0
         self._first = True
         self._ready = False
@@ -405,10 +406,10 @@ class Turn:
     async def __aenter__(self) -> Self:
         session, op = self._session, self._op
         self._began = session.bound_loop().time()
-        deadline = session.limits(op, self._timeout, self._began).deadline
-        await session.acquire(session.turns, op, deadline)
+        limits = self._asked = session.limits(op, self._timeout, self._began)
+        await session.acquire(session.turns, op, limits.deadline)
         try:
-            await self._take_line(deadline)
+            await self._take_line(limits.deadline)
         except BaseException:
             session.turns.release()
             raise
@@ -433,7 +434,10 @@ class Turn:
         """
         session, op = self._session, op_of(request)
         session.check_offered(op)
-        limits = self._limits(op, takes)
+        limits = self._asked
+        if limits is None or op is not self._op or takes is not None:
+            limits = self._limits(op, takes)
+        self._asked = None
         self._first = False
         stats = session.transport.stats
         before = stats.sent

@@ -239,15 +239,17 @@ class SimState:
 
     def _ours(self) -> list[MirroredArticulation]:
         # A server whose robots have owners refuses a step that writes to others' robots, so it hears of ours only.
-        claims = self.session.features.claims
-        return [record for record in self._records.values() if record.driven or not claims]
+        records = self._records.values()
+        return [record for record in records if record.driven] if self.session.features.claims else [*records]
 
     def take_wrenches(self) -> Carried:
         """Take what the step that is being built carries out of its buffers."""
-        records: list[MirroredEntity] = [*self._ours()]
+        carried: Carried = {record: record.take_wrenches() for record in self._ours() if record.wrenches}
         if self._records or not self.session.features.claims:
-            records.extend(self._entity_records.values())
-        return {record: record.take_wrenches() for record in records if record.wrenches}
+            for record in self._entity_records.values():
+                if record.wrenches:
+                    carried[record] = record.take_wrenches()
+        return carried
 
     def require_handshake(self, op: str) -> None:
         """Refuse an op that goes by what a handshake said, when that is not known.
