@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -147,3 +148,22 @@ def test_whatever_else_a_newer_release_writes_is_an_error(body: str) -> None:
         _mujoco.without_newer_attributes(
             f"<mujoco><worldbody>{body}</worldbody></mujoco>", mujoco.MjModel.from_xml_string
         )
+
+
+NEWER = re.compile(
+    r"\.(nactuator|actuator_(ctrl|out)(adr|num)|mj_resetCtrl|mju_threadpool|dedup_assets|savecompiled|encode\(str)\b"
+    r"|from mujoco\.batch|model\.opt = "
+)
+"""What releases that are allowed do not have."""
+
+
+def test_one_module_alone_uses_what_older_releases_lack() -> None:
+    package = Path(_mujoco.__file__).parent
+    found = [
+        f"{path.relative_to(package)}:{number}: {line.strip()}"
+        for path in package.rglob("*.py")
+        if path.name != "_mujoco.py"
+        for number, line in enumerate(path.read_text("utf-8").splitlines(), 1)
+        if NEWER.search(line)
+    ]
+    assert found == []

@@ -4,7 +4,8 @@ Run: python tools/check_versions.py [ENVIRONMENT ...] [--keep FOLDER] [-- PYTEST
 
 Each environment is made afresh with this interpreter's venv and pip. `lowest` has every core dependency at the version
 that pyproject.toml allows as the lowest; the others have one release of MuJoCo each. The core is what depends on these:
-protocol, both clients, server, conformance and Gymnasium environments. Exit code 1 says that tests failed somewhere.
+protocol, both clients, server, conformance and Gymnasium environments. Then a client there drives a server of this
+interpreter's, which so needs the package, too, and the other way round. Exit code 1 says that something failed.
 """
 
 from __future__ import annotations
@@ -87,6 +88,10 @@ def main() -> int:
             print(f"=== {name}: exit code {done.returncode}, {time.monotonic() - started:.0f} s", flush=True)
             if done.returncode:
                 failed.append(name)
+            for client, server in ((str(python), sys.executable), (sys.executable, str(python))):
+                done = subprocess.run([client, "tools/drive_other_release.py", server], cwd=ROOT, check=False)  # noqa: S603
+                if done.returncode:
+                    failed.append(f"{name} with {sys.executable}")
     if failed:
         print(f"failed: {', '.join(failed)}", file=sys.stderr)
     return 1 if failed else 0

@@ -361,7 +361,7 @@ async def test_pixels_become_what_the_reference_says(plugin: Any, connect: Any) 
         cams = client.articulations["robot"].cameras
         real = {"width": 2.0, "height": 1.0, "dtype": "bgra8", "data": bytes([1, 2, 3, 0, 4, 5, 6, 7])}
         depth = {"width": 2.0, "height": 1.0, "dtype": "float32", "data": np.array([150, 25], "<f4").tobytes()}
-        plugin.cameras = {"c1": real, "robot/c10": depth}
+        plugin.cameras = {"robot/c1": real, "robot/c10": depth}
         await client.step(include_cameras={"c1": "sync", "robot/c10": "latest"})
         assert cams["c1"].latest_frame.tolist() == [[[3, 2, 1, 255], [6, 5, 4, 255]]]
         assert cams["c10"].mode is CameraMode.DEPTH

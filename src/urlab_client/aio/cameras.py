@@ -50,6 +50,11 @@ class URLabCameraView:
         return self.pictures.newest()[1]
 
     @property
+    def frame_id(self) -> int | None:
+        """Which snapshot of the state the newest frame shows, to be compared with `StepOk.frame_id`; None if unsaid."""
+        return self.pictures.frame_id()
+
+    @property
     def mode(self) -> CameraMode | str:
         """What its pixels mean; a plain string for a mode this client does not know."""
         return known(CameraMode, self.info.mode)

@@ -20,6 +20,7 @@ from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.explain import diagnose
 from urlab_client.aio.launch import SCHEME, LaunchedTransport
+from urlab_client.aio.live.camera_switch import CameraSwitch
 from urlab_client.aio.live.publishers import Publishers
 from urlab_client.aio.model.mirror import model_names
 from urlab_client.aio.model.numbers import finite
@@ -176,6 +177,7 @@ class URLabClient:
             keys=keys,
             memory=memory,
         )
+        self._publishers.camera_switch = CameraSwitch(self._session, self._publishers.subscriptions.refresh)
         self._state = SimState(
             self._session,
             self._publishers,
@@ -423,7 +425,8 @@ class URLabClient:
         Args:
             n_steps: Physics steps, at least 1; at least 0 in `puppet`. Not used in `live`.
             include_cameras: True for the newest frame of every camera, or camera name to `sync` (rendered after the
-                step) or `latest`. Ignored in live mode.
+                step) or `latest`. A `sync` picture that came out older than the step is left out of the reply, as one
+                that did not come. Ignored in live mode by servers that draw in the other modes only.
             observations: Level of this reply alone; default the level of the session.
             timeout: Seconds to wait; None waits without limit.
 
@@ -623,7 +626,10 @@ class URLabClient:
         promoted_from = self._state.promoted_from
         self._publishers.close()
         try:
-            await self._session.control.aclose(connected=self.connected and self.manager_present)
+            playing = self.connected and self.manager_present
+            if self._publishers.camera_switch is not None:
+                await self._publishers.camera_switch.aclose(connected=playing)
+            await self._session.control.aclose(connected=playing)
             await self._watch.aclose()
             await asyncio.sleep(0)  # a blocking client notices only now that the server has gone meanwhile
             if promoted_from is not None and self.connected and self.manager_present:

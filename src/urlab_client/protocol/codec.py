@@ -36,6 +36,7 @@ __all__ = [
     "decode_answer",
     "decode_job",
     "decode_reply",
+    "encode_message",
     "encode_reply",
     "encode_request",
     "from_wire_array",
@@ -100,6 +101,11 @@ def _to_wire(value: Any) -> Any:
 
 _encoder = msgspec.msgpack.Encoder(enc_hook=_to_wire)
 _json_encoder = msgspec.json.Encoder(enc_hook=_to_wire)
+
+
+def encode_message(message: Struct) -> bytes:
+    """Return a published message in msgpack, its numbers as they are."""
+    return _encoder.encode(message)
 
 
 def encode_request(request: Request[Any], session_id: str, *, json: bool = False) -> bytes:

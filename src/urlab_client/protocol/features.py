@@ -131,6 +131,11 @@ class Features(Struct, frozen=True, kw_only=True):
         return not self._beta_state
 
     @property
+    def level_sticks(self) -> bool:
+        """The observation level of a step holds for later steps, too."""
+        return not self._beta_state
+
+    @property
     def idles_in_puppet(self) -> bool:
         """Physics takes steps of its own between the pushes of puppet mode, unless it is paused."""
         return self._beta_state

@@ -44,6 +44,7 @@ __all__ = [
     "TwistRow",
     "articulation_filter",
     "camera_filter",
+    "camera_header",
     "check_picture_size",
     "decode_camera",
     "decode_gains",
@@ -760,6 +761,19 @@ def _target(mode: CameraMode | str, width: int, height: int, out: Pixels | None)
     if out.shape != shape or out.dtype != dtype or not out.flags.c_contiguous:
         raise ValueError(f"out is {out.dtype} {out.shape}, expected C-contiguous {dtype} {shape}")
     return out
+
+
+def camera_header(frame_id: int, sim_time: float, width: int, height: int, captured: float) -> bytes:
+    """Return what newer servers put before the pixels of a streamed picture.
+
+    Args:
+        frame_id: Number of the snapshot that it shows.
+        sim_time: Simulation time of that, seconds.
+        width: Columns.
+        height: Rows.
+        captured: When it was taken, Unix seconds.
+    """
+    return _FRAME_HEADERS[2].pack(_FRAME_MAGIC, 2, frame_id, sim_time, width, height, captured)
 
 
 def _frame_header(payload: BytesLike, width: int, height: int, where: object) -> Layout | None:

@@ -85,6 +85,10 @@ class PhysicsConfig:
         return CameraMode.REAL
 
 
+def _no_switch(key: str, *, zmq: bool, shm: bool) -> None:
+    """Stand in for the streams of a server without any."""
+
+
 @dataclass(kw_only=True)
 class ServerCore:
     """A server without its sockets.
@@ -93,6 +97,7 @@ class ServerCore:
         world: The level being edited.
         physics: How play sessions are set up.
         camera_endpoint: Returns where a camera publishes, from articulation key and camera name.
+        switch_camera: Lets a camera, by `ARTICULATION/CAMERA`, stream on its socket and in shared memory, or not.
         dialect: What the generation of the plugin that it speaks for says differently.
         shm_directory: Directory of the shared-memory regions; None without.
         session: The client's session.
@@ -110,6 +115,7 @@ class ServerCore:
     world: EditorWorld
     physics: PhysicsConfig
     camera_endpoint: Callable[[str, str], str]
+    switch_camera: Callable[..., None] = _no_switch
     dialect: Dialect = ALPHA
     shm_directory: str | None = None
     session: ServerSession = field(default_factory=ServerSession)

@@ -558,7 +558,12 @@ class _Opened:
         ports = config.ports
         memory = self._memory = None if config.shm_dir is None else SharedMemoryServer(config.shm_dir, self.health)
         cameras = self._cameras = CameraStreams(
-            health=self.health, host=self.host, port=ports.camera, curve_keys=self.curve_keys, memory=memory
+            health=self.health,
+            host=self.host,
+            port=ports.camera,
+            curve_keys=self.curve_keys,
+            memory=memory,
+            dialect=config.dialect,
         )
         self._streams = StreamServer(
             lambda scene: [
@@ -578,6 +583,7 @@ class _Opened:
             world=EditorWorld(self._content(config), actor_names=config.actor_names),
             physics=config.physics,
             camera_endpoint=cameras.endpoint,
+            switch_camera=cameras.switch,
             dialect=config.dialect,
             instance=self._instance if config.dialect.instance else None,
             shm_directory=None if memory is None else str(memory.directory),

@@ -94,7 +94,11 @@ class DeferredSignals:
         """Put the handlers back, and let those of signals that have arrived run, one by one as Python does."""
         mine = self._on_signal
         # Not those that somebody has replaced meanwhile.
-        aside = [pair for pair in zip(self._numbers, self._handlers) if _get_handler(pair[0]) == mine]  # noqa: B905
+        aside = [
+            (number, _last_in_place(number, handler))
+            for number, handler in zip(self._numbers, self._handlers)  # noqa: B905
+            if _get_handler(number) == mine
+        ]
         try:
             _consume(starmap(_set_handler, aside))
         except BaseException:  # a handler that was back already has raised
@@ -111,6 +115,10 @@ class DeferredSignals:
         outer = getattr(handler, "__self__", None)
         return outer._aside(number) if isinstance(outer, DeferredSignals) else handler  # noqa: SLF001  # our own
 
+    def left_in_place(self, number: int) -> Any:
+        """Return the handler that this stands for though its block is over; None if the block is not."""
+        return None if self._holding else dict(zip(self._numbers, self._handlers, strict=False)).get(number)
+
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         if not self._holding:
             # At the edges of the block, and after it if several signals have struck there: as if it were not aside.
@@ -122,3 +130,11 @@ class DeferredSignals:
             self._undelivered = map(_raise_soon, map(itemgetter(0), self._arrived))
         if self.on_arrival is not None:
             self.on_arrival()
+
+
+def _last_in_place(number: int, handler: Any) -> Any:
+    """Return what a handler stands for that several signals at once have left in place after its block."""
+    owner = getattr(handler, "__self__", None)
+    while isinstance(owner, DeferredSignals) and (before := owner.left_in_place(number)) is not None:
+        handler, owner = before, getattr(before, "__self__", None)
+    return handler

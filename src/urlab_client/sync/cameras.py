@@ -57,6 +57,11 @@ class URLabCameraView(Facade, twin=aio.URLabCameraView):
         return self._aio.sim_time
 
     @property
+    def frame_id(self) -> int | None:
+        """Which snapshot of the state the newest frame shows, to be compared with `StepOk.frame_id`; None if unsaid."""
+        return self._aio.frame_id
+
+    @property
     def mode(self) -> CameraMode | str:
         """What its pixels mean; a plain string for a mode this client does not know."""
         return self._aio.mode

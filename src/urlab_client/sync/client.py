@@ -338,7 +338,8 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
         Args:
             n_steps: Physics steps, at least 1; at least 0 in `puppet`. Not used in `live`.
             include_cameras: True for the newest frame of every camera, or camera name to `sync` (rendered after the
-                step) or `latest`. Ignored in live mode.
+                step) or `latest`. A `sync` picture that came out older than the step is left out of the reply, as one
+                that did not come. Ignored in live mode by servers that draw in the other modes only.
             observations: Level of this reply alone; default the level of the session.
             timeout: Seconds to wait; None waits without limit.
 

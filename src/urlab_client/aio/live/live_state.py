@@ -152,6 +152,7 @@ class LatestPicture(MessageHandler):
         self._message: tuple[bytes, BytesLike] | None = None
         self._pixels: Pixels | None = None
         self._sim_time: float | None = None
+        self._frame_id: int | None = None
         self._running = False
         self._warned = False
 
@@ -171,11 +172,16 @@ class LatestPicture(MessageHandler):
         self._source.detach(self)
         self.newest()  # what the camera is like now may not hold when somebody looks
 
-    def deliver(self, pixels: Pixels, sim_time: float) -> None:
+    def deliver(self, pixels: Pixels, sim_time: float, frame_id: int | None = None) -> None:
         """Take over a picture that a reply carried."""
         with self._lock:
             self._message = None
-            self._pixels, self._sim_time = pixels, sim_time
+            self._pixels, self._sim_time, self._frame_id = pixels, sim_time, frame_id
+
+    def frame_id(self) -> int | None:
+        """Return which snapshot of the state the newest picture shows, as far as it says so. From any thread."""
+        self.newest()
+        return self._frame_id
 
     def newest(self) -> tuple[Pixels | None, float | None]:
         """Return the newest picture and its simulation time, as far as there is one and it has one. From any thread."""
@@ -190,6 +196,7 @@ class LatestPicture(MessageHandler):
                     self._warn(str(error))
                 else:
                     self._pixels, self._sim_time = sample.pixels, sample.sim_time
+                    self._frame_id = sample.frame_id
             return self._pixels, self._sim_time
 
     def on_message(self, topic: bytes, payload: BytesLike) -> None:

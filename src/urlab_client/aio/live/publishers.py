@@ -6,10 +6,12 @@ from collections.abc import Callable, Collection
 
 import numpy as np
 
+from urlab_client.aio.live.camera_switch import CameraSwitch
 from urlab_client.aio.live.sources import (
     CameraSource,
     EventBus,
     HasCamera,
+    OwnSteps,
     RowSource,
     SharedCameraSource,
     SharedStateSource,
@@ -65,6 +67,8 @@ class Publishers:
         subscriptions: What is being received.
         events: What happens to the client.
         regions: What is being received from shared memory; None for a client that does not.
+        camera_switch: Switches cameras on and off; None where they stream anyway.
+        own_steps: Feeds those who receive snapshots from the client's own steps.
     """
 
     def __init__(
@@ -80,6 +84,8 @@ class Publishers:
         self.default_timeout = default_timeout
         self.subscriptions = Subscriptions(keys)
         self.events = EventBus()
+        self.camera_switch: CameraSwitch | None = None
+        self.own_steps = OwnSteps()
         self.regions = None if memory is None else Regions(memory, self.subscriptions)
         self._rpc_endpoint = rpc_endpoint
         self._state_port = state_port
@@ -89,8 +95,8 @@ class Publishers:
         """Return what brings snapshots to a stream of that policy."""
         # A region keeps the newest only.
         if self.regions is None or policy == StreamPolicy.ALL:
-            return StateSource(self.subscriptions, self._state_endpoint)
-        return SharedStateSource(self.regions, self.subscriptions, self._state_endpoint)
+            return StateSource(self.subscriptions, self._state_endpoint, self.own_steps)
+        return SharedStateSource(self.regions, self.subscriptions, self._state_endpoint, self.own_steps)
 
     def rows(
         self,
@@ -106,14 +112,18 @@ class Publishers:
     def camera(self, view: HasCamera, policy: str = StreamPolicy.LATEST) -> CameraSource:
         """Return what brings a camera's pictures to a stream of that policy."""
         if self.regions is None or policy == StreamPolicy.ALL:
-            return CameraSource(self.subscriptions, view, self._host, self._live)
-        return SharedCameraSource(self.regions, self.subscriptions, view, self._host, self._live)
+            return CameraSource(self.subscriptions, view, self._host, live=self._live, switch=self.camera_switch)
+        return SharedCameraSource(
+            self.regions, self.subscriptions, view, self._host, live=self._live, switch=self.camera_switch
+        )
 
     def shared_frame(self, view: HasCamera) -> SharedFrame | None:
         """Return a camera's newest picture in shared memory, None where there is none. From any thread."""
         if self.regions is None:
             return None
-        found = self.regions.view(SharedCameraSource(self.regions, self.subscriptions, view, self._host, self._live))
+        found = self.regions.view(
+            SharedCameraSource(self.regions, self.subscriptions, view, self._host, live=self._live)
+        )
         width, height = view.info.resolution
         if found is None or len(found[0].payload) < width * height * 4:
             return None

@@ -10,13 +10,14 @@ from typing import Protocol
 
 import msgspec
 
+from urlab_client.aio.live.camera_switch import CameraSwitch
 from urlab_client.aio.streams import Stream
 from urlab_client.aio.transport.regions import Place, Regions, SharedPicture
 from urlab_client.aio.transport.subscriber import MessageHandler, Subscription, Subscriptions, client_closed
 from urlab_client.protocol import doorbell
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.errors import ProtocolError
-from urlab_client.protocol.messages.session import CameraInfo
+from urlab_client.protocol.messages.session import CameraInfo, StateReply
 from urlab_client.protocol.messages.streams import (
     CameraSample,
     ClientEvent,
@@ -51,6 +52,7 @@ __all__ = [
     "CameraSource",
     "EventBus",
     "HasCamera",
+    "OwnSteps",
     "RowSource",
     "SharedCameraSource",
     "SharedStateSource",
@@ -127,12 +129,38 @@ class SocketSource(ABC):
         return f"connected to {line.endpoint}, but nothing came {within} on topics {topics}.", self.silent
 
 
+class OwnSteps:
+    """Hands the states in replies to those who receive snapshots, where the server publishes in live mode only."""
+
+    def __init__(self) -> None:
+        self._handlers: dict[MessageHandler, None] = {}
+
+    def __bool__(self) -> bool:
+        return bool(self._handlers)
+
+    def attach(self, handler: MessageHandler) -> None:
+        """Begin to feed `handler`, from the event loop."""
+        self._handlers[handler] = None
+
+    def detach(self, handler: MessageHandler) -> None:
+        """Stop feeding `handler`. Idempotent."""
+        self._handlers.pop(handler, None)
+
+    def publish(self, reply: StateReply) -> None:
+        """Hand a state over."""
+        payload = StateSnapshot.of(reply).encode()
+        for handler in tuple(self._handlers):
+            handler.on_message(STATE_FULL, payload)
+            handler.on_drained()
+
+
 class StateSource(SocketSource):
     """The snapshots of the state socket.
 
     Args:
         subscriptions: The client's.
         endpoint: Tells where the state socket is.
+        own: What brings the states of the client's own steps, where the server publishes none of them.
     """
 
     name = "state_stream"
@@ -142,9 +170,20 @@ class StateSource(SocketSource):
         "state port?"
     )
 
-    def __init__(self, subscriptions: Subscriptions, endpoint: Callable[[], str]) -> None:
+    def __init__(self, subscriptions: Subscriptions, endpoint: Callable[[], str], own: OwnSteps | None = None) -> None:
         super().__init__(subscriptions)
         self._endpoint = endpoint
+        self._own = OwnSteps() if own is None else own
+
+    def attach(self, handler: MessageHandler) -> None:
+        """Begin to feed `handler`, from the event loop."""
+        super().attach(handler)
+        self._own.attach(handler)
+
+    def detach(self, handler: MessageHandler) -> None:
+        """Stop feeding `handler`. Idempotent."""
+        super().detach(handler)
+        self._own.detach(handler)
 
     def subscription(self) -> Subscription:
         """See the base class."""
@@ -269,6 +308,7 @@ class CameraSource(SocketSource):
         view: The camera.
         host: Tells under which name or address the server was reached.
         live: Tells whether the server is in live mode, as far as is known.
+        switch: Switches the camera on and off; None where it always streams.
     """
 
     name = "frames"
@@ -287,12 +327,36 @@ class CameraSource(SocketSource):
         subscriptions: Subscriptions,
         view: HasCamera,
         host: Callable[[], str],
+        *,
         live: Callable[[], bool] = lambda: True,
+        switch: CameraSwitch | None = None,
     ) -> None:
         super().__init__(subscriptions)
         self.view = view
         self._host = host
         self._live = live
+        self._switch = switch
+        self._users: set[MessageHandler] = set()
+
+    def attach(self, handler: MessageHandler) -> None:
+        """Begin to feed `handler`, from the event loop, and switch the camera on."""
+        super().attach(handler)
+        self._use(handler)
+
+    def detach(self, handler: MessageHandler) -> None:
+        """Stop feeding `handler`. Idempotent."""
+        super().detach(handler)
+        self._leave(handler)
+
+    def _use(self, handler: MessageHandler) -> None:
+        if self._switch is not None and handler not in self._users:
+            self._users.add(handler)
+            self._switch.use(self.view.info)
+
+    def _leave(self, handler: MessageHandler) -> None:
+        if self._switch is not None and handler in self._users:
+            self._users.discard(handler)
+            self._switch.leave(self.view.info)
 
     def first_after(self, handler: MessageHandler) -> float:
         """Return how long a server may take until it can draw, where it is there and in live mode; else 0."""
@@ -354,11 +418,27 @@ class SharedStateSource(_SharedMemorySource, StateSource):
         endpoint: Tells where the state socket is.
     """
 
-    def __init__(self, regions: Regions, subscriptions: Subscriptions, endpoint: Callable[[], str]) -> None:
-        super().__init__(subscriptions, endpoint)
+    def __init__(
+        self,
+        regions: Regions,
+        subscriptions: Subscriptions,
+        endpoint: Callable[[], str],
+        own: OwnSteps | None = None,
+    ) -> None:
+        super().__init__(subscriptions, endpoint, own)
         self.regions = regions
         # The socket may be one ahead of the region. Two are never equal: each tells when it was built.
         self._came = deque[BytesLike](maxlen=2)
+
+    def attach(self, handler: MessageHandler) -> None:
+        """See the base classes."""
+        super().attach(handler)
+        self._own.attach(handler)
+
+    def detach(self, handler: MessageHandler) -> None:
+        """See the base classes."""
+        super().detach(handler)
+        self._own.detach(handler)
 
     def place(self) -> Place:
         """See the base class."""
@@ -383,6 +463,7 @@ class SharedCameraSource(_SharedMemorySource, CameraSource):
         view: The camera.
         host: Tells under which name or address the server was reached.
         live: Tells whether the server is in live mode, as far as is known.
+        switch: Switches the camera on and off; None where it always streams.
     """
 
     def __init__(
@@ -391,11 +472,23 @@ class SharedCameraSource(_SharedMemorySource, CameraSource):
         subscriptions: Subscriptions,
         view: HasCamera,
         host: Callable[[], str],
+        *,
         live: Callable[[], bool] = lambda: True,
+        switch: CameraSwitch | None = None,
     ) -> None:
-        super().__init__(subscriptions, view, host, live)
+        super().__init__(subscriptions, view, host, live=live, switch=switch)
         self.regions = regions
         self._taken: SharedPicture | None = None
+
+    def attach(self, handler: MessageHandler) -> None:
+        """See the base classes."""
+        super().attach(handler)
+        self._use(handler)
+
+    def detach(self, handler: MessageHandler) -> None:
+        """See the base classes."""
+        super().detach(handler)
+        self._leave(handler)
 
     def first_after(self, handler: MessageHandler) -> float:
         """See the base class; regions get pictures in every mode."""
@@ -404,7 +497,8 @@ class SharedCameraSource(_SharedMemorySource, CameraSource):
     def place(self) -> Place:
         """See the base class."""
         topic = self.view.info.zmq_topic
-        articulation, _, camera = topic.strip().partition("/camera/")
+        separator = "/camera/" if "/camera/" in topic else "/"
+        articulation, _, camera = topic.strip().partition(separator)
         return Place(camera_file(articulation, camera), camera_filter(topic), doorbell.CAMERA)
 
     def wants(self, topic: bytes, payload: BytesLike) -> bool:

@@ -10,6 +10,7 @@ import math
 import re
 import time
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any, Protocol
@@ -27,7 +28,7 @@ from urlab_client.aio.session import Session, Turn
 from urlab_client.aio.state.handshake import Examined, examine
 from urlab_client.aio.state.recovery import PendingOutcomes, leaves_open
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.enums import LATER_MODE_NAMES, CameraMode, CameraTiming, StepMode
+from urlab_client.protocol.enums import LATER_MODE_NAMES, CameraMode, StepMode
 from urlab_client.protocol.errors import (
     BadMode,
     ModeLocked,
@@ -72,7 +73,7 @@ _ENGINE_NAME = re.compile(r"(?P<stem>.+)_C_(?:\d+|UAID_\w+)")
 _Parts = tuple[
     list[tuple[MirroredArticulation, ArticulationState]],
     list[tuple[MirroredEntity, EntityState]],
-    list[tuple[URLabCameraView, Pixels]],
+    list[tuple[URLabCameraView, Pixels, CameraFrame]],
 ]
 """The parts of a state that fits, each with what it is about."""
 
@@ -362,6 +363,8 @@ class SimState:
         self.pending.play = False
         self._views()  # binds the cameras to what the handshake says of them
         self.publishers.refresh()
+        if self.publishers.camera_switch is not None:
+            self.publishers.camera_switch.restart([view.info for view in self._views()])
         if hello.manager_present and not played:
             self.publishers.events.publish(PlayStarted(articulations=list(self.articulations)))
         if self.on_adopted is not None:
@@ -535,12 +538,12 @@ class SimState:
             entities = [(known[name], state) for name, state in reply.entities.items() if name in known]
             for record, state in entities:
                 record.check_pose(state, op)
-        pictures: list[tuple[URLabCameraView, Pixels]] = []
+        pictures: list[tuple[URLabCameraView, Pixels, CameraFrame]] = []
         if isinstance(reply, StepOk):
             if reply.perturbation is not None:
                 self._check_perturbation(reply.perturbation, op)
             if reply.cameras:
-                pictures = [(view, _pixels(view, frame)) for view, frame in self._frames(reply.cameras)]
+                pictures = [(view, _pixels(view, frame), frame) for view, frame in self._frames(reply.cameras)]
         return articulations, entities, pictures
 
     def _take_over(self, reply: StateReply | StateSnapshot, parts: _Parts, received: int, *, into_mirror: bool) -> None:
@@ -552,12 +555,16 @@ class SimState:
                     record.write_mirror(state)
             for record, state in entities:
                 record.absorb_pose(state, into_mirror=into_mirror)
-            for view, pixels in pictures:
-                view.pictures.deliver(pixels, reply.time)
+            for view, pixels, frame in pictures:
+                taken = reply.time if frame.sim_time is None else frame.sim_time
+                view.pictures.deliver(pixels, taken, frame.frame_id)
             if into_mirror and self.mirror.data is not None:
                 self.mirror.data.time = reply.time
             self.mirror.mark_stale()
             self._absorb_clocks(reply, received)
+        own = self.publishers.own_steps
+        if own and isinstance(reply, StateReply) and not (self.live or self.session.features.publishes_steps):
+            own.publish(reply)
         for observer in self.observers:
             observer.on_state(reply)
 
@@ -634,50 +641,78 @@ class SimState:
             if self.on_adopted is not None:
                 self.on_adopted()
 
-    def note_missing_frames(self, asked: bool | Mapping[str, str | None], reply: StepOk) -> None:
+    def note_missing_frames(self, asked: Iterable[str], reply: StepOk) -> None:
         """Mark the cameras whose frame was asked for and did not come: the server just leaves them out."""
-        if isinstance(asked, bool):
-            views = [view for art in self.articulations.values() for view in art.cameras.values()] if asked else []
-        else:
-            views = [view for view in map(self.camera, asked) if view is not None]
+        views = [view for view in map(self.camera, asked) if view is not None]
         came = {id(self.camera(name)) for name in reply.cameras or {}}
         for view in views:
             if view.delivered and id(view) not in came:
                 log.warning("camera %s delivered no frame; its latest_frame is older than the state", view.name)
             view.delivered = id(view) in came
 
-    def wanted_pictures(self, include: bool | Mapping[str, str | CameraTiming]) -> bool | dict[str, str | None]:
-        """Return `include_cameras` as it travels.
-
-        Raises:
-            KeyError: There is no such camera.
-        """
-        if isinstance(include, bool):
-            return include
-        for name in include:
-            if self.camera(name) is None:
-                known = [f"{art.prefix}/{camera}" for art in self.articulations.values() for camera in art.cameras]
-                raise KeyError(f"no camera {name!r}; there are: {', '.join(known) or 'none'}")
-        return {name: str(CameraTiming(timing)) for name, timing in include.items()}
-
     def _frames(self, cameras: Mapping[str, CameraFrame]) -> list[tuple[URLabCameraView, CameraFrame]]:
         found: list[tuple[URLabCameraView, CameraFrame]] = []
         for name, frame in cameras.items():
-            view = self.camera(name)
+            view = self.camera(name) or self._scene_camera(name, frame)
             if view is None:
                 raise ProtocolError(f"step: a frame of camera {name!r}, which the handshake does not list.", op="step")
             found.append((view, frame))
         return found
 
-    def camera(self, name: str) -> URLabCameraView | None:
-        """Return the camera that the wire calls `<articulation>/<camera>` or just `<camera>`, or None."""
-        prefix, slash, short = name.rpartition("/")
+    def _scene_camera(self, name: str, frame: CameraFrame) -> URLabCameraView | None:
+        """Return a view of a camera of the scene that was announced by its picture alone."""
+        if not self.hidden_cameras:
+            return None
+        mode = CameraMode.DEPTH if frame.dtype == "float32" else CameraMode.REAL
+        info = CameraInfo(mode=mode, resolution=(frame.width, frame.height), fovy=0.0, zmq_endpoint="", zmq_topic=name)
+        view = URLabCameraView(name, info, self.publishers)
+        self.global_cameras = NameMap({**self.global_cameras, name: view}, kind="camera")
+        return view
+
+    def camera_names(self) -> list[str]:
+        """Return a name of each camera that no other has: `<articulation>/<camera>`, or the scene's."""
+        own = [f"{art.prefix}/{name}" for art in self.articulations.values() for name in art.cameras]
+        return [*own, *self.global_cameras]
+
+    def shown_cameras(self, names: Iterable[str]) -> dict[str, str]:
+        """Return what users call cameras by `camera_names`: by the name alone where that means one of them."""
+        short = {name: name.rpartition("/")[2] for name in names}
+        counts = Counter(short.values())
+        return {name: bare if counts[bare] == 1 else name for name, bare in short.items()}
+
+    def camera_name(self, name: str) -> str:
+        """Return which of `camera_names` a user means by `<articulation>/<camera>` or just `<camera>`.
+
+        Raises:
+            KeyError: None of them, or several.
+        """
+        names = self.camera_names()
+        owner, slash, short = name.rpartition("/")
         if slash:
-            art = self.articulations.get(prefix)
-            return None if art is None else art.cameras.get(short)
-        # As on the server, the articulation listed last wins when several have a camera of that name.
-        owners = [art for art in self.articulations.values() if name in art.cameras]
-        return owners[-1].cameras[name] if owners else self.global_cameras.get(name)
+            art = self.articulations.get(owner)
+            found = [f"{art.prefix}/{short}"] if art is not None and short in art.cameras else []
+        else:
+            found = [known for known in names if known == name or known.endswith(f"/{name}")]
+        if not found:
+            raise KeyError(f"no camera {name!r}; there are: {', '.join(names) or 'none'}")
+        if len(found) > 1:
+            raise KeyError(f"camera {name!r} is ambiguous: it could mean {' or '.join(map(repr, found))}")
+        return found[0]
+
+    @property
+    def hidden_cameras(self) -> bool:
+        """Whether the scene may have cameras that the handshake does not list."""
+        return any("/" in name for record in self._records.values() for name in record.info.camera_topics)
+
+    def camera(self, name: str) -> URLabCameraView | None:
+        """Return the camera that a user means by `<articulation>/<camera>` or just `<camera>`, or None."""
+        if name in self.global_cameras:
+            return self.global_cameras[name]
+        try:
+            owner, _, short = self.camera_name(name).rpartition("/")
+        except KeyError:
+            return None
+        return self.articulations[owner].cameras[short] if owner else self.global_cameras[short]
 
 
 def _listed(keys: Iterable[str]) -> str:

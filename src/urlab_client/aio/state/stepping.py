@@ -9,14 +9,13 @@ from urlab_client.aio.model.articulation_state import Carried, give_back
 from urlab_client.aio.session import Turn
 from urlab_client.aio.state.recovery import leaves_open
 from urlab_client.aio.state.sim_state import SimState
+from urlab_client.aio.state.step_pictures import StepPictures
 from urlab_client.protocol.codec import op_of
 from urlab_client.protocol.enums import CameraTiming, StepMode
 from urlab_client.protocol.errors import StepTimeout, URLabError
-from urlab_client.protocol.messages.session import CameraChoice, Step, StepOk
+from urlab_client.protocol.messages.session import Step, StepOk
 
 __all__ = ["take_steps"]
-
-_SYNC_CAMERA_S = 3.0  # the server waits up to 2 s + 1 s for each
 
 Cameras = bool | Mapping[str, "str | CameraTiming"]
 
@@ -38,13 +37,13 @@ async def take_steps(state: SimState, turn: Turn, n_steps: int, cameras: Cameras
     if n_steps < (0 if mode is StepMode.PUPPET else 1):
         raise ValueError(_too_few(n_steps, mode))
     if mode is StepMode.LIVE and not state.mode_assumed:
-        return await _live_step(state, turn)
+        return await _live_step(state, turn, _pictures(state, cameras, n_steps))
     pictures = _pictures(state, cameras, n_steps)
     request, carried = _puppet_step(state, n_steps) if mode is StepMode.PUPPET else _direct_step(state, n_steps)
-    request.include_cameras = pictures
+    pictures.ask(request)
     assumed, before, session = state.mode_assumed, state.step_count, state.session.session_id
     try:
-        reply = await _exchange(state, turn, request, level or state.level)
+        reply = await _exchange(state, turn, request, level or state.level, pictures)
         state.absorb(reply, "step", into_mirror=mode is not StepMode.PUPPET)
     except BaseException as error:
         if turn.sent and leaves_open(error):
@@ -61,33 +60,41 @@ async def take_steps(state: SimState, turn: Turn, n_steps: int, cameras: Cameras
         if state.mode is StepMode.PUPPET and mode is not StepMode.PUPPET:
             return await take_steps(state, turn, n_steps, cameras, level)  # all it has done is to set the clock
     if pictures and state.mode is not StepMode.LIVE:
-        state.note_missing_frames(pictures, reply)
+        state.note_missing_frames(pictures.names, reply)
     if state.mode is StepMode.PUPPET:
         with state.mirror.lock:
             state.mirror.perturb(reply.perturbation)
     return reply
 
 
-async def _exchange(state: SimState, turn: Turn, request: Step, level: str) -> StepOk:
+async def _exchange(state: SimState, turn: Turn, request: Step, level: str, pictures: StepPictures) -> StepOk:
     if level != state.sent_level:
         request.observations = level
     session = state.session.session_id
     state.sent_level = ""  # unknown to us until the server has answered
-    reply = await turn.call(request, takes=_seconds(request.include_cameras))
+    reply = await turn.call(request, takes=_seconds(pictures))
     if state.session.session_id == session:  # else it has the level of a handshake that was given up
-        state.sent_level = level
+        state.sent_level = level if state.session.features.level_sticks else state.level
+    pictures.take(reply)
     return reply
 
 
-async def _live_step(state: SimState, turn: Turn) -> StepOk:
+async def _live_step(state: SimState, turn: Turn, pictures: StepPictures) -> StepOk:
+    drawn = bool(pictures) and state.session.features.live_pictures_in_steps
     carried = state.take_wrenches()  # of no effect on servers that do not take them in this mode
     try:
-        reply = await turn.call(Step(per_articulation=state.live_commands(carried) or None))
+        request = Step(per_articulation=state.live_commands(carried) or None)
+        if drawn:
+            pictures.ask(request)
+        reply = await turn.call(request, takes=_seconds(pictures) if drawn else None)
+        pictures.take(reply)
         state.absorb(reply, "step")
     except BaseException as error:
         if not (turn.sent and leaves_open(error)):
             give_back(carried)
         raise
+    if drawn:
+        state.note_missing_frames(pictures.names, reply)
     return reply
 
 
@@ -149,11 +156,12 @@ def _learn_mode(state: SimState, request: Step, reply: StepOk, advanced: int) ->
         )
 
 
-def _pictures(state: SimState, cameras: Cameras, n_steps: int) -> bool | dict[str, str | None]:
-    pictures = state.wanted_pictures(cameras)
+def _pictures(state: SimState, cameras: Cameras, n_steps: int) -> StepPictures:
+    asked: bool | dict[str, str | None]
+    asked = cameras if isinstance(cameras, bool) else {name: str(CameraTiming(how)) for name, how in cameras.items()}
     for observer in state.observers:
-        pictures = observer.wanted_pictures(pictures, n_steps)
-    return pictures
+        asked = observer.wanted_pictures(asked, n_steps)
+    return StepPictures(state, asked)
 
 
 def _too_few(n_steps: int, mode: StepMode) -> str:
@@ -162,7 +170,6 @@ def _too_few(n_steps: int, mode: StepMode) -> str:
     return f"step: n_steps is at least 1 in step mode {mode}, got {n_steps}; only a puppet step may take none"
 
 
-def _seconds(pictures: CameraChoice) -> float | None:
+def _seconds(pictures: StepPictures) -> float | None:
     """Return how long a step may take the server that has to wait for pictures; None for as long as any other."""
-    waits = 0 if isinstance(pictures, bool) else sum(timing == CameraTiming.SYNC for timing in pictures.values())
-    return (op_of(Step).timeout or 0.0) + _SYNC_CAMERA_S * waits if waits else None
+    return (op_of(Step).timeout or 0.0) + pictures.seconds if pictures.seconds else None

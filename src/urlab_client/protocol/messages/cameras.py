@@ -21,11 +21,11 @@ __all__ = [
 ]
 
 
-class CameraSwitch(Struct, kw_only=True):
-    """Where a camera is to stream; what is not mentioned is switched off."""
+class CameraSwitch(Struct, kw_only=True, omit_defaults=True):
+    """Where a camera is to stream: what is not mentioned is switched off, unless nothing is mentioned."""
 
-    zmq: Annotated[bool, doc("On its socket.")] = True
-    shm: Annotated[bool, doc("In shared memory.")] = True
+    zmq: Annotated[bool | None, doc("On its socket.")] = None
+    shm: Annotated[bool | None, doc("In shared memory.")] = None
 
 
 class CameraStreaming(Struct, kw_only=True, omit_defaults=True):

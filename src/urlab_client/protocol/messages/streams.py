@@ -9,10 +9,10 @@ import msgspec
 from msgspec import Struct
 
 from urlab_client.protocol.base import doc
-from urlab_client.protocol.codec import from_wire_array
+from urlab_client.protocol.codec import encode_message, from_wire_array
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.errors import ProtocolError
-from urlab_client.protocol.messages.session import ArticulationState, Clock, EntityState
+from urlab_client.protocol.messages.session import ArticulationState, Clock, EntityState, StateReply, StepOk
 from urlab_client.protocol.rows import BytesLike, Pixels, Row, TopicKind
 
 __all__ = [
@@ -99,6 +99,23 @@ class StateSnapshot(StreamItem, tag_field="op", tag="state_full", kw_only=True, 
             self.per_articulation = self.arts
         if self.scene is not None:
             self.entities = self.scene
+
+    @classmethod
+    def of(cls, reply: StateReply) -> StateSnapshot:
+        """Return the state in a reply as a snapshot."""
+        now = Clock(sec=int(reply.time), nsec=int(reply.time % 1.0 * 1e9))
+        return cls(
+            time=reply.time,
+            step=reply.step,
+            sim_time=reply.sim_time or now,
+            wall_time=reply.wall_time or Clock(sec=0, nsec=0),
+            per_articulation=reply.per_articulation,
+            entities=(reply.entities or {}) if isinstance(reply, StepOk) else {},
+        )
+
+    def encode(self) -> bytes:
+        """Return the msgpack map of a `state/full` message."""
+        return encode_message(self)
 
     @classmethod
     def decode(cls, payload: BytesLike, where: object = "") -> StateSnapshot:

@@ -1,6 +1,7 @@
 """The op handlers. Importing this package registers all of them; ops without one answer `unsupported`."""
 
 from urlab_client.server.handlers import (
+    cameras,
     control,
     debug,
     options,
@@ -17,6 +18,7 @@ from urlab_client.server.rpc.dispatch import HANDLERS
 
 __all__ = [
     "HANDLERS",
+    "cameras",
     "control",
     "debug",
     "options",

@@ -14,6 +14,7 @@ from urlab_client.protocol.enums import ObservationLevel, StepMode
 from urlab_client.protocol.messages.control import UNCLAIMED
 from urlab_client.protocol.messages.session import (
     ArticulationInfo,
+    CameraFrame,
     CameraInfo,
     ControllerInfo,
     EntityInfo,
@@ -172,7 +173,9 @@ def step(server: ServerCore, request: Step) -> StepOk | bytes:
         if running.engine.mode in (StepMode.DIRECT, StepMode.PUPPET):
             server.session.level = level
         level = server.session.level
-    shots = running.cameras.shots(request.include_cameras)
+    forms = server.dialect.camera_forms
+    fresh = forms and (request.wait_cameras or request.render == "sync")
+    shots = running.cameras.shots(request.include_cameras, fresh=fresh)
 
     if not shots:
         if server.session.json or running.engine.replay is not None or running.channels.declared:
@@ -181,13 +184,23 @@ def step(server: ServerCore, request: Step) -> StepOk | bytes:
         return engine.step(request, lambda _: encode(level, engine.time, engine.step_count, engine.frame_id))
 
     def observe(mode: StepMode) -> tuple[StepOk, StepMode, Exposure | None]:
-        stepped = mode in (StepMode.DIRECT, StepMode.PUPPET) or server.dialect.camera_forms
-        return _observe_step(running, level), mode, running.cameras.capture(shots) if stepped else None
+        stepped = forms or mode in (StepMode.DIRECT, StepMode.PUPPET)
+        exposure = running.cameras.capture(shots, running.engine.frame_id) if stepped else None
+        return _observe_step(running, level), mode, exposure
 
     reply, mode, exposure = running.engine.step(request, observe)
-    if exposure is not None or mode in (StepMode.DIRECT, StepMode.PUPPET):
-        reply.cameras = running.cameras.frames(shots, exposure)
+    if forms or mode in (StepMode.DIRECT, StepMode.PUPPET):
+        reply.cameras = _wanted(request, running.cameras.frames(shots, exposure))
     return reply
+
+
+def _wanted(request: Step, frames: dict[str, CameraFrame] | None) -> dict[str, CameraFrame] | None:
+    """Leave out pictures of snapshots before the ones that a request names."""
+    asked = request.include_cameras
+    if frames is None or isinstance(asked, bool):
+        return frames
+    least = {key: kind.get("frame_id", 0.0) for key, kind in asked.items() if isinstance(kind, dict)}
+    return {key: frame for key, frame in frames.items() if (frame.frame_id or 0) >= least.get(key, 0.0)} or None
 
 
 def _check_owners(server: ServerCore, running: Running, request: Step) -> None:

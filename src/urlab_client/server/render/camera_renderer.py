@@ -270,12 +270,14 @@ class Exposure:
         cameras: The cameras.
         data: The state.
         taken_at: When it was the state, monotonic seconds.
+        frame_id: Number of its snapshot; None in dialects whose pictures do not tell.
         done: Set when the cameras have their frames, or never will.
     """
 
     cameras: Sequence[_Camera]
     data: mujoco.MjData
     taken_at: float
+    frame_id: int | None = None
     done: threading.Event = field(default_factory=threading.Event)
 
 
@@ -325,6 +327,7 @@ class CameraRenderer:
         self._health = Health() if health is None else health
         self._quality: RenderQuality = quality
         self._tints = _Tints(scene, classes)
+        self._stamped = dialect.camera_forms
         self._by_name: dict[str, _Camera] = {}
         self._bare: dict[str, _Camera] = {}
         for index in scene.articulations:
@@ -348,15 +351,23 @@ class CameraRenderer:
         """All cameras as `ARTICULATION/CAMERA`."""
         return list(self._by_name)
 
-    def shots(self, include_cameras: CameraChoice) -> list[Shot]:
-        """Return what a request's `include_cameras` asks for; unknown names are left out."""
+    def shots(self, include_cameras: CameraChoice, *, fresh: bool = False) -> list[Shot]:
+        """Return what a request's `include_cameras` asks for; unknown names are left out.
+
+        Args:
+            include_cameras: The request's field.
+            fresh: Whether every picture is to show the state after the step.
+        """
         if isinstance(include_cameras, bool):
-            return [Shot(key, camera, sync=False) for key, camera in self._bare.items()] if include_cameras else []
+            return [Shot(key, camera, sync=fresh) for key, camera in self._bare.items()] if include_cameras else []
         shots: list[Shot] = []
         for key, kind in include_cameras.items():
             camera = self._by_name.get(key) or self._bare.get(key)
             if camera is not None and kind is not None:
-                shots.append(Shot(key, camera, sync=isinstance(kind, str) and kind.lower() == "sync"))
+                # A picture from some snapshot on is asked for: that of now is one, if there is any.
+                later = self._stamped and not isinstance(kind, str)
+                sync = fresh or later or (isinstance(kind, str) and kind.lower() == "sync")
+                shots.append(Shot(key, camera, sync=sync))
         return shots
 
     def frame_bytes(self, include_cameras: CameraChoice) -> int:
@@ -368,8 +379,12 @@ class CameraRenderer:
         """Return width and height of all cameras by `ARTICULATION/CAMERA`."""
         return {key: camera.info.resolution for key, camera in self._by_name.items()}
 
-    def capture(self, shots: Iterable[Shot]) -> Exposure | None:
+    def capture(self, shots: Iterable[Shot], frame_id: int = 0) -> Exposure | None:
         """Copy the state that `frames` draws; the caller holds the engine's lock.
+
+        Args:
+            shots: What is asked for.
+            frame_id: Number of the state's snapshot.
 
         Returns:
             What to hand to `frames`; None if nothing has to be drawn.
@@ -378,7 +393,7 @@ class CameraRenderer:
         cameras = list(dict.fromkeys(shot.camera for shot in shots if shot.sync or shot.camera.stale(now)))
         if not cameras or self._broken:
             return None
-        return Exposure(cameras, self._copy_state(), now)
+        return Exposure(cameras, self._copy_state(), now, frame_id if self._stamped else None)
 
     def frames(self, shots: Sequence[Shot], job: Exposure | None) -> dict[str, CameraFrame] | None:
         """Draw what has to be drawn and return the frames by the request's keys; None without any.
@@ -517,7 +532,10 @@ class CameraRenderer:
         for camera in job.cameras:
             if self._closed:
                 return
-            camera.frame = stage.draw(job.data, camera.info, camera.mode)
+            frame = stage.draw(job.data, camera.info, camera.mode)
+            if job.frame_id is not None:
+                frame.frame_id, frame.sim_time = job.frame_id, float(job.data.time)
+            camera.frame = frame
             camera.drawn_at = job.taken_at
 
 

@@ -17,8 +17,10 @@ from typing import Final
 import zmq
 
 from urlab_client._uninterrupted import uninterrupted
+from urlab_client.protocol.dialects import ALPHA, Dialect
 from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.rows import camera_filter
+from urlab_client.protocol.messages.session import CameraFrame
+from urlab_client.protocol.rows import camera_filter, camera_header
 from urlab_client.server.physics.play import Running
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.system.health import Health
@@ -71,11 +73,10 @@ class _Stream:
                     self._filters.discard(message[1:])
         return bool(self.key) and any(self.topic.startswith(prefix) for prefix in self._filters)
 
-    def show(self, key: str) -> None:
+    def show(self, key: str, topic: str) -> None:
         """Publish a camera from now on, by `ARTICULATION/CAMERA`; none, if it is empty."""
-        articulation, _, camera = key.partition("/")
         self.key = key
-        self.topic = camera_filter(f"{articulation}/camera/{camera}")
+        self.topic = camera_filter(topic)
 
 
 class CameraStreams:
@@ -94,6 +95,7 @@ class CameraStreams:
         port: int,
         curve_keys: CurveKeys | None = None,
         memory: SharedMemoryServer | None = None,
+        dialect: Dialect = ALPHA,
     ) -> None:
         """Bind the first port.
 
@@ -103,12 +105,16 @@ class CameraStreams:
             port: Port of the first camera; the others get the free ones after it. 0 picks any.
             door: Who may connect; None for anybody who reaches the interface.
             memory: Shared memory that gets the images as well, in every mode.
+            dialect: Decides what streams when, under which topic and with what in front.
 
         Raises:
             PortInUse: Somebody has the port.
             OSError: The address is not one of this machine.
         """
         self.filter: Callable[[bytes, bytes], bytes | None] | None = None
+        self._dialect = dialect
+        self._zmq_on: set[str] = set()
+        self._shm_on: set[str] = set()
         self._host = host
         self._memory = memory
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
@@ -155,16 +161,41 @@ class CameraStreams:
                 stream.socket.close()
             del self._streams[1:]
             keys = [] if running is None else running.cameras.keys
+            on = self._dialect.cameras_on
+            self._zmq_on = set(keys) if on else set()
+            self._shm_on = set(keys) if on else set()
             if self._memory is not None:
-                self._memory.show_cameras({} if running is None else running.cameras.resolutions())
-            self._streams[0].show(keys[0] if keys else "")
+                shown = running.cameras.resolutions() if on and running is not None else {}
+                self._memory.show_cameras(shown, self._header_bytes)
+            first = keys[0] if keys else ""
+            self._streams[0].show(first, self._topic(first))
             for key in keys[1:]:
                 stream = self._next_free()
                 if stream is None:
                     logger.warning("no free port for camera '%s' and those after it; they have no stream", key)
                     break
-                stream.show(key)
+                stream.show(key, self._topic(key))
                 self._streams.append(stream)
+
+    def switch(self, key: str, *, zmq: bool, shm: bool) -> None:
+        """Let a camera of the play session stream on its socket, in shared memory, on both or not at all."""
+        with self._lock:
+            running = self._running
+            if running is None:
+                return
+            for on, wanted in ((self._zmq_on, zmq), (self._shm_on, shm)):
+                (on.add if wanted else on.discard)(key)
+            if self._memory is not None:
+                size = running.cameras.resolutions()[key] if shm else None
+                self._memory.switch_camera(key, size, self._header_bytes)
+
+    def _topic(self, key: str) -> str:
+        robot, _, camera = key.partition("/")
+        return self._dialect.camera_topic(robot, camera)
+
+    @property
+    def _header_bytes(self) -> int:
+        return len(camera_header(0, 0.0, 0, 0, 0.0)) if self._dialect.camera_headers else 0
 
     def stop(self) -> None:
         """Ask the thread to end."""
@@ -211,10 +242,11 @@ class CameraStreams:
     def _publish(self) -> None:
         with self._lock:
             running = self._running
-            topics = {stream.key: stream.topic for stream in self._streams if stream.wanted()}
+            wanted = [stream for stream in self._streams if stream.wanted()]
+            topics = {stream.key: stream.topic for stream in wanted if stream.key in self._zmq_on}
         if running is None:
             return
-        if running.engine.mode in (StepMode.DIRECT, StepMode.PUPPET):
+        if self._dialect.cameras_on and running.engine.mode in (StepMode.DIRECT, StepMode.PUPPET):
             topics = {}
         shared = [] if self._memory is None else self._memory.wanted_cameras()
         if not (topics or shared):
@@ -222,18 +254,19 @@ class CameraStreams:
         shots = running.cameras.shots(dict.fromkeys([*topics, *shared], "sync"))
         try:
             with running.engine.lock:
-                exposure = running.cameras.capture(shots)
+                exposure = running.cameras.capture(shots, running.engine.frame_id)
+                captured = time.time()
         except Refusal:  # physics is busy; the next time, then
             return
         frames = running.cameras.frames(shots, exposure) or {}
         if self._memory is not None:
             with self._lock:
                 for key, frame in frames.items() if self._running is running else ():
-                    self._memory.publish_picture(key, frame.data)
+                    self._memory.publish_picture(key, self._headed(frame, captured))
         images: dict[str, bytes] = {}
         for key in filter(frames.__contains__, topics):
             try:
-                image = self._filtered(topics[key], frames[key].data)
+                image = self._filtered(topics[key], self._headed(frames[key], captured))
             except Exception as error:  # noqa: BLE001 - the other cameras are none the worse
                 self._skip(f"an image of '{key}' is not published", error)
                 continue
@@ -244,6 +277,12 @@ class CameraStreams:
                 for stream in self._streams:
                     if stream.key in images:
                         stream.socket.send_multipart([stream.topic, images[stream.key]], zmq.DONTWAIT)
+
+    def _headed(self, frame: CameraFrame, captured: float) -> bytes:
+        if not self._dialect.camera_headers:
+            return frame.data
+        sim_time = frame.sim_time or 0.0
+        return camera_header(frame.frame_id or 0, sim_time, frame.width, frame.height, captured) + frame.data
 
     def _filtered(self, topic: bytes, image: bytes) -> bytes | None:
         return image if self.filter is None else self.filter(topic, image)

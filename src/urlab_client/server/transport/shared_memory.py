@@ -192,19 +192,36 @@ class SharedMemoryServer:
 
     # Cameras, on the thread that draws for streams.
 
-    def show_cameras(self, resolutions: dict[str, tuple[int, int]]) -> None:
-        """Lay out the regions of these cameras, by `ARTICULATION/CAMERA`, in place of all others."""
+    def show_cameras(self, resolutions: dict[str, tuple[int, int]], header_bytes: int = 0) -> None:
+        """Lay out the regions of these cameras, by `ARTICULATION/CAMERA`, in place of all others.
+
+        Args:
+            resolutions: Width and height of each.
+            header_bytes: What stands before the pixels.
+        """
         with self._lock:
             for region in self._cameras.values():
                 region.close()
             self._cameras = {}
-            for key, (width, height) in resolutions.items():
-                articulation, _, camera = key.partition("/")
-                try:
-                    path = self.directory / camera_file(articulation, camera)
-                    self._cameras[key] = RegionFile(path, camera_stride(width, height))
-                except (OSError, ProtocolError) as error:
-                    logger.warning("camera '%s' is not in shared memory: %s", key, error)
+        for key, size in resolutions.items():
+            self.switch_camera(key, size, header_bytes)
+
+    def switch_camera(self, key: str, size: tuple[int, int] | None, header_bytes: int = 0) -> None:
+        """Lay out the region of one camera, or with no size take it away; without effect where that is done already."""
+        with self._lock:
+            if size is None:
+                region = self._cameras.pop(key, None)
+                if region is not None:
+                    region.close()
+                return
+            if key in self._cameras:
+                return
+            articulation, _, camera = key.partition("/")
+            try:
+                path = self.directory / camera_file(articulation, camera)
+                self._cameras[key] = RegionFile(path, camera_stride(*size) + header_bytes)
+            except (OSError, ProtocolError) as error:
+                logger.warning("camera '%s' is not in shared memory: %s", key, error)
 
     def wanted_cameras(self) -> list[str]:
         """Return the cameras whose pictures are to be published now."""

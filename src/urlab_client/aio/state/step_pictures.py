@@ -1,0 +1,91 @@
+"""The pictures that a step brings: asked for by the names that mean one camera, handed back under the user's.
+
+For the client's `step`. A picture that was to show the state after the step, and shows an older one, is withheld.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Final
+
+from urlab_client.protocol.enums import CameraTiming
+from urlab_client.protocol.messages.session import CameraFrame, Step, StepOk
+
+if TYPE_CHECKING:
+    from urlab_client.aio.state.sim_state import SimState
+
+__all__ = ["StepPictures"]
+
+log = logging.getLogger("urlab_client.client")
+
+_BLOCKING_S: Final = 3.0  # an alpha waits up to 2 s + 1 s for each picture
+_RENDER_S: Final = 2.0
+
+
+class StepPictures:
+    """The pictures of one step.
+
+    Args:
+        state: The client's state, which knows the cameras.
+        asked: What is wanted: all newest ones, none, or camera to `sync` or `latest`.
+
+    Raises:
+        KeyError: There is no such camera, or several; nothing was sent.
+    """
+
+    def __init__(self, state: SimState, asked: bool | Mapping[str, str | None]) -> None:
+        self._features = state.session.features
+        names = state.camera_names()
+        if isinstance(asked, bool):
+            self._wanted = dict.fromkeys(names, str(CameraTiming.LATEST)) if asked else {}
+            shown = state.shown_cameras(names)
+            self._shown = {name: shown[name] for name in self._wanted}
+        else:
+            self._shown = {state.camera_name(name): name for name in asked}
+            self._wanted = {state.camera_name(name): timing for name, timing in asked.items()}
+        # Asked for all of them, a server that calls two cameras alike brings one. One that has cameras which it does
+        # not announce shows them to nobody else.
+        unique = all("/" not in name for name in self._shown.values())
+        self._all = asked is True and (unique or state.hidden_cameras)
+        self._sync = {name for name, timing in self._wanted.items() if timing == CameraTiming.SYNC}
+
+    def __bool__(self) -> bool:
+        return bool(self._wanted) or self._all
+
+    @property
+    def seconds(self) -> float:
+        """How long the server may take for them, besides the step itself."""
+        if not self._sync:
+            return 0.0
+        return _RENDER_S if self._features.renders_sync else _BLOCKING_S * len(self._sync)
+
+    def ask(self, request: Step) -> None:
+        """Write into a request what it is to ask for, if anything."""
+        if not self:
+            return
+        request.include_cameras = True if self._all else dict(self._wanted)
+        if self._sync and self._features.renders_sync:
+            request.render = "sync"
+            request.camera_timeout_ms = 1000.0 * _RENDER_S
+
+    def take(self, reply: StepOk) -> None:
+        """Bring the pictures of a reply under the user's names, without those that are too old."""
+        if reply.cameras is None:
+            return
+        reply.cameras = {
+            self._shown.get(name, name): frame
+            for name, frame in reply.cameras.items()
+            if not self._too_old(name, frame, reply.frame_id)
+        }
+
+    def _too_old(self, name: str, frame: CameraFrame, step: int | None) -> bool:
+        if name not in self._sync or frame.frame_id is None or step is None or frame.frame_id >= step:
+            return False
+        log.info("camera %s: its picture is of snapshot %d, the step of %d", name, frame.frame_id, step)
+        return True
+
+    @property
+    def names(self) -> list[str]:
+        """The user's names of the cameras whose pictures are to come."""
+        return list(self._shown.values())
