@@ -337,3 +337,27 @@ async def test_play_that_runs_is_left_alone_by_start(connect: Any) -> None:
         assert (await client.sim.start()).is_ready
         assert client.sim_time == time
         assert (await client.step()).time > time
+
+
+@pytest.mark.mujoco("3.11")
+async def test_an_actuator_behind_one_of_several_controls_has_its_own_range_and_place(
+    connect: Any, tmp_path: Path
+) -> None:
+    path = tmp_path / "multi.xml"
+    path.write_text("""
+<mujoco model="multi"><worldbody>
+  <body><joint name="turn" type="ball"/><geom size="0.1"/>
+    <body pos="1 0 0"><joint name="h"/><geom size="0.1"/></body></body>
+</worldbody><actuator>
+  <orientation name="o" joint="turn" kp="3"/>
+  <motor name="last" joint="h" ctrlrange="-2 3" ctrllimited="true"/>
+</actuator></mujoco>""")
+    with SimulatedServer(path, play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        (robot,) = client.articulations.values()
+        assert robot.actuators["last"].ctrlrange == (-2.0, 3.0)
+        assert robot.actuators["o"].ctrlrange is None
+        robot.set_ctrl({"last": 1.5})
+        await client.step()
+        assert robot.ctrl_array.tolist() == robot.last_applied_ctrl.tolist() == [0.0, 0.0, 0.0, 1.5]

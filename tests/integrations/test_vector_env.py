@@ -145,12 +145,17 @@ def test_a_slow_environment_counts_as_failed_and_holds_up_nobody_for_longer(made
         SimulatedServer("arm", play=True) as quick,
     ):
         addresses = [f"{server.address}:{server.step_port}" for server in (quick, slow)]
-        env = URLabVectorEnv(addresses, step_timeout=3.0)
+        everywhere: Any = {
+            "reward_fn": lambda before, action, after, info: np.ones(2),
+            "termination_fn": lambda after, info: np.ones(2, dtype=bool),
+        }
+        env = URLabVectorEnv(addresses, step_timeout=3.0, **everywhere)
         made.append(env)
         env.reset(seed=0)
         faults.add(Drop("step", times=1))
         action = np.zeros(env.action_space.shape)
-        *_, truncated, infos = env.step(action)
+        _, rewards, terminated, truncated, infos = env.step(action)
+        assert (rewards.tolist(), terminated.tolist()) == ([1.0, 0.0], [True, False]), "what failed earned nothing"
         assert truncated.tolist() == [False, True]
         assert "environment 1 did not answer within 3 s" in str(infos["error"][1])
         *_, truncated, infos = env.step(action)

@@ -170,7 +170,7 @@ def test_tables() -> None:
     assert [frame.time for frame in decode_csv(b"a\n1\n2\n")] == [0.0, 0.002]
     with pytest.raises(ValueError, match="row 2"):
         decode_csv(b"a,b\n1\n")
-    with pytest.raises(ValueError, match="no table"):
+    with pytest.raises(ValueError, match="not a table"):
         decode_csv(b"a\n" + 200_000 * b"x")
 
 

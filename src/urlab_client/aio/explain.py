@@ -174,8 +174,11 @@ async def _play(session: Session, state: SimState) -> tuple[Finding, bool]:
 
 
 def _modes(config: ClientConfig, state: SimState) -> Iterator[Finding]:
-    wanted = StepMode.LIVE if config.step_mode is StepMode.AUTO else config.step_mode
-    if state.mode is wanted:
+    wanted = config.step_mode
+    if wanted is StepMode.AUTO:
+        known = "as long as no step shows otherwise" if state.mode_assumed else "as the server has it"
+        yield Finding(Verdict.OK, "step mode", f"{state.mode}, {known}.")
+    elif state.mode is wanted:
         yield Finding(Verdict.OK, "step mode", f"{state.mode}, as asked for.")
     else:
         text = f"{state.mode} instead of {wanted}. The server may pin it, or runtime.set_mode() changed it."
