@@ -141,7 +141,6 @@ async def _resync(state: SimState, pending: PendingOutcomes, turn: Turn) -> Resy
         reply, held, renewed = None, False, True
     if before is not None:
         applied, was_reset = _compare(pending, before)
-    if before is not None and pending:
         # What broke off with a connection may still travel, and then meets a server that has moved on. In puppet mode
         # the next push overrides it anyway; elsewhere it is shut out with the session it belongs to.
         late = pending.connects != state.session.transport.stats.connects and state.mode is not StepMode.PUPPET
