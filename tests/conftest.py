@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
-# The tests start some hundred processes, each of which would compile the package anew.
+# The tests start hundreds of processes; without bytecode files each would compile the package anew.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 # A test that is slow because the machine is busy has not failed; pytest's own limit ends those that hang.
@@ -101,13 +101,13 @@ def pytest_report_header(config: pytest.Config) -> list[str]:
 
 
 def pytest_collection_finish() -> None:
-    """Spare the garbage collector the tests themselves, which stay: some tests collect again and again."""
+    """Keep the collected tests out of the garbage collector's rounds: some tests run it again and again."""
     gc.freeze()
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
 def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Collect no garbage meanwhile: Python 3.11 fails where a finaliser's traceback is told within another's."""
+    """Collect no garbage meanwhile: Python 3.11 fails when a finaliser formats a traceback within another's."""
     gc.disable()
     try:
         return (yield)

@@ -391,6 +391,25 @@ async def test_an_alpha_never_hears_of_claims(scripted: ScriptedServer) -> None:
     assert all("control_owner" not in request for request in seen)
 
 
+async def test_explain_tells_who_controls_what(beta: ScriptedBeta) -> None:
+    async with client_of(beta, step_mode="direct", claim_control=False) as client:
+        await client.discover()
+        mine, theirs = client.articulations["arm_a"], client.articulations["arm_C_1"]
+
+        async def told(about: str) -> str:
+            return " ".join(f.text for f in (await client.explain()).findings if f.subject == about)
+
+        assert "the first write claims it" in await told("arm_a")
+        mine.set_ctrl({"m": 0.5})
+        assert "articulation.claim()" in await told("arm_a")
+        await mine.claim()
+        assert "This client controls it" in await told("arm_a")
+        beta.owners["arm_C_1"] = "dashboard"
+        with pytest.raises(ControlClaimed):
+            await theirs.claim()
+        assert "'dashboard' controls it" in await told("arm_C_1")
+
+
 # Puppet mode, and the pause that keeps its physics still.
 
 

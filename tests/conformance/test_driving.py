@@ -379,6 +379,7 @@ async def test_the_mode_that_the_server_is_in_already(connect: Any, pinned: bool
         reply = await client.step(5)
         assert (reply.step, client.step_count, client.step_mode) == (5, 5, StepMode.DIRECT)
         assert reply.time == pytest.approx(5 * client.model.opt.timestep)
+        assert "direct, as " in str(await client.explain())
         assert (await client.step(2)).step == 7
         assert await client.runtime.set_mode("direct") is StepMode.DIRECT
 

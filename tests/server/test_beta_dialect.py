@@ -139,6 +139,11 @@ def test_the_handshake_in_play(playing: Bench) -> None:
     assert reply["global_cameras"] == {}
 
 
+def test_the_handshake_in_the_start_of_play(bench: Bench) -> None:
+    """Beta statement 4."""
+    assert bench.play()["urlab_version"] == "urlab/0.1"
+
+
 def test_a_second_hello(playing: Bench) -> None:
     """Beta statement 7."""
     playing.claim()

@@ -82,6 +82,26 @@ async def _examine(config: ClientConfig, session: Session, state: SimState) -> A
         yield finding
     for finding in _articulations(state):
         yield finding
+    for finding in _control(config, session, state):
+        yield finding
+
+
+def _control(config: ClientConfig, session: Session, state: SimState) -> Iterator[Finding]:
+    """Look at who may write to the robots, on a server where each has one owner."""
+    if not session.features.claims:
+        return
+    for key, record in state.records.items():
+        owner = session.control.owner_of(key)
+        if owner == session.control.owner:
+            yield Finding(Verdict.OK, key, "This client controls it.")
+        elif owner is not None:
+            text = f"{owner!r} controls it, so writes to it are refused. articulation.claim(force=True) takes it over."
+            yield Finding(Verdict.PROBLEM, key, text)
+        elif record.driven and not config.claim_control:
+            text = "Nobody controls it, as far as this client knows, so writes to it are refused. "
+            yield Finding(Verdict.PROBLEM, key, text + "Call articulation.claim(), or leave claim_control on.")
+        else:
+            yield Finding(Verdict.NOTE, key, "This client does not control it yet: the first write claims it.")
 
 
 async def _reachability(config: ClientConfig, session: Session) -> AsyncIterator[Finding]:
@@ -154,8 +174,11 @@ async def _play(session: Session, state: SimState) -> tuple[Finding, bool]:
 
 
 def _modes(config: ClientConfig, state: SimState) -> Iterator[Finding]:
-    wanted = StepMode.LIVE if config.step_mode is StepMode.AUTO else config.step_mode
-    if state.mode is wanted:
+    wanted = config.step_mode
+    if wanted is StepMode.AUTO:
+        known = "as long as no step shows otherwise" if state.mode_assumed else "as the server has it"
+        yield Finding(Verdict.OK, "step mode", f"{state.mode}, {known}.")
+    elif state.mode is wanted:
         yield Finding(Verdict.OK, "step mode", f"{state.mode}, as asked for.")
     else:
         text = f"{state.mode} instead of {wanted}. The server may pin it, or runtime.set_mode() changed it."

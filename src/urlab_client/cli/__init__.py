@@ -49,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Arguments without the program's name; default those of this process.
     """
     argv = sys.argv[1:] if argv is None else argv
-    # Each `sim://` server is an `urlab serve`: it starts a third faster without the modules of the other commands.
+    # Every `sim://` server is an `urlab serve`, which starts sooner without the modules of the other commands.
     parser = _parser(*(name for name in argv[:1] if name in _COMMANDS))
     arguments = parser.parse_args(argv)
     run: Callable[[object], int] = arguments.run
@@ -86,7 +86,7 @@ def _parser(*commands: str) -> Parser:
     return parser
 
 
-class _Version(argparse.Action):  # argparse's own wants the version, which takes a while, before it is asked for
+class _Version(argparse.Action):  # argparse's own needs the version in advance, and reading it takes a while
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
         print(f"urlab_client {urlab_client.__version__}")
         parser.exit()

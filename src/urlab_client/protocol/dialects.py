@@ -93,7 +93,6 @@ class Dialect:
         camera_forms: Pictures carry `frame_id` and `sim_time` in replies, live steps bring them, and steps can wait.
         qualified_cameras: Cameras are called `<robot>/<camera>`, on topics, too, and under no other name.
         public_names: Robots are called by their actor id where they have one, and `actor_name` tells the object's.
-        original_names: The handshake lists elements that were renamed.
         frame_ids: Steps are numbered by `frame_id`.
         steps_published: State is published in every step mode, else in live mode only.
         rows_published: Single joints, sensors and so on are published.
@@ -103,11 +102,9 @@ class Dialect:
         auto_mode: `auto` is a step mode beside live, else another name of it.
         controls_float32: Set-points are rounded to single precision.
         options_float32: Options are kept in single precision and keywords in lower case.
-        options_merged: The `<option>` of imported robots reaches the scene.
-        attached_documents: The scene's document attaches those of the robots, which are assets.
+        options_merged: The `<option>` of an imported robot reaches the scene.
         instance: The handshake says which of several servers this is, and its own shared-memory regions.
         first_camera_port: Default port of the first camera.
-        key_names: Names of the robots' and entities' states in a reply.
         shapes: What replies look like, by their `op`, where that is not how `messages` declares them.
     """
 
@@ -121,7 +118,6 @@ class Dialect:
     camera_forms: bool
     qualified_cameras: bool
     public_names: bool
-    original_names: bool
     frame_ids: bool
     steps_published: bool
     rows_published: bool
@@ -132,10 +128,8 @@ class Dialect:
     controls_float32: bool
     options_float32: bool
     options_merged: bool
-    attached_documents: bool
     instance: bool
     first_camera_port: int
-    key_names: tuple[str, str]
     shapes: Callable[[], Mapping[str, Callable[[Any], Struct]]] = field(default=_no_shapes)
 
     @property
@@ -176,7 +170,6 @@ ALPHA: Final = Dialect(
     camera_forms=False,
     qualified_cameras=False,
     public_names=False,
-    original_names=True,
     frame_ids=False,
     steps_published=True,
     rows_published=True,
@@ -187,10 +180,8 @@ ALPHA: Final = Dialect(
     controls_float32=True,
     options_float32=True,
     options_merged=False,
-    attached_documents=False,
     instance=False,
     first_camera_port=5558,
-    key_names=("per_articulation", "entities"),
 )
 """The plugin's main branch of June 2026."""
 
@@ -205,7 +196,6 @@ BETA: Final = Dialect(
     camera_forms=True,
     qualified_cameras=True,
     public_names=True,
-    original_names=False,
     frame_ids=True,
     steps_published=False,
     rows_published=False,
@@ -216,10 +206,8 @@ BETA: Final = Dialect(
     controls_float32=False,
     options_float32=False,
     options_merged=True,
-    attached_documents=True,
     instance=True,
     first_camera_port=5561,
-    key_names=("arts", "scene"),
     shapes=_beta_shapes,
 )
 """0.6.0-beta of August 2026 and the main branch of that age."""

@@ -161,7 +161,7 @@ class ServerCore:
         def build() -> Running:
             scene = compile_scene(
                 actors,
-                honour_mjcf_options=physics.mjcf_options,
+                honour_mjcf_options=self._honours_options,
                 camera_size=physics.camera_size,
                 limits=self.limits,
             )
@@ -228,6 +228,10 @@ class ServerCore:
             channels,
         )
 
+    @property
+    def _honours_options(self) -> bool:
+        return self.physics.mjcf_options or self.dialect.options_merged
+
     def authored_renderer(self) -> CameraRenderer:
         """Compile the level as it is now and return what draws it; the caller closes it.
 
@@ -235,7 +239,7 @@ class ServerCore:
             CompileFailed: MuJoCo rejects the level.
         """
         actors = self.world.freeze()
-        scene = compile_scene(actors, honour_mjcf_options=self.physics.mjcf_options, limits=self.limits)
+        scene = compile_scene(actors, honour_mjcf_options=self._honours_options, limits=self.limits)
         return self._camera_renderer(scene, actors, {}, {})
 
     def _camera_renderer(

@@ -26,7 +26,8 @@ def begin_pie(server: ServerCore, request: BeginPie) -> BeginPieOk:
     state = play.wait(request.timeout_s)
     reply = BeginPieOk(state=state, compile_error=play.compile_error)
     if state is PIEState.READY:
-        reply.handshake_payload = handshake(server, request.session_id)
+        reply.handshake_payload = payload = handshake(server, request.session_id)
+        payload.urlab_version = server.dialect.urlab_version_at_start
     return reply
 
 

@@ -197,7 +197,7 @@ class _LooseOp:
         self.exact = op.name in ("hello", "meta")
         self._struct = struct
 
-    # Found out when first needed: a server that reads few kinds of requests starts the sooner.
+    # Computed on first use, so that a server starts sooner.
 
     @cached_property
     def declared(self) -> tuple[str, ...]:
@@ -324,7 +324,7 @@ def _bad_request(why: str) -> Refusal:
 # The exact way: structs that refuse whatever the field-by-field way would have to interpret.
 
 
-# What a server's start takes longest for, and the same for each.
+# Inspecting the types took most of a server's start, and gives the same for every server.
 _type_info = cache(inspect.type_info)
 
 
