@@ -36,9 +36,15 @@ class StepPictures:
 
     def __init__(self, state: SimState, asked: bool | Mapping[str, str | None]) -> None:
         self._features = state.session.features
+        self._wanted: dict[str, str | None] = {}
+        self._shown: dict[str, str] = {}
+        self._sync: set[str] = set()
+        self._all = False
+        if asked is False:  # as nearly every step has it
+            return
         names = state.camera_names()
         if isinstance(asked, bool):
-            self._wanted = dict.fromkeys(names, str(CameraTiming.LATEST)) if asked else {}
+            self._wanted = dict.fromkeys(names, str(CameraTiming.LATEST))
             shown = state.shown_cameras(names)
             self._shown = {name: shown[name] for name in self._wanted}
         else:
