@@ -139,7 +139,9 @@ def own_errors(base: type[Any]) -> Iterator[list[str]]:
     from urlab_client.protocol.errors import RPC_ERRORS, URLabError
 
     for cls in base.__subclasses__():
-        if cls.__module__ == base.__module__ and cls not in RPC_ERRORS.values():
+        if cls.__module__ != base.__module__:
+            continue
+        if cls not in RPC_ERRORS.values():
             also = next((b for b in cls.__mro__ if b.__module__ == "builtins" and not issubclass(URLabError, b)), None)
             yield [
                 code(cls.__name__),
@@ -147,7 +149,7 @@ def own_errors(base: type[Any]) -> Iterator[list[str]]:
                 "" if also is None else code(also.__name__),
                 first_sentence(cls.__doc__),
             ]
-            yield from own_errors(cls)
+        yield from own_errors(cls)
 
 
 def render() -> str:

@@ -259,9 +259,9 @@ def test_a_server_from_afar_with_nothing_but_a_binary_model(monkeypatch: pytest.
 
     hello = Session.hello
 
-    async def without_assets(self: Session, request: Any, **options: Any) -> HelloOk:
+    async def without_assets(self: Session, turn: Any, request: Any) -> HelloOk:
         request.include_assets = False
-        return await hello(self, request, **options)
+        return await hello(self, turn, request)
 
     monkeypatch.setattr(Session, "hello", without_assets)
     with (

@@ -292,7 +292,7 @@ def test_an_empty_level_is_an_empty_picture(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("size", [(0, 5), (5, 100_000), (1, 2, 3)])
 def test_sizes_that_are_none(stage: Stage, size: Any) -> None:
-    with pytest.raises(ValueError, match="size is a width and a height"):
+    with pytest.raises(ValueError, match="size must be a width and a height"):
         stage.server.snapshot(size)
 
 

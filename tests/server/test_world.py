@@ -348,7 +348,7 @@ def load(workspace: Workspace, level: object) -> EditorWorld:
         (HEAD | {"actors": [BOX | {"location": [0, 0]}]}, "$.actors[0].location"),
         (HEAD | {"actors": [BOX, BOX]}, "two actors are called 'crate'"),
         (HEAD | {"actors": [BOX | {"name": "a crate"}]}, "letters, digits and underscores"),
-        (HEAD | {"actors": [BOX | {"rotation_quat": [0, 0, 0, 0]}]}, "no rotation"),
+        (HEAD | {"actors": [BOX | {"rotation_quat": [0, 0, 0, 0]}]}, "not a rotation"),
         (HEAD | {"actors": [BOX | {"scale": [1, 0, 1]}]}, "scale"),
         (HEAD | {"actors": [BOX | {"parent": "nobody"}]}, "attached to 'nobody'"),
         (HEAD | {"actors": [BOX | {"parent": "crate"}]}, "attached to itself"),
