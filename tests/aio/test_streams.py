@@ -515,7 +515,7 @@ class TestWaiting:
         self, subscriptions: Subscriptions, publisher: Publisher, live: bool
     ) -> None:
         camera = Camera(publisher.endpoint)
-        source = CameraSource(subscriptions, camera, lambda: "127.0.0.1", lambda: live)
+        source = CameraSource(subscriptions, camera, lambda: "127.0.0.1", live=lambda: live)
         async with latest(source, default_timeout=1.0) as frames:
             first = asyncio.ensure_future(frames.receive())
             await publisher.subscribed(b"arm0/camera/wrist ")
@@ -534,7 +534,7 @@ class TestWaiting:
     async def test_the_first_picture_has_its_deadline_too(
         self, subscriptions: Subscriptions, publisher: Publisher
     ) -> None:
-        source = CameraSource(subscriptions, Camera(publisher.endpoint), lambda: "127.0.0.1", lambda: True)
+        source = CameraSource(subscriptions, Camera(publisher.endpoint), lambda: "127.0.0.1", live=lambda: True)
         async with latest(source, default_timeout=1.0) as frames:
             first = asyncio.ensure_future(anext(frames))
             await publisher.subscribed(b"arm0/camera/wrist ")

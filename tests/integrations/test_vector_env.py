@@ -87,7 +87,7 @@ def test_a_reset_by_itself_and_one_by_hand_tell_the_same_episodes(made: list[Any
     )
     made += [same, by_hand]
     assert np.array_equal(same.reset(seed=5)[0], by_hand.reset(seed=5)[0])
-    for step, action in enumerate(actions_of(same, 7), start=1):
+    for step, action in enumerate(actions_of(same, 8), start=1):
         seen, _, _, truncated, infos = same.step(action)
         last, _, _, ended, _ = by_hand.step(action)
         assert truncated.tolist() == ended.tolist() == [step % 3 == 0] * 2
@@ -97,6 +97,9 @@ def test_a_reset_by_itself_and_one_by_hand_tell_the_same_episodes(made: list[Any
         assert np.array_equal(np.stack(infos["final_obs"]), last), "the last observation of the episode that ended"
         assert np.array_equal(seen, by_hand.reset(options={"reset_mask": ended})[0]), "the first one of the next"
         assert not np.array_equal(seen, last)
+    alone, _ = by_hand.reset(options={"reset_mask": np.array([True, False])})
+    assert np.array_equal(alone[1], last[1]), "the other goes on where it was"
+    assert not np.array_equal(alone[0], last[0])
 
 
 def test_environment_i_equals_a_single_one_with_its_seed(servers: list[str], made: list[Any]) -> None:
