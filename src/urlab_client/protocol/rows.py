@@ -733,8 +733,8 @@ def decode_camera(
     """
     try:
         check_picture_size(width, height)
-    except ValueError as problem:
-        raise _error("camera frame", where, str(problem), payload) from None
+    except ValueError as error:
+        raise _error("camera frame", where, str(error), payload) from None
     size = width * height * 4
     header = _frame_header(payload, width, height, where)
     if header is None and len(payload) != size:

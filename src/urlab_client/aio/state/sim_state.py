@@ -536,8 +536,8 @@ class SimState:
         if isinstance(reply, (StepOk, StateSnapshot)) and reply.entities:
             known = self._entity_records
             entities = [(known[name], state) for name, state in reply.entities.items() if name in known]
-            for record, state in entities:
-                record.check_pose(state, op)
+            for entity, pose in entities:
+                entity.check_pose(pose, op)
         pictures: list[tuple[URLabCameraView, Pixels, CameraFrame]] = []
         if isinstance(reply, StepOk):
             if reply.perturbation is not None:
@@ -553,8 +553,8 @@ class SimState:
                 record.absorb(state)
                 if into_mirror:
                     record.write_mirror(state)
-            for record, state in entities:
-                record.absorb_pose(state, into_mirror=into_mirror)
+            for entity, pose in entities:
+                entity.absorb_pose(pose, into_mirror=into_mirror)
             for view, pixels, frame in pictures:
                 taken = reply.time if frame.sim_time is None else frame.sim_time
                 view.pictures.deliver(pixels, taken, frame.frame_id)
