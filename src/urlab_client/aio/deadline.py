@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Callable
 from typing import Final, Literal, TypeAlias
 
-from urlab_client.aio.event_loop import running_loop
-
-__all__ = ["DEFAULT", "Default", "Timeout", "shared"]
+__all__ = ["DEFAULT", "Default", "Timeout"]
 
 
 class Default(enum.Enum):
@@ -22,15 +19,3 @@ DEFAULT: Final = Default.DEFAULT
 
 Timeout: TypeAlias = float | Literal[Default.DEFAULT] | None
 """Seconds for queueing, sending and the reply together; None waits without limit."""
-
-
-def shared(timeout: Timeout) -> Callable[[], Timeout]:
-    """Return what tells how much of `timeout` is left from now on: one limit for several requests in a row.
-
-    The default and None stand for each request by itself.
-    """
-    if timeout is DEFAULT or timeout is None:
-        return lambda: timeout
-    loop = running_loop()
-    end = loop.time() + timeout
-    return lambda: max(0.0, end - loop.time())
