@@ -134,11 +134,11 @@ def test_an_action_lasts_for_its_substeps_and_info_tells_the_clocks(make_env: Ma
 
 def test_what_an_environment_tells_can_be_copied_and_sent_to_another_process(make_env: MakeEnv) -> None:
     env = make_env()
-    observation, info = env.reset(seed=1)
+    _, info = env.reset(seed=1)
     *_, stepped = env.step(np.zeros(env.action_space.shape))
     for told in (info, stepped):
         assert copy.deepcopy(told) == told
-        assert pickle.loads(pickle.dumps(told)) == told  # noqa: S301  # our own
+        assert pickle.loads(pickle.dumps(told)) == told
 
 
 def test_rewards_terminations_and_truncation_come_from_the_users_functions(make_env: MakeEnv) -> None:
