@@ -40,7 +40,8 @@ from urlab_client.aio.state.stepping import take_steps
 from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS, Stream
 from urlab_client.aio.transport.base import RequestTransport, TransportStats
 from urlab_client.aio.transport.curve import ClientKeys, client_keys, is_local
-from urlab_client.aio.transport.shm import SharedMemoryRegions, ShmTransport
+from urlab_client.aio.transport.server_regions import SharedMemoryRegions
+from urlab_client.aio.transport.shm import ShmTransport
 from urlab_client.aio.transport.zmq import ZmqTransport
 from urlab_client.protocol.base import Reply, Request
 from urlab_client.protocol.enums import CameraTiming, ObservationLevel, StepMode, Transport
