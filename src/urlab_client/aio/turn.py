@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Coroutine
 from types import TracebackType
 from typing import TYPE_CHECKING, NamedTuple, Self, TypeVar
 
 from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.mutex import Mutex
+from urlab_client.aio.transport.base import RequestTransport
 from urlab_client.protocol.base import Needs, Op, Reply, Request
 from urlab_client.protocol.codec import op_of
 from urlab_client.protocol.errors import ProtocolError
 from urlab_client.protocol.messages.jobs import OpStarted
-
-if TYPE_CHECKING:
-    from urlab_client.aio.session import Session
 
 __all__ = ["Limits", "Turn", "at_once"]
 
@@ -29,6 +28,27 @@ class Limits(NamedTuple):
     connect_by: float | None
 
 
+class TurnSession(Protocol):
+    """What a turn needs of its session, where the meaning of each stands."""
+
+    line: Mutex
+    turns: Mutex
+    editing: Mutex
+
+    @property
+    def transport(self) -> RequestTransport: ...
+
+    def bound_loop(self) -> asyncio.AbstractEventLoop: ...
+
+    def check_offered(self, op: Op) -> None: ...
+
+    def limits(self, op: Op, timeout: Timeout, since: float, takes: float | None = None) -> Limits: ...
+
+    async def acquire(self, lock: Mutex, op: Op, deadline: float | None) -> None: ...
+
+    def exchange(self, request: Request[R], op: Op, limits: Limits) -> Coroutine[Any, Any, R | OpStarted]: ...
+
+
 class Turn:
     """The time in which one task alone reads and changes the client's state, and sends what depends on it.
 
@@ -41,7 +61,7 @@ class Turn:
 
     __slots__ = ("_asked", "_began", "_each", "_first", "_op", "_ready", "_session", "_timeout", "sent")
 
-    def __init__(self, session: Session, op: Op, timeout: Timeout, *, each: bool) -> None:
+    def __init__(self, session: TurnSession, op: Op, timeout: Timeout, *, each: bool) -> None:
         self._session = session
         self._op = op
         self._timeout: Timeout = timeout
