@@ -1,7 +1,8 @@
 """The same tests for both flavours of the client and both dialects of the simulated server, over real transports.
 
 A test is written once, with `await`. For the façade its objects are wrapped so that blocking calls run in a thread.
-Each test runs over ZeroMQ; over shared memory, too, where its module says so, or with `-m long`.
+Each test runs over ZeroMQ, and on the alpha in both flavours; over shared memory, too, in `test_shared_memory`. The
+rest of the matrix runs with `-m long`.
 """
 
 from __future__ import annotations
@@ -123,6 +124,15 @@ Connect = Callable[..., Any]
 Serve = Callable[..., AbstractContextManager[SimulatedServer]]
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what adds little: the façade knows nothing of dialects, and most of the client nothing of transports."""
+    for item in items:
+        chosen = item.callspec.params if isinstance(item, pytest.Function) and hasattr(item, "callspec") else {}
+        if chosen.get("transport") == "shm" or (chosen.get("connect"), chosen.get("dialect")) == ("sync", "beta"):
+            item.add_marker("long")
+
+
 @pytest.fixture(scope="module")
 def servers() -> Iterator[Servers]:
     made = Servers()
@@ -141,7 +151,7 @@ def dialect(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
-@pytest.fixture(params=["zmq", pytest.param("shm", marks=pytest.mark.long)])
+@pytest.fixture(params=["zmq", "shm"])
 def transport(request: pytest.FixtureRequest) -> str:
     return request.param
 

@@ -42,7 +42,9 @@ async def test_options_reach_the_mirror(connect: Any, serve: Any) -> None:
     with serve("ball", play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
-        options = await client.runtime.set_sim_options(timestep=0.001, gravity=(0, 0, -1.62), solver="CG", integrator="RK4")
+        options = await client.runtime.set_sim_options(
+            timestep=0.001, gravity=(0, 0, -1.62), solver="CG", integrator="RK4"
+        )
         assert client.model.opt.timestep == options.timestep == pytest.approx(0.001)
         assert client.model.opt.gravity[2] == pytest.approx(-1.62)
         assert (options.solver, options.integrator, options.cone) == ("cg", "rk4", "pyramidal")
