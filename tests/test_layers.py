@@ -96,6 +96,8 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "state",
         "explain",
         "namespaces",
+        "address",
+        "client_state",
         "client",
         "",
     ),
