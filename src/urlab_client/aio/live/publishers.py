@@ -19,7 +19,7 @@ from urlab_client.aio.live.sources import (
 )
 from urlab_client.aio.transport.curve import ClientKeys
 from urlab_client.aio.transport.regions import Regions
-from urlab_client.aio.transport.shm import SharedMemoryRegions
+from urlab_client.aio.transport.server_regions import SharedMemoryRegions
 from urlab_client.aio.transport.subscriber import Subscriptions, client_closed
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.errors import URLabError
