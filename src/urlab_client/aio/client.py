@@ -294,8 +294,13 @@ class URLabClient(ClientState):
         """
         n_steps = operator.index(n_steps)  # a hot op: its request is not checked again before it is sent
         level = None if isinstance(observations, SessionLevel) else ObservationLevel(observations)
-        async with self._session.turn(Step, timeout=timeout) as turn:
+        turn = self._session.turn(Step, timeout=timeout)
+        if not turn.begin_at_once():  # which `async with` would take three coroutines for
+            await turn.begin()
+        try:
             return await take_steps(self._state, turn, n_steps, include_cameras, level)
+        finally:
+            turn.end()
 
     async def reset(
         self,

@@ -27,7 +27,7 @@ from urlab_client.protocol.messages.runtime import (
     SetUserChannels,
 )
 from urlab_client.protocol.messages.session import Forward, ForwardOk
-from urlab_client.protocol.sim_options import check_sim_options
+from urlab_client.protocol.sim_options import check_sim_options, in_small_letters
 from urlab_client.protocol.types import ContactsResult, SimOptions
 
 __all__ = ["RuntimeNamespace"]
@@ -126,7 +126,7 @@ class RuntimeNamespace(RuntimeOps):
         }
         try:
             with building():
-                options = msgspec.convert(plain, SimOptions)
+                options = in_small_letters(msgspec.convert(plain, SimOptions))
             check_sim_options(options)
         except msgspec.ValidationError as error:
             raise TypeError(f"set_sim_options: {error}. Nothing was sent.") from None
@@ -134,8 +134,9 @@ class RuntimeNamespace(RuntimeOps):
             raise ValueError(f"set_sim_options: {error}. Nothing was sent.") from None
         async with self._session.turn(SetSimOptions, timeout=timeout) as turn:
             reply = await turn.call(SetSimOptions(options=options))
-            self._state.mirror_options(reply.options)
-            return reply.options
+            in_force = in_small_letters(reply.options)
+            self._state.mirror_options(in_force)
+            return in_force
 
     async def set_user_channels(
         self,
