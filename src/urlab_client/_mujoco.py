@@ -229,6 +229,12 @@ def _written_by_hand(spec: mujoco.MjSpec) -> tuple[str, dict[str, bytes]]:
     for compiler in compilers:
         compiler.meshdir = compiler.texturedir = ""
     spec.assets = {**spec.assets, **files}
+    if not _writes_archives(spec):
+        # The compiler notes the content type of what its cache does not have. Assigning what was given undoes that:
+        # a model is written in the same way each time, so that a server knows it by its digest.
+        spec.compile()
+        for asset in (*spec.meshes, *spec.hfields, *spec.textures):
+            asset.content_type = str(asset.content_type)
     return spec.to_xml(), files
 
 
