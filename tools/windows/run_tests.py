@@ -73,7 +73,9 @@ def run(file: str, interpreter: Path, prefix: Path, log: Path) -> Outcome:
             outcome.problems.append(f"the interpreter ended with {code}")
             break
     outcome.seconds = time.monotonic() - started
-    outcome.problems += [f"{result} {test}" for test, result in outcome.results.items() if result in {"FAILED", "ERROR"}]
+    outcome.problems += [
+        f"{result} {test}" for test, result in outcome.results.items() if result in {"FAILED", "ERROR"}
+    ]
     return outcome
 
 
@@ -84,18 +86,21 @@ def run_rest(outcome: Outcome, interpreter: Path, prefix: Path, log: Path) -> tu
         arguments.writelines(f"--deselect={test}\n" for test in outcome.results)
         arguments.flush()
         listed = [f"@Z:{arguments.name}"] if outcome.results else []
-        with subprocess.Popen(  # noqa: S603
-            [
-                *("timeout", "--kill-after=10", str(FILE_S)),
-                *(interpreter, "-m", "pytest", *options, f"--timeout={TEST_S}", *listed, outcome.file),
-            ],
-            cwd=ROOT,
-            env={**os.environ, "WINEPREFIX": str(prefix)},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            errors="replace",
-        ) as process, log.open("a", encoding="utf-8") as lines:
+        with (
+            subprocess.Popen(  # noqa: S603
+                [
+                    *("timeout", "--kill-after=10", str(FILE_S)),
+                    *(interpreter, "-m", "pytest", *options, f"--timeout={TEST_S}", *listed, outcome.file),
+                ],
+                cwd=ROOT,
+                env={**os.environ, "WINEPREFIX": str(prefix)},
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+                errors="replace",
+            ) as process,
+            log.open("a", encoding="utf-8") as lines,
+        ):
             assert process.stdout is not None  # noqa: S101
             met = 0
             for line in process.stdout:
@@ -161,8 +166,8 @@ def prefix(folder: Path, number: int) -> Path:
         shutil.copytree(original, path, symlinks=True)
     environment = {**os.environ, "WINEPREFIX": str(path), "WINEDEBUG": "-all"}
     subprocess.run(["nice", "-n", "5", "wineserver", "-p"], env=environment, check=False)  # noqa: S607
-    # Wine's services start with the first program and keep its output open: not that of a test run, which would not end.
-    subprocess.run(  # noqa: S603
+    # Wine's services start with the first program and keep its output open; a test run's would not end.
+    subprocess.run(
         ["wine", "cmd", "/c", "exit"],  # noqa: S607
         env=environment,
         stdin=subprocess.DEVNULL,
