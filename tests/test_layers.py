@@ -81,11 +81,13 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "aio": (
         "event_loop",
         "deadline",
+        "mutex",
         "stream_buffer",
         "transport",
         "launch",
         "control",
         "jobs",
+        "turn",
         "session",
         "streams",
         "live",

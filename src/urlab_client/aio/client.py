@@ -34,8 +34,11 @@ from urlab_client.aio.namespaces.sim import SimNamespace
 from urlab_client.aio.namespaces.viewport import ViewportNamespace
 from urlab_client.aio.session import Session
 from urlab_client.aio.state.connection_monitor import ConnectionMonitor
-from urlab_client.aio.state.recovery import leaves_open, resync
+from urlab_client.aio.state.discovery import Discovery
+from urlab_client.aio.state.pending_outcomes import leaves_open
+from urlab_client.aio.state.recovery import resync
 from urlab_client.aio.state.sim_state import SimState
+from urlab_client.aio.state.step_mode import ask_mode
 from urlab_client.aio.state.stepping import take_steps
 from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS, Stream
 from urlab_client.aio.transport.base import RequestTransport, TransportStats
@@ -183,17 +186,20 @@ class URLabClient:
             self._session,
             self._publishers,
             wanted_mode=StepMode(step_mode),
+            live_pictures=live_pictures,
+        )
+        self._discovery = Discovery(
+            self._state,
             local_model=local_model,
             check_version=mujoco_version_check,
             promote=auto_promote_step_mode,
             trusted=trust_server or keys is not None or is_local(address),
-            live_pictures=live_pictures,
         )
         self._watch = ConnectionMonitor(self._session, self._state)
         self._transport.on_event = self._watch.on_connection
         self._closed = False
         self._scene = SceneNamespace(self._session)
-        self._sim = SimNamespace(self._session, self._state)
+        self._sim = SimNamespace(self._session, self._state, self._discovery)
         self._runtime = RuntimeNamespace(self._session, self._state)
         self._outliner = OutlinerNamespace(self._session)
         self._debug = DebugNamespace(self._session)
@@ -330,22 +336,22 @@ class URLabClient:
     @property
     def articulations(self) -> NameMap[URLabArticulation]:
         """Articulations by key. An actor id or a class name is found, too, where it means one of them."""
-        return self._state.articulations
+        return self._state.objects.articulations
 
     @property
     def articulations_by_id(self) -> dict[str, URLabArticulation]:
         """Articulations that have an actor id, by that id."""
-        return self._state.articulations_by_id
+        return self._state.objects.articulations_by_id
 
     @property
     def entities(self) -> NameMap[URLabEntity]:
         """Every dynamic body by name, articulations included."""
-        return self._state.entities
+        return self._state.objects.entities
 
     @property
     def global_cameras(self) -> NameMap[URLabCameraView]:
         """Scene-level cameras by name."""
-        return self._state.global_cameras
+        return self._state.objects.global_cameras
 
     @property
     def step_count(self) -> int:
@@ -407,7 +413,7 @@ class URLabClient:
         """
         level = ObservationLevel(observations)
         async with self._session.turn(Hello, timeout=timeout) as turn:
-            await self._state.open(turn, level)
+            await self._discovery.open(turn, level)
 
     async def step(
         self,
@@ -444,8 +450,13 @@ class URLabClient:
         """
         n_steps = operator.index(n_steps)  # a hot op: its request is not checked again before it is sent
         level = None if isinstance(observations, SessionLevel) else ObservationLevel(observations)
-        async with self._session.turn(Step, timeout=timeout) as turn:
+        turn = self._session.turn(Step, timeout=timeout)
+        if not turn.begin_at_once():  # which `async with` would take three coroutines for
+            await turn.begin()
+        try:
             return await take_steps(self._state, turn, n_steps, include_cameras, level)
+        finally:
+            turn.end()
 
     async def reset(
         self,
@@ -511,7 +522,7 @@ class URLabClient:
         Raises:
             URLabConnectionError: The server is not back yet. What is in doubt stays so for the next attempt.
         """
-        return await resync(self._state, timeout=timeout)
+        return await resync(self._state, self._discovery, timeout=timeout)
 
     def state_stream(
         self,
@@ -636,7 +647,7 @@ class URLabClient:
             if promoted_from is not None and self.connected and self.manager_present:
                 with contextlib.suppress(URLabError):  # a courtesy: the server may have moved on
                     async with self._session.turn(SetMode, timeout=_REVERT_S) as turn:
-                        await self._state.ask_mode(turn, promoted_from)
+                        await ask_mode(self._state, turn, promoted_from)
         finally:
             await self._session.aclose()
 
