@@ -19,7 +19,7 @@ from waiting import DEADLINE_S
 
 from urlab_client.aio.live.publishers import Publishers
 from urlab_client.aio.streams import Stream
-from urlab_client.aio.transport.shm import SharedMemoryRegions
+from urlab_client.aio.transport.server_regions import SharedMemoryRegions
 from urlab_client.protocol import shm
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.fence import processor_fence

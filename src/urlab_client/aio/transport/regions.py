@@ -18,7 +18,7 @@ from msgspec import Struct
 
 from urlab_client.aio.transport.mapped_region import MappedRegion
 from urlab_client.aio.transport.poller import StreamPoll
-from urlab_client.aio.transport.shm import SharedMemoryRegions
+from urlab_client.aio.transport.server_regions import SharedMemoryRegions
 from urlab_client.aio.transport.subscriber import (
     MessageGone,
     MessageHandler,

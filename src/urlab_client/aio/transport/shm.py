@@ -9,25 +9,18 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import os
-import secrets
 import time
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
-from typing import Final
 
-import msgspec
-from msgspec import Struct
-
-from urlab_client._windows import NamedEvent
 from urlab_client.aio.transport.base import LateReply, RequestTransport
 from urlab_client.aio.transport.busy_poll import BusyPoll
-from urlab_client.aio.transport.mapped_region import MappedRegion, RegionInUse
-from urlab_client.aio.transport.poller import Doorbell, Poller, ReplyPoll
+from urlab_client.aio.transport.mapped_region import RegionInUse
+from urlab_client.aio.transport.poller import ReplyPoll
+from urlab_client.aio.transport.region_channel import SYNC_PREFIX, RegionChannel, envelope_of, opening_of
+from urlab_client.aio.transport.server_regions import SharedMemoryRegions
 from urlab_client.protocol import doorbell
 from urlab_client.protocol.base import Effect, Needs, Op
-from urlab_client.protocol.codec import encode_request
 from urlab_client.protocol.errors import (
     ClientClosed,
     ConnectionLost,
@@ -37,12 +30,11 @@ from urlab_client.protocol.errors import (
     URLabError,
     URLabTimeoutError,
 )
-from urlab_client.protocol.messages.runtime import ReadMocapPose
 from urlab_client.protocol.messages.session import HelloOk, StateReply
 from urlab_client.protocol.messages.streams import ClientEvent, ServerLost
-from urlab_client.protocol.shm import REPLY_FILE, REQUEST_FILE, RegionNotReady, region_directories
+from urlab_client.protocol.shm import REPLY_FILE, REQUEST_FILE, RegionNotReady
 
-__all__ = ["SharedMemoryRegions", "ShmTransport"]
+__all__ = ["ShmTransport"]
 
 log = logging.getLogger("urlab_client.transport")
 
@@ -61,212 +53,6 @@ _GLANCE_S = 0.05
 # Looking from the loop before the thread is asked to; longer than the last waits took is of no use.
 _SPIN_S = 400e-6
 _LONGEST_SPIN_S = 2e-3
-
-_SYNC: Final = "sync-"
-
-
-class SharedMemoryRegions:
-    """Where one client's server has its regions, and how the client learns of news in them.
-
-    Args:
-        directory: Where the regions are, when it is not where the server says.
-
-    Attributes:
-        directory: Directory of `state.shm`; None while no server said so.
-        rung: Called for each ring of the doorbell, by kind.
-    """
-
-    def __init__(self, directory: str | os.PathLike[str] | None) -> None:
-        self.directory: Path | None = None
-        self.rung: dict[bytes, list[Callable[[], None]]] = {doorbell.STATE: [], doorbell.CAMERA: [], doorbell.REPLY: []}
-        self._given = None if directory is None else Path(directory).absolute()
-        self._waiter: Poller | None = None
-        self._bell: Doorbell | None = None
-        self._wanted: set[bytes] = set()
-
-    @property
-    def waiter(self) -> Poller:
-        """The thread that looks, where there is no doorbell."""
-        if self._waiter is None:
-            self._waiter = Poller(asyncio.get_running_loop())
-        return self._waiter
-
-    @property
-    def bell(self) -> Doorbell | None:
-        """The doorbell, while there is one."""
-        return self._bell
-
-    def follow(self, hello: HelloOk) -> bool:
-        """Take over what a handshake says; return whether the regions are elsewhere than before.
-
-        Raises:
-            URLabConnectionError: The server says that play runs, and not where its regions are.
-        """
-        before = self.directory
-        if self._given is not None:
-            self.directory = self._given
-        elif hello.shm_session_dir is not None:
-            self.directory = Path(hello.shm_session_dir)
-        elif hello.manager_present:
-            raise URLabConnectionError(
-                "discover: transport='shm', but the server names no directory of shared memory.",
-                hint="Start it with shared memory, or use transport='zmq'.",
-            )
-        return self.directory != before
-
-    def candidates(self, file: str) -> list[Path]:
-        """Return where a region's file may be, best place first.
-
-        Raises:
-            ProtocolError: The server's directory is not absolute.
-        """
-        if self.directory is None:
-            return []
-        if self._given is not None:
-            return [self._given / file]
-        return [Path(directory) / file for directory in region_directories(self.directory, file)]
-
-    def find(self, file: str) -> Path | None:
-        """Return where a region's file is; None when it is nowhere."""
-        return next((path for path in self.candidates(file) if path.exists()), None)
-
-    def connect_bell(self) -> Doorbell | None:
-        """Return the doorbell, connecting it if the server has one."""
-        if self._bell is None:
-            on_ring = {kind: self._act(kind) for kind in self.rung}
-            try:
-                requests = self.find(REQUEST_FILE)
-                path = None if requests is None else requests.with_name(doorbell.FILE)
-                if path is None or not path.exists():
-                    return None
-                bell = self._bell = Doorbell(asyncio.get_running_loop(), path, on_ring, self._lose_bell)
-            except (OSError, ProtocolError) as error:
-                log.debug("no doorbell: %s", error)
-                return None
-            for message in self._wanted:
-                bell.ring(message)  # which may find that it is lost already
-        return self._bell
-
-    def want(self, message: bytes) -> None:
-        """Ask to be told of publications, too: `WANT_STATE` or `WANT_CAMERAS`."""
-        if message not in self._wanted:
-            self._wanted.add(message)
-            if self._bell is not None:
-                self._bell.ring(message)
-
-    def disconnect(self) -> None:
-        """Let go of the server, which is gone or elsewhere."""
-        if self._bell is not None:
-            self._bell.close()
-            self._bell = None
-
-    def close(self) -> None:
-        """Release everything. Idempotent."""
-        self.disconnect()
-        if self._waiter is not None:
-            self._waiter.close()
-
-    def _act(self, kind: bytes) -> Callable[[], None]:
-        def act() -> None:
-            for listener in tuple(self.rung[kind]):
-                listener()
-
-        return act
-
-    def _lose_bell(self) -> None:
-        self._bell = None
-        # Whoever waited for a ring looks once more and goes on without.
-        for kind in self.rung:
-            self._act(kind)()
-
-
-class _Envelope(Struct):
-    """What a reply says about itself."""
-
-    op: str = ""
-    code: str = ""
-    message: str = ""
-
-
-_MSGPACK = msgspec.msgpack.Decoder(_Envelope)
-_JSON = msgspec.json.Decoder(_Envelope)
-
-
-def _envelope(reply: bytes) -> _Envelope:
-    """Read what a reply says about itself; empty for what is not a reply."""
-    try:
-        return (_JSON if reply[:1] == b"{" else _MSGPACK).decode(reply)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
-        return _Envelope()
-
-
-@cache
-def _opening(op: Op) -> bytes:
-    """Return how a successful msgpack reply to `op` begins, after the byte or bytes that say how long its map is."""
-    return msgspec.msgpack.encode({"op": op.reply_name})[1:]
-
-
-class _RegionChannel:
-    """The pair of request and reply region, for the one client that holds the lock."""
-
-    def __init__(self, requests: Path, replies: Path) -> None:
-        self.requests = MappedRegion(requests, writable=True, exclusive=True)
-        try:
-            self.replies = MappedRegion(replies)
-        except BaseException:
-            self.requests.close()
-            raise
-        session = requests.parent.name
-        self._request_event = NamedEvent(f"Local\\URLab_{session}_req_ready")
-        self.reply_event = NamedEvent(f"Local\\URLab_{session}_rep_ready")
-        # A client that died here may have left a request behind whose reply is still to come.
-        self.dirty = True
-        self.seen = 0
-        self._token = ""
-        self._asked_at = 0.0
-
-    @property
-    def limit(self) -> int:
-        """Largest payload that fits in both directions."""
-        return min(self.requests.region.max_payload, self.replies.region.max_payload)
-
-    def intact(self) -> bool:
-        return self.requests.intact() and self.replies.intact()
-
-    def replaced(self) -> bool:
-        return self.requests.replaced() or self.replies.replaced()
-
-    def publish(self, frame: bytes) -> None:
-        self.seen = self.replies.region.sequence
-        self.requests.region.publish(frame)
-        self._request_event.set()
-
-    def ask_for_sync(self, now: float) -> bool:
-        """Ask, unless that was done a moment ago, for a refusal that only this question gets; return whether it was."""
-        if self._token and now - self._asked_at < _RETRY_S:
-            return False
-        self._token = _SYNC + secrets.token_hex(8)
-        self._asked_at = now
-        # Refused for its session before anything else about it is looked at.
-        self.publish(encode_request(ReadMocapPose(body=""), self._token))
-        return True
-
-    def synchronised(self) -> bool:
-        """Take up the answer to `ask_for_sync` if it is there; from then on the channel is clean."""
-        found = self.replies.region.read_latest(self.seen) if self._token and self.intact() else None
-        if found is not None:
-            self.seen = found.sequence
-            answer = _envelope(found.payload)
-            if answer.code == "session_expired" and self._token in answer.message:
-                self.dirty = False
-                self._token = ""
-        return not self.dirty
-
-    def close(self) -> None:
-        self.requests.close()
-        self.replies.close()
-        self._request_event.close()
-        self.reply_event.close()
 
 
 class _Pending:
@@ -294,7 +80,7 @@ class ShmTransport:
         self._memory = memory
         inner.on_event = self._on_event
         memory.rung[doorbell.REPLY].append(self._on_ring)
-        self._channel: _RegionChannel | None = None
+        self._channel: RegionChannel | None = None
         self._obstacle = "no handshake yet"
         self._retry_at = 0.0
         self._used_at = 0.0
@@ -406,7 +192,7 @@ class ShmTransport:
             return "pictures"
         return self._refused.get(op.name, "")
 
-    def _usable_channel(self) -> _RegionChannel | None:
+    def _usable_channel(self) -> RegionChannel | None:
         """Return the channel if it may be used right now."""
         loop = asyncio.get_running_loop()
         now = loop.time()
@@ -433,11 +219,11 @@ class ShmTransport:
             return None
         return channel
 
-    def _settling(self, channel: _RegionChannel) -> bool:
+    def _settling(self, channel: RegionChannel) -> bool:
         """Whether `channel` has yet to become clean, unless it is gone or another task's request is in it by now."""
         return self._channel is channel and self._pending is None and not self._is_clean(channel)
 
-    def _is_clean(self, channel: _RegionChannel) -> bool:
+    def _is_clean(self, channel: RegionChannel) -> bool:
         try:
             waits = channel.dirty and channel.intact() and not channel.synchronised()
             if waits and channel.ask_for_sync(asyncio.get_running_loop().time()):
@@ -447,7 +233,7 @@ class ShmTransport:
             self._put_off(error)
         return not channel.dirty
 
-    def _open(self) -> _RegionChannel:
+    def _open(self) -> RegionChannel:
         """Open the regions. Raises as `MappedRegion` does."""
         paths: list[Path] = []
         for file in (REQUEST_FILE, REPLY_FILE):
@@ -456,7 +242,7 @@ class ShmTransport:
                 looked = ", ".join(map(str, self._memory.candidates(file)))
                 raise FileNotFoundError(f"there is no {looked}")
             paths.append(path)
-        self._channel = _RegionChannel(*paths)
+        self._channel = RegionChannel(*paths)
         self._memory.connect_bell()
         self._used_at = asyncio.get_running_loop().time()
         log.info(
@@ -471,9 +257,9 @@ class ShmTransport:
 
     def _refusal(self, answer: bytes, op: Op) -> str:
         """Return why an answer means that the request has to go over ZMQ; empty if it is the answer."""
-        if answer.startswith(_opening(op), 1):
+        if answer.startswith(opening_of(op), 1):
             return ""
-        code = _envelope(answer).code
+        code = envelope_of(answer).code
         if code == "wrong_transport":  # says before anything else that it was not executed
             self._refused[op.name] = "refused by the server"
         elif code == "reply_too_large":
@@ -488,7 +274,7 @@ class ShmTransport:
 
     # Over shared memory
 
-    async def _over_shm(self, channel: _RegionChannel, frame: bytes, op: Op, deadline: float | None) -> bytes:
+    async def _over_shm(self, channel: RegionChannel, frame: bytes, op: Op, deadline: float | None) -> bytes:
         loop = asyncio.get_running_loop()
         pending = self._pending = _Pending(op, loop.create_future())
         timer: asyncio.TimerHandle | None = None
@@ -503,7 +289,8 @@ class ShmTransport:
             self._ring()
             if deadline is not None:
                 timer = loop.call_at(deadline, self._expire, pending, deadline - started)
-            if self._busy_poll.pays(op.name):
+            awake = self._busy_poll.pays(op.name)
+            if awake:
                 await self._busy_poll.look(op.name, pending.future, lambda: self._look_at(channel))
             if not pending.future.done():
                 if self._memory.bell is None:
@@ -520,7 +307,7 @@ class ShmTransport:
             self._used_at = loop.time()
         channel.dirty = False
         self.stats.received += 1
-        self._busy_poll.note(op.name, time.perf_counter() - sent)
+        self._busy_poll.note(op.name, time.perf_counter() - sent, awake=awake)
         return answer
 
     def _ring(self) -> None:
@@ -528,7 +315,7 @@ class ShmTransport:
         if bell is not None:
             bell.ring(doorbell.REQUEST)
 
-    def _look_at(self, channel: _RegionChannel) -> None:
+    def _look_at(self, channel: RegionChannel) -> None:
         # Between two looks another task may have had the loop for as long as a server takes to start again.
         if not channel.replies.intact() or channel.replies.region.sequence != channel.seen:
             self._look()
@@ -599,11 +386,11 @@ class ShmTransport:
 
     @staticmethod
     def _answers(reply: bytes, op: Op) -> bool:
-        if reply.startswith(_opening(op), 1):
+        if reply.startswith(opening_of(op), 1):
             return True
-        found = _envelope(reply)
+        found = envelope_of(reply)
         if found.op == "error":
-            return not (found.code == "session_expired" and _SYNC in found.message)
+            return not (found.code == "session_expired" and SYNC_PREFIX in found.message)
         return found.op == op.reply_name
 
     def _expire(self, pending: _Pending, seconds: float) -> None:

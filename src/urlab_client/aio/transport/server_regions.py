@@ -1,0 +1,134 @@
+"""Where one client's server has its shared-memory regions, and how the client learns of news in them."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from urlab_client.aio.transport.poller import Doorbell, Poller
+from urlab_client.protocol import doorbell
+from urlab_client.protocol.errors import ProtocolError, URLabConnectionError
+from urlab_client.protocol.messages.session import HelloOk
+from urlab_client.protocol.shm import REQUEST_FILE, region_directories
+
+__all__ = ["SharedMemoryRegions"]
+
+log = logging.getLogger("urlab_client.transport")
+
+
+class SharedMemoryRegions:
+    """Where one client's server has its regions, and how the client learns of news in them.
+
+    Args:
+        directory: Where the regions are, when it is not where the server says.
+
+    Attributes:
+        directory: Directory of `state.shm`; None while no server said so.
+        rung: Called for each ring of the doorbell, by kind.
+    """
+
+    def __init__(self, directory: str | os.PathLike[str] | None) -> None:
+        self.directory: Path | None = None
+        self.rung: dict[bytes, list[Callable[[], None]]] = {doorbell.STATE: [], doorbell.CAMERA: [], doorbell.REPLY: []}
+        self._given = None if directory is None else Path(directory).absolute()
+        self._waiter: Poller | None = None
+        self._bell: Doorbell | None = None
+        self._wanted: set[bytes] = set()
+
+    @property
+    def waiter(self) -> Poller:
+        """The thread that looks, where there is no doorbell."""
+        if self._waiter is None:
+            self._waiter = Poller(asyncio.get_running_loop())
+        return self._waiter
+
+    @property
+    def bell(self) -> Doorbell | None:
+        """The doorbell, while there is one."""
+        return self._bell
+
+    def follow(self, hello: HelloOk) -> bool:
+        """Take over what a handshake says; return whether the regions are elsewhere than before.
+
+        Raises:
+            URLabConnectionError: The server says that play runs, and not where its regions are.
+        """
+        before = self.directory
+        if self._given is not None:
+            self.directory = self._given
+        elif hello.shm_session_dir is not None:
+            self.directory = Path(hello.shm_session_dir)
+        elif hello.manager_present:
+            raise URLabConnectionError(
+                "discover: transport='shm', but the server names no directory of shared memory.",
+                hint="Start it with shared memory, or use transport='zmq'.",
+            )
+        return self.directory != before
+
+    def candidates(self, file: str) -> list[Path]:
+        """Return where a region's file may be, best place first.
+
+        Raises:
+            ProtocolError: The server's directory is not absolute.
+        """
+        if self.directory is None:
+            return []
+        if self._given is not None:
+            return [self._given / file]
+        return [Path(directory) / file for directory in region_directories(self.directory, file)]
+
+    def find(self, file: str) -> Path | None:
+        """Return where a region's file is; None when it is nowhere."""
+        return next((path for path in self.candidates(file) if path.exists()), None)
+
+    def connect_bell(self) -> Doorbell | None:
+        """Return the doorbell, connecting it if the server has one."""
+        if self._bell is None:
+            on_ring = {kind: self._act(kind) for kind in self.rung}
+            try:
+                requests = self.find(REQUEST_FILE)
+                path = None if requests is None else requests.with_name(doorbell.FILE)
+                if path is None or not path.exists():
+                    return None
+                bell = self._bell = Doorbell(asyncio.get_running_loop(), path, on_ring, self._lose_bell)
+            except (OSError, ProtocolError) as error:
+                log.debug("no doorbell: %s", error)
+                return None
+            for message in self._wanted:
+                bell.ring(message)  # which may find that it is lost already
+        return self._bell
+
+    def want(self, message: bytes) -> None:
+        """Ask to be told of publications, too: `WANT_STATE` or `WANT_CAMERAS`."""
+        if message not in self._wanted:
+            self._wanted.add(message)
+            if self._bell is not None:
+                self._bell.ring(message)
+
+    def disconnect(self) -> None:
+        """Let go of the server, which is gone or elsewhere."""
+        if self._bell is not None:
+            self._bell.close()
+            self._bell = None
+
+    def close(self) -> None:
+        """Release everything. Idempotent."""
+        self.disconnect()
+        if self._waiter is not None:
+            self._waiter.close()
+
+    def _act(self, kind: bytes) -> Callable[[], None]:
+        def act() -> None:
+            for listener in tuple(self.rung[kind]):
+                listener()
+
+        return act
+
+    def _lose_bell(self) -> None:
+        self._bell = None
+        # Whoever waited for a ring looks once more and goes on without.
+        for kind in self.rung:
+            self._act(kind)()
