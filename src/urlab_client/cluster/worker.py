@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from urlab_client.aio.launch import with_model_options
 from urlab_client.cluster.episodes import Episode, Job, Policy, seed_of
 from urlab_client.cluster.leases import Lease
 from urlab_client.integrations.gym.env import URLabEnv
@@ -101,7 +102,7 @@ class Worker:
         if self._env is not None and self._address == address:
             return self._env
         self.close()
-        client = URLabClient(address, **self._client_options)
+        client = URLabClient(with_model_options(address), **self._client_options)
         try:
             client.discover()
             self._env = URLabEnv(client, owns_client=True, **self._env_options)

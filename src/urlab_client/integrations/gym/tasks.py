@@ -13,6 +13,7 @@ from typing import Any, Final, Literal
 import gymnasium
 import numpy as np
 
+from urlab_client.aio.launch import with_model_options
 from urlab_client.integrations.gym.batch import URLabBatchEnv
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn, URLabEnv
 from urlab_client.integrations.gym.spaces import Observation, SpaceMapping
@@ -114,7 +115,7 @@ def make(task_id: str, address: str | None = None, **options: Any) -> URLabEnv:
     """
     task = TASKS[task_id]
     options = {"n_substeps": task.n_substeps, "reset_noise": task.reset_noise, **options}
-    client = URLabClient(address or f"sim://{task.robot}", step_mode="direct")
+    client = URLabClient(with_model_options(address or f"sim://{task.robot}"), step_mode="direct")
     try:
         client.discover()
         env = URLabEnv(client, owns_client=True, **options)
