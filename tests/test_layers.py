@@ -98,6 +98,8 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "state",
         "explain",
         "namespaces",
+        "address",
+        "client_state",
         "client",
         "",
     ),
