@@ -43,7 +43,8 @@ from urlab_client.server.limits import Limits
 from urlab_client.server.physics.channels import channel_problem
 from urlab_client.server.physics.controllers import ControllerConfig
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.render.camera_renderer import RenderQuality, find_backend
+from urlab_client.server.render.drawing import RenderQuality
+from urlab_client.server.render.opengl import find_backend
 from urlab_client.server.rpc.dispatch import Dispatcher
 from urlab_client.server.rpc.watchdog import Watchdog
 from urlab_client.server.session import ServerSession
