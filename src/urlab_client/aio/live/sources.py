@@ -309,6 +309,7 @@ class CameraSource(SocketSource):
         host: Tells under which name or address the server was reached.
         live: Tells whether the server is in live mode, as far as is known.
         switch: Switches the camera on and off; None where it always streams.
+        asked: Whether the user asked for these pictures, rather than having them received in the background.
     """
 
     name = "frames"
@@ -330,12 +331,14 @@ class CameraSource(SocketSource):
         *,
         live: Callable[[], bool] = lambda: True,
         switch: CameraSwitch | None = None,
+        asked: bool = True,
     ) -> None:
         super().__init__(subscriptions)
         self.view = view
         self._host = host
         self._live = live
         self._switch = switch
+        self._asked = asked
         self._users: set[MessageHandler] = set()
 
     def attach(self, handler: MessageHandler) -> None:
@@ -351,7 +354,7 @@ class CameraSource(SocketSource):
     def _use(self, handler: MessageHandler) -> None:
         if self._switch is not None and handler not in self._users:
             self._users.add(handler)
-            self._switch.use(self.view.info)
+            self._switch.use(self.view.info, asked=self._asked)
 
     def _leave(self, handler: MessageHandler) -> None:
         if self._switch is not None and handler in self._users:
@@ -464,6 +467,7 @@ class SharedCameraSource(_SharedMemorySource, CameraSource):
         host: Tells under which name or address the server was reached.
         live: Tells whether the server is in live mode, as far as is known.
         switch: Switches the camera on and off; None where it always streams.
+        asked: Whether the user asked for these pictures, rather than having them received in the background.
     """
 
     def __init__(
@@ -475,8 +479,9 @@ class SharedCameraSource(_SharedMemorySource, CameraSource):
         *,
         live: Callable[[], bool] = lambda: True,
         switch: CameraSwitch | None = None,
+        asked: bool = True,
     ) -> None:
-        super().__init__(subscriptions, view, host, live=live, switch=switch)
+        super().__init__(subscriptions, view, host, live=live, switch=switch, asked=asked)
         self.regions = regions
         self._taken: SharedPicture | None = None
 

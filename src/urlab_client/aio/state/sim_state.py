@@ -28,7 +28,7 @@ from urlab_client.aio.session import Session, Turn
 from urlab_client.aio.state.handshake import Examined, examine
 from urlab_client.aio.state.recovery import PendingOutcomes, leaves_open
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.enums import LATER_MODE_NAMES, CameraMode, StepMode
+from urlab_client.protocol.enums import LATER_MODE_NAMES, CameraMode, StepMode, known
 from urlab_client.protocol.errors import (
     BadMode,
     ModeLocked,
@@ -99,7 +99,8 @@ class SimState:
         mirror: Local model and data.
         wanted_mode: Step mode the user asked for.
         mode_assumed: Whether nothing the server said shows yet that `mode` is in force.
-        promoted_from: Mode to go back to on close, after a promotion of our own.
+        promoted_from: Mode to go back to on close, after a promotion of our own; maybe one that only the server knows.
+        mode_word: What the server called the step mode when it last told it.
         level: Observation level of the session.
         sent_level: Observation level the server has, which an earlier step may have changed.
         hello: The last handshake, without the model's bytes.
@@ -133,7 +134,8 @@ class SimState:
         self._mode = StepMode.LIVE
         self.mode_assumed = False
         self._live = LiveState(publishers.state(), self._absorb_live, self.mirror.lock)
-        self.promoted_from: StepMode | None = None
+        self.promoted_from: StepMode | str | None = None
+        self.mode_word = ""
         self.level = "standard"
         self.sent_level = "standard"
         self.hello: HelloOk | None = None
@@ -396,8 +398,10 @@ class SimState:
         if previous is not self.mode:
             self.promoted_from = previous
 
-    async def ask_mode(self, turn: Turn, mode: StepMode) -> StepMode:
+    async def ask_mode(self, turn: Turn, mode: StepMode | str) -> StepMode | str:
         """Bring the server into a step mode, take over the one in force, and return the one before.
+
+        A word that no mode is known by is the server's own for the mode that it was asked for.
 
         Raises:
             ModeLocked: The project pins another one, which has been taken over if its name is known.
@@ -408,7 +412,8 @@ class SimState:
                     reply = await turn.call(SetMode(mode=mode))
                 except BadMode:
                     # Servers after the beta call the modes by other names.
-                    reply = await turn.call(SetMode(mode=LATER_MODE_NAMES.get(mode, mode)))
+                    later = LATER_MODE_NAMES.get(mode) if isinstance(mode, StepMode) else None
+                    reply = await turn.call(SetMode(mode=later or mode))
         except ModeLocked as locked:
             if locked.pinned is not None:
                 self.mode = locked.pinned
@@ -418,14 +423,19 @@ class SimState:
                 # Play starts paused, and no change of mode can resume it where the mode is pinned.
                 await turn.call(SetPaused(paused=False))
             return mode
+        previous, current = known(StepMode, reply.previous_mode), known(StepMode, reply.current_mode)
+        self.mode_word = reply.current_mode
+        if not isinstance(current, StepMode):
+            log.warning("the server calls step mode %s %r", mode, current)
+            current = mode if isinstance(mode, StepMode) else StepMode.LIVE
         try:
             if self.session.features.idles_in_puppet:
-                await self._still_puppet(turn, reply.previous_mode, reply.current_mode)
+                await self._still_puppet(turn, previous, current)
         finally:
-            self.mode = reply.current_mode
-        return reply.previous_mode
+            self.mode = current
+        return previous
 
-    async def _still_puppet(self, turn: Turn, previous: StepMode, current: StepMode) -> None:
+    async def _still_puppet(self, turn: Turn, previous: StepMode | str, current: StepMode) -> None:
         """Keep physics from taking steps of its own between the pushes of puppet mode, and undo that afterwards."""
         if current is StepMode.PUPPET:
             await turn.call(SetPaused(paused=True))
@@ -634,6 +644,8 @@ class SimState:
             self.hello.manager_present = False
         self.publishers.release_regions()
         self.session.control.forget()
+        if self.publishers.camera_switch is not None:
+            self.publishers.camera_switch.forget()
         self.mode = StepMode.LIVE
         self.promoted_from = None
         if played:
@@ -706,12 +718,20 @@ class SimState:
 
     def camera(self, name: str) -> URLabCameraView | None:
         """Return the camera that a user means by `<articulation>/<camera>` or just `<camera>`, or None."""
-        if name in self.global_cameras:
-            return self.global_cameras[name]
         try:
-            owner, _, short = self.camera_name(name).rpartition("/")
+            return self.require_camera(name)
         except KeyError:
             return None
+
+    def require_camera(self, name: str) -> URLabCameraView:
+        """Return the camera that a user means by `<articulation>/<camera>` or just `<camera>`.
+
+        Raises:
+            KeyError: None, or several.
+        """
+        if name in self.global_cameras:
+            return self.global_cameras[name]
+        owner, _, short = self.camera_name(name).rpartition("/")
         return self.articulations[owner].cameras[short] if owner else self.global_cameras[short]
 
 
