@@ -76,6 +76,7 @@ PLAN = Plan(
     shown=REPOSITORY,
     modules=(
         "client.py",
+        "client_state.py",
         "articulation.py",
         "controllers.py",
         "cameras.py",
@@ -335,7 +336,7 @@ class Mirror:
         own = f"aio.{node.name}"
         bases, derived = self._bases(node)
         root = node.name == self.sources.plan.root
-        if not derived:
+        if root or not derived:
             bases.insert(0, "FacadeRoot" if root else "Facade")
         generic = next((base.removeprefix("Generic") for base in bases if base.startswith("Generic[")), "")
         ignored = "  # pyright: ignore[reportIncompatibleVariableOverride]  # never assigned after construction"

@@ -387,7 +387,7 @@ class Tasks(RuleBasedStateMachine):
             carried.update(arm["xfrc_applied"][tip(self.client)][5] for arm in arms.values() if "xfrc_applied" in arm)
         assert all(count == 1 for count in carried.values()), carried
         missing = {push for push in self.due if push not in carried}
-        buffered = {wrench[5] for wrench in self.client._state.records["arm"].wrenches.values()}
+        buffered = {wrench[5] for wrench in self.client._state.objects.records["arm"].wrenches.values()}
         for push in missing - buffered:
             # A later one on the same body took its place, or a step took it that cannot carry any.
             later = push + 1 in self.due

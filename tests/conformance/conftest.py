@@ -1,17 +1,22 @@
-"""The same tests for both flavours of the client, against a simulated server over real sockets.
+"""The same tests for both flavours of the client and both dialects of the simulated server, over real transports.
 
 A test is written once, with `await`. For the façade its objects are wrapped so that blocking calls run in a thread.
+Each test runs over ZeroMQ, and on the alpha in both flavours; over shared memory, too, in `test_shared_memory`. The
+rest of the matrix runs with `-m long`.
 """
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import anyio.to_thread
 import gymnasium
+import numpy as np
 import pytest
 
 import urlab_client
@@ -84,16 +89,93 @@ class AwaitedMap:
         return [awaited(value) for value in self.entries.values()]
 
 
+class Servers:
+    """Servers that are kept for the next test with the same wishes: bringing one back is quicker than starting it."""
+
+    MOST = 4
+
+    def __init__(self) -> None:
+        self._idle: dict[str, SimulatedServer] = {}
+
+    @contextmanager
+    def lend(self, *models: Any, **options: Any) -> Iterator[SimulatedServer]:
+        """Hand out a server as it is after its start."""
+        wishes = repr((models, sorted(options.items())))
+        server = self._idle.pop(wishes, None)
+        if server is None:
+            server = SimulatedServer(*models, **options).start()
+        else:
+            server.restore()
+        try:
+            yield server
+        except BaseException:
+            server.close()
+            raise
+        self._idle[wishes] = server
+        if len(self._idle) > self.MOST:
+            self._idle.pop(next(iter(self._idle))).close()
+
+    def close(self) -> None:
+        for server in self._idle.values():
+            server.close()
+
+
 Connect = Callable[..., Any]
+Serve = Callable[..., AbstractContextManager[SimulatedServer]]
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what adds little: the façade knows nothing of dialects, and most of the client nothing of transports."""
+    for item in items:
+        chosen = item.callspec.params if isinstance(item, pytest.Function) and hasattr(item, "callspec") else {}
+        if chosen.get("transport") == "shm" or (chosen.get("connect"), chosen.get("dialect")) == ("sync", "beta"):
+            item.add_marker("long")
+
+
+@pytest.fixture(scope="module")
+def servers() -> Iterator[Servers]:
+    made = Servers()
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="session")
+def memory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Directory of all servers' shared memory; its name is short, as those of sockets must be."""
+    return tmp_path_factory.getbasetemp()
+
+
+@pytest.fixture(params=["alpha", "beta"])
+def dialect(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+@pytest.fixture(params=["zmq", "shm"])
+def transport(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+@pytest.fixture
+def applied(dialect: str) -> Callable[[float], float]:
+    """What the server makes of a set-point."""
+    return {"alpha": lambda value: float(np.float32(value)), "beta": float}[dialect]
+
+
+@pytest.fixture
+def serve(servers: Servers, dialect: str, transport: str, memory: Path) -> Serve:
+    """Lend servers of one dialect, with the regions that the clients of the test need."""
+    return partial(servers.lend, dialect=dialect, shm_dir=memory if transport == "shm" else None)
 
 
 @pytest.fixture(params=["aio", "sync"])
-async def connect(request: pytest.FixtureRequest) -> AsyncIterator[Connect]:
+async def connect(request: pytest.FixtureRequest, transport: str) -> AsyncIterator[Connect]:
     """Make clients of one flavour; closed after the test."""
     made: list[Any] = []
 
     def connect(server: SimulatedServer | None = None, **options: Any) -> Any:
-        options = {**(server.client_options() if server else {}), **options}
+        if server is not None:
+            options = {**server.client_options(), "transport": transport, **options}
         if request.param == "aio":
             client: Any = urlab_client.aio.URLabClient(**options)
         else:
@@ -110,3 +192,9 @@ async def connect(request: pytest.FixtureRequest) -> AsyncIterator[Connect]:
 def asset() -> Callable[[str], str]:
     """Path of one of gymnasium's MuJoCo models."""
     return lambda name: str(GYMNASIUM / name)
+
+
+@pytest.fixture(scope="module")
+def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder for a module's models, which outlive their tests as the servers do."""
+    return tmp_path_factory.mktemp("models")

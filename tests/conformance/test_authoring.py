@@ -20,7 +20,6 @@ from urlab_client import (
     URLabPIEError,
 )
 from urlab_client.enums import StepMode
-from urlab_client.server import SimulatedServer
 
 BOX = """
 <mujoco model="box"><worldbody><body name="box" pos="0 0 1"><freejoint name="root"/>
@@ -37,8 +36,8 @@ def box(tmp_path: Path) -> str:
 
 
 @pytest.fixture
-def empty(tmp_path: Path) -> Any:
-    with SimulatedServer(model_roots=[tmp_path]) as server:
+def empty(serve: Any, tmp_path: Path) -> Any:
+    with serve(model_roots=[tmp_path]) as server:
         yield server
 
 
@@ -183,8 +182,8 @@ async def test_play_without_a_manager_explains_itself(connect: Any, empty: Any) 
     assert not result.is_ready
 
 
-async def test_a_healthy_session_goes_on(connect: Any) -> None:
-    with SimulatedServer("ball", play=True) as server:
+async def test_a_healthy_session_goes_on(connect: Any, serve: Any) -> None:
+    with serve("ball", play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         await client.step(10)
@@ -194,16 +193,16 @@ async def test_a_healthy_session_goes_on(connect: Any) -> None:
         assert client.sim_time == pytest.approx(0.022), "play was not restarted"
 
 
-async def test_what_this_server_cannot_do_yet_says_so(connect: Any) -> None:
-    with SimulatedServer("ball", play=True) as server:
+async def test_what_this_server_cannot_do_yet_says_so(connect: Any, serve: Any) -> None:
+    with serve("ball", play=True) as server:
         client = connect(server)
         await client.discover()
         with pytest.raises(Unsupported, match="reflections"):
             await client.viewport.set_mode("reflections")
 
 
-async def test_meta_lists_the_ops(connect: Any, empty: Any) -> None:
+async def test_meta_lists_the_ops(connect: Any, empty: Any, dialect: str) -> None:
     client = connect(empty)
     names = {op.name for op in await client.meta()}
-    assert len(names) == 62
+    assert len(names) == {"alpha": 62, "beta": 73}[dialect]
     assert {"step", "spawn_actor", "draw_axes"} <= names

@@ -11,15 +11,15 @@ import pytest
 from urlab_client import ModeLocked, NoSession, SessionTakenOver, UnknownKeyframe, UnknownName, URLabError
 from urlab_client.enums import ControlMode, StepMode
 from urlab_client.protocol.messages.runtime import SetMode
-from urlab_client.server import ControllerConfig, SimulatedServer
+from urlab_client.server import ControllerConfig
 
 MODELS = ["humanoid.xml", "ant.xml", "walker2d_v5.xml", "pusher_v5.xml"]
 
 
 @pytest.mark.parametrize("model", MODELS)
-async def test_physics_is_bitwise_what_mj_step_gives(connect: Any, asset: Any, model: str) -> None:
+async def test_physics_is_bitwise_what_mj_step_gives(connect: Any, serve: Any, asset: Any, model: str) -> None:
     steps = 1000 if model == "humanoid.xml" else 200
-    with SimulatedServer(asset(model), play=True) as server:
+    with serve(asset(model), play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         (art,) = client.articulations.values()
@@ -39,8 +39,8 @@ async def test_physics_is_bitwise_what_mj_step_gives(connect: Any, asset: Any, m
         assert client.step_count == steps
 
 
-async def test_several_substeps_equal_single_ones(connect: Any, asset: Any) -> None:
-    with SimulatedServer(asset("ant.xml"), play=True) as server:
+async def test_several_substeps_equal_single_ones(connect: Any, serve: Any, asset: Any) -> None:
+    with serve(asset("ant.xml"), play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         (art,) = client.articulations.values()
@@ -53,8 +53,8 @@ async def test_several_substeps_equal_single_ones(connect: Any, asset: Any) -> N
         assert np.array_equal(art.qpos_array, together)
 
 
-async def test_two_of_the_same_robot_are_two_robots(connect: Any, asset: Any) -> None:
-    with SimulatedServer(asset("ant.xml"), asset("ant.xml"), play=True) as server:
+async def test_two_of_the_same_robot_are_two_robots(connect: Any, serve: Any, asset: Any) -> None:
+    with serve(asset("ant.xml"), asset("ant.xml"), play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         assert len(client.articulations) == 2
@@ -68,8 +68,8 @@ async def test_two_of_the_same_robot_are_two_robots(connect: Any, asset: Any) ->
         assert not np.array_equal(first.dof_qpos, second.dof_qpos)
 
 
-async def test_a_robot_beside_free_objects(connect: Any) -> None:
-    with SimulatedServer("arm", "ball", "pallet", play=True) as server:
+async def test_a_robot_beside_free_objects(connect: Any, serve: Any) -> None:
+    with serve("arm", "ball", "pallet", play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         assert {art.actor_id for art in client.articulations.values()} == {"arm", "ball", "pallet"}
@@ -86,8 +86,8 @@ async def test_a_robot_beside_free_objects(connect: Any) -> None:
         assert np.array_equal(client.data.qpos[free], ball.qpos_array)
 
 
-async def test_a_wrench_acts_for_one_step_only(connect: Any) -> None:
-    with SimulatedServer("ball", play=True) as server:
+async def test_a_wrench_acts_for_one_step_only(connect: Any, serve: Any) -> None:
+    with serve("ball", play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         (ball,) = client.articulations.values()
@@ -100,8 +100,8 @@ async def test_a_wrench_acts_for_one_step_only(connect: Any) -> None:
         assert ball.root_pos_w[2] < height - 1e-3
 
 
-async def test_a_wrench_survives_a_failed_step(connect: Any) -> None:
-    with SimulatedServer("ball", play=True) as server:
+async def test_a_wrench_survives_a_failed_step(connect: Any, serve: Any) -> None:
+    with serve("ball", play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         (ball,) = client.articulations.values()
@@ -115,8 +115,8 @@ async def test_a_wrench_survives_a_failed_step(connect: Any) -> None:
         assert ball.root_lin_vel_w[2] > 0
 
 
-async def test_state_of_a_root_that_is_not_free(connect: Any, asset: Any) -> None:
-    with SimulatedServer(asset("walker2d_v5.xml"), play=True) as server:
+async def test_state_of_a_root_that_is_not_free(connect: Any, serve: Any, asset: Any) -> None:
+    with serve(asset("walker2d_v5.xml"), play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         (walker,) = client.articulations.values()
@@ -133,8 +133,8 @@ async def test_state_of_a_root_that_is_not_free(connect: Any, asset: Any) -> Non
         assert np.allclose(walker.root_ang_vel_w, velocity[:3])
 
 
-async def test_root_frames_of_a_free_base_agree_with_mujoco(connect: Any) -> None:
-    with SimulatedServer("quadruped", play=True) as server:
+async def test_root_frames_of_a_free_base_agree_with_mujoco(connect: Any, serve: Any) -> None:
+    with serve("quadruped", play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover(observations="full")
         (robot,) = client.articulations.values()
@@ -155,8 +155,8 @@ async def test_root_frames_of_a_free_base_agree_with_mujoco(connect: Any) -> Non
         assert np.allclose(np.roll(robot.root_quat_xyzw, 1), robot.root_quat_w)
 
 
-async def test_handles_describe_the_compiled_model(connect: Any) -> None:
-    with SimulatedServer("arm", play=True) as server:
+async def test_handles_describe_the_compiled_model(connect: Any, serve: Any) -> None:
+    with serve("arm", play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         (arm,) = client.articulations.values()
@@ -178,8 +178,8 @@ async def test_handles_describe_the_compiled_model(connect: Any) -> None:
             assert np.allclose(np.linalg.norm(body.xquat), 1)
 
 
-async def test_set_points_are_partial_and_misspelled_names_are_told(connect: Any) -> None:
-    with SimulatedServer("arm", play=True) as server:
+async def test_set_points_are_partial_and_misspelled_names_are_told(connect: Any, serve: Any, applied: Any) -> None:
+    with serve("arm", play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         (arm,) = client.articulations.values()
@@ -193,11 +193,11 @@ async def test_set_points_are_partial_and_misspelled_names_are_told(connect: Any
         assert arm.resolve_actuator("nonsense") is None
         assert arm.resolve_joint(f"{arm.prefix}_{next(iter(arm.joints))}") == next(iter(arm.joints))
         await client.step()
-        assert arm.last_applied_ctrl[0] == np.float32(0.1)
+        assert arm.last_applied_ctrl[0] == applied(0.1)
 
 
-async def test_reset_finds_a_keyframe_by_its_short_name(connect: Any) -> None:
-    with SimulatedServer("quadruped", play=True) as server:
+async def test_reset_finds_a_keyframe_by_its_short_name(connect: Any, serve: Any) -> None:
+    with serve("quadruped", play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         (robot,) = client.articulations.values()
@@ -210,8 +210,8 @@ async def test_reset_finds_a_keyframe_by_its_short_name(connect: Any) -> None:
             await client.reset(keyframe_name="homme")
 
 
-async def test_an_ambiguous_keyframe_is_refused(connect: Any) -> None:
-    with SimulatedServer("quadruped", "quadruped", play=True) as server:
+async def test_an_ambiguous_keyframe_is_refused(connect: Any, serve: Any) -> None:
+    with serve("quadruped", "quadruped", play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         with pytest.raises(UnknownKeyframe, match="could mean"):
@@ -220,8 +220,8 @@ async def test_an_ambiguous_keyframe_is_refused(connect: Any) -> None:
         await client.reset(keyframe_name=f"{one.prefix}_home")
 
 
-async def test_reset_overrides_single_joints(connect: Any) -> None:
-    with SimulatedServer("arm", play=True) as server:
+async def test_reset_overrides_single_joints(connect: Any, serve: Any) -> None:
+    with serve("arm", play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         (arm,) = client.articulations.values()
@@ -232,8 +232,8 @@ async def test_reset_overrides_single_joints(connect: Any) -> None:
             await client.reset(per_articulation_qpos={arm.prefix: {"nonsense": 0.25}})
 
 
-async def test_observation_levels(connect: Any) -> None:
-    with SimulatedServer("quadruped", play=True) as server:
+async def test_observation_levels(connect: Any, serve: Any) -> None:
+    with serve("quadruped", play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover(observations="minimal")
         (robot,) = client.articulations.values()
@@ -250,8 +250,8 @@ async def test_observation_levels(connect: Any) -> None:
             await client.step(observations="everything")
 
 
-async def test_discover_again_keeps_what_the_user_holds(connect: Any) -> None:
-    with SimulatedServer("arm", play=True) as server:
+async def test_discover_again_keeps_what_the_user_holds(connect: Any, serve: Any, applied: Any) -> None:
+    with serve("arm", play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         (arm,) = client.articulations.values()
@@ -264,13 +264,13 @@ async def test_discover_again_keeps_what_the_user_holds(connect: Any) -> None:
         assert client.articulations[arm.prefix] == arm
         assert client.step_count == 0, "steps are counted from the handshake on"
         assert (await client.step()).step == client.step_count == 1
-        assert arm.last_applied_ctrl[0] == np.float32(0.2)
+        assert arm.last_applied_ctrl[0] == applied(0.2)
         assert actuator.value == 0.2
 
 
 @pytest.mark.parametrize("on", [True, False])
-async def test_options_are_those_of_the_server_in_the_local_model(connect: Any, on: bool) -> None:
-    with SimulatedServer("ball", play=True) as server:
+async def test_options_are_those_of_the_server_in_the_local_model(connect: Any, serve: Any, on: bool) -> None:
+    with serve("ball", play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         opt = client.model.opt
@@ -284,8 +284,8 @@ async def test_options_are_those_of_the_server_in_the_local_model(connect: Any, 
         assert (opt.gravity.tolist(), opt.integrator) == ([0.0, 0.0, -1.5], mujoco.mjtIntegrator.mjINT_RK4)
 
 
-async def test_closing_takes_back_the_mode_that_discover_promoted_and_no_other(connect: Any) -> None:
-    with SimulatedServer("ball", play=True) as server:
+async def test_closing_takes_back_the_mode_that_discover_promoted_and_no_other(connect: Any, serve: Any) -> None:
+    with serve("ball", play=True) as server:
 
         async def mode_after(client: Any) -> str:
             await client.close()
@@ -308,8 +308,8 @@ async def test_closing_takes_back_the_mode_that_discover_promoted_and_no_other(c
         assert await mode_after(finding) == "direct", "somebody else's choice"
 
 
-async def test_a_second_client_takes_over_and_the_first_is_told(connect: Any) -> None:
-    with SimulatedServer("ball", play=True) as server:
+async def test_a_second_client_takes_over_and_the_first_is_told(connect: Any, serve: Any) -> None:
+    with serve("ball", play=True) as server:
         first, second = connect(server, step_mode="direct"), connect(server, step_mode="direct")
         await first.discover()
         await second.discover()
@@ -318,8 +318,8 @@ async def test_a_second_client_takes_over_and_the_first_is_told(connect: Any) ->
         await second.step()
 
 
-async def test_without_a_local_model_the_arrays_still_come(connect: Any) -> None:
-    with SimulatedServer("arm", play=True) as server:
+async def test_without_a_local_model_the_arrays_still_come(connect: Any, serve: Any, applied: Any) -> None:
+    with serve("arm", play=True) as server:
         client = connect(server, step_mode="direct", local_model=False)
         await client.discover()
         assert client.model is None
@@ -327,13 +327,13 @@ async def test_without_a_local_model_the_arrays_still_come(connect: Any) -> None
         arm.set_ctrl({next(iter(arm.actuators)): 0.3})
         await client.step(5)
         assert len(arm.qpos_array) == 8
-        assert arm.last_applied_ctrl[0] == np.float32(0.3)
+        assert arm.last_applied_ctrl[0] == applied(0.3)
         with pytest.raises(URLabError, match="local_model=True"):
             _ = arm.root_pos_w
 
 
-async def test_modes_are_promoted_and_taken_back(connect: Any) -> None:
-    with SimulatedServer("ball", play=True) as server:
+async def test_modes_are_promoted_and_taken_back(connect: Any, serve: Any) -> None:
+    with serve("ball", play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         assert client.step_mode is StepMode.DIRECT
@@ -345,8 +345,8 @@ async def test_modes_are_promoted_and_taken_back(connect: Any) -> None:
         assert reply.previous_mode == "puppet"
 
 
-async def test_closing_reverts_only_its_own_promotion(connect: Any) -> None:
-    with SimulatedServer("ball", play=True) as server:
+async def test_closing_reverts_only_its_own_promotion(connect: Any, serve: Any) -> None:
+    with serve("ball", play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         await client.close()
@@ -364,10 +364,10 @@ def _set_mode(mode: str) -> Any:
 
 @pytest.mark.parametrize("pinned", [True, False])
 @pytest.mark.parametrize("step_mode", ["auto", "direct"])
-async def test_the_mode_that_the_server_is_in_already(connect: Any, pinned: bool, step_mode: str) -> None:
+async def test_the_mode_that_the_server_is_in_already(connect: Any, serve: Any, pinned: bool, step_mode: str) -> None:
     """session-ops.md, sections 6 and 9.6: no op tells the mode, a pinned server refuses to change it, and play starts
     paused."""
-    with SimulatedServer("ball", play=True, step_mode="direct" if pinned else "auto") as server:
+    with serve("ball", play=True, step_mode="direct" if pinned else "auto") as server:
         if not pinned:
             before = connect(server, step_mode="direct", auto_promote_step_mode=False)
             await before.discover()
@@ -384,8 +384,8 @@ async def test_the_mode_that_the_server_is_in_already(connect: Any, pinned: bool
         assert await client.runtime.set_mode("direct") is StepMode.DIRECT
 
 
-async def test_a_server_that_is_pinned_to_another_mode(connect: Any) -> None:
-    with SimulatedServer("ball", play=True, step_mode="puppet") as server:
+async def test_a_server_that_is_pinned_to_another_mode(connect: Any, serve: Any) -> None:
+    with serve("ball", play=True, step_mode="puppet") as server:
         client = connect(server, step_mode="direct")
         with pytest.raises(ModeLocked, match="puppet"):
             await client.discover()
@@ -395,8 +395,8 @@ async def test_a_server_that_is_pinned_to_another_mode(connect: Any) -> None:
         assert (await client.step(5)).time == client.data.time == pytest.approx(5 * client.model.opt.timestep)
 
 
-async def test_auto_follows_a_server_in_puppet_mode(connect: Any) -> None:
-    with SimulatedServer("ball", play=True, step_mode="puppet") as server:
+async def test_auto_follows_a_server_in_puppet_mode(connect: Any, serve: Any) -> None:
+    with serve("ball", play=True, step_mode="puppet") as server:
         client = connect(server)
         await client.discover()
         reply = await client.step(5)
@@ -404,8 +404,8 @@ async def test_auto_follows_a_server_in_puppet_mode(connect: Any) -> None:
         assert reply.time == client.data.time == pytest.approx(5 * client.model.opt.timestep)
 
 
-async def test_auto_stays_live_where_the_server_is(connect: Any) -> None:
-    with SimulatedServer("ball", play=True) as server:
+async def test_auto_stays_live_where_the_server_is(connect: Any, serve: Any) -> None:
+    with serve("ball", play=True) as server:
         client = connect(server)
         await client.discover()
         for n_steps in (1, 5):
@@ -414,8 +414,10 @@ async def test_auto_stays_live_where_the_server_is(connect: Any) -> None:
 
 
 @pytest.mark.parametrize(("actual", "expected"), [("live", "direct"), ("direct", "live"), ("live", "puppet")])
-async def test_a_mode_that_was_not_to_be_changed_is_told_apart(connect: Any, actual: str, expected: str) -> None:
-    with SimulatedServer("ball", play=True, step_mode=actual, unpaused=True) as server:
+async def test_a_mode_that_was_not_to_be_changed_is_told_apart(
+    connect: Any, serve: Any, actual: str, expected: str
+) -> None:
+    with serve("ball", play=True, step_mode=actual, unpaused=True) as server:
         client = connect(server, step_mode=expected, auto_promote_step_mode=False)
         await client.discover()
         with pytest.raises(URLabError, match=rf"step mode {actual}, .*not in {expected}.*set_mode\('{expected}'\)"):
@@ -424,8 +426,8 @@ async def test_a_mode_that_was_not_to_be_changed_is_told_apart(connect: Any, act
         assert (await client.step(5)).step == (10 if actual == "direct" else 0)
 
 
-async def test_live_is_asked_for_where_somebody_left_another_mode(connect: Any) -> None:
-    with SimulatedServer("ball", play=True) as server:
+async def test_live_is_asked_for_where_somebody_left_another_mode(connect: Any, serve: Any) -> None:
+    with serve("ball", play=True) as server:
         left = connect(server)
         await left.discover()
         await left.runtime.set_mode("direct")
@@ -435,9 +437,9 @@ async def test_live_is_asked_for_where_somebody_left_another_mode(connect: Any) 
 
 
 @pytest.mark.parametrize(("mode", "n_steps"), [("direct", 0), ("direct", -1), ("live", 0), ("puppet", -1)])
-async def test_fewer_steps_than_there_can_be_are_refused(connect: Any, mode: str, n_steps: int) -> None:
+async def test_fewer_steps_than_there_can_be_are_refused(connect: Any, serve: Any, mode: str, n_steps: int) -> None:
     """simulation.md, section 2.4: the server takes one step where none was asked for."""
-    with SimulatedServer("ball", play=True) as server:
+    with serve("ball", play=True) as server:
         client = connect(server, step_mode=mode)
         await client.discover()
         with pytest.raises(ValueError, match=rf"^step: n_steps is at least .* got {n_steps}"):
@@ -445,8 +447,8 @@ async def test_fewer_steps_than_there_can_be_are_refused(connect: Any, mode: str
         assert (await client.runtime.forward()).step == 0
 
 
-async def test_calls_before_the_handshake_say_so(connect: Any) -> None:
-    with SimulatedServer("ball", play=True) as server:
+async def test_calls_before_the_handshake_say_so(connect: Any, serve: Any) -> None:
+    with serve("ball", play=True) as server:
         client = connect(server)
         for call in (client.scene.current_level, client.step, client.reset, client.runtime.forward):
             with pytest.raises(NoSession, match=r"^\w+: no session is open\. Call discover\(\) first\.$"):
@@ -455,8 +457,8 @@ async def test_calls_before_the_handshake_say_so(connect: Any) -> None:
         assert (await client.step()).step == 0
 
 
-async def test_live_mode_hands_over_set_points(connect: Any) -> None:
-    with SimulatedServer("arm", play=True) as server:
+async def test_live_mode_hands_over_set_points(connect: Any, serve: Any) -> None:
+    with serve("arm", play=True) as server:
         client = connect(server, step_mode="live")
         await client.discover()
         (arm,) = client.articulations.values()
@@ -466,8 +468,8 @@ async def test_live_mode_hands_over_set_points(connect: Any) -> None:
         assert await client.runtime.set_paused(False) is False
 
 
-async def test_puppet_mode_pushes_the_local_state(connect: Any, asset: Any) -> None:
-    with SimulatedServer(asset("humanoid.xml"), play=True) as server:
+async def test_puppet_mode_pushes_the_local_state(connect: Any, serve: Any, asset: Any) -> None:
+    with serve(asset("humanoid.xml"), play=True) as server:
         client = connect(server, step_mode="puppet")
         await client.discover(observations="full")
         (robot,) = client.articulations.values()
@@ -487,8 +489,8 @@ async def test_puppet_mode_pushes_the_local_state(connect: Any, asset: Any) -> N
 
 
 @pytest.mark.parametrize("mode", ["raw", "ue_controller"])
-async def test_control_mode(connect: Any, mode: str) -> None:
-    with SimulatedServer("quadruped", play=True, controllers={"*": ControllerConfig()}) as server:
+async def test_control_mode(connect: Any, serve: Any, mode: str) -> None:
+    with serve("quadruped", play=True, controllers={"*": ControllerConfig()}) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         (robot,) = client.articulations.values()
@@ -503,10 +505,10 @@ async def test_control_mode(connect: Any, mode: str) -> None:
             robot.control_mode = "autopilot"
 
 
-async def test_gains(connect: Any) -> None:
+async def test_gains(connect: Any, serve: Any) -> None:
     from urlab_client import ControllerSchemaViolation
 
-    with SimulatedServer("quadruped", play=True, controllers={"*": ControllerConfig()}) as server:
+    with serve("quadruped", play=True, controllers={"*": ControllerConfig()}) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         (robot,) = client.articulations.values()

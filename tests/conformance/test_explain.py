@@ -6,7 +6,7 @@ import socket
 from typing import Any
 
 from urlab_client import Verdict
-from urlab_client.server import ControllerConfig, SimulatedServer
+from urlab_client.server import ControllerConfig
 
 
 def problems(diagnosis: Any) -> str:
@@ -24,13 +24,13 @@ async def test_nobody_there(connect: Any) -> None:
     assert "is the server running" in problems(diagnosis)
 
 
-async def test_no_session(connect: Any) -> None:
-    with SimulatedServer("arm", play=True) as server:
+async def test_no_session(connect: Any, serve: Any) -> None:
+    with serve("arm", play=True) as server:
         assert "Call discover() first" in problems(await connect(server).explain())
 
 
-async def test_a_session_that_was_taken_over_is_not_a_problem_of_play(connect: Any) -> None:
-    with SimulatedServer("arm", play=True) as server:
+async def test_a_session_that_was_taken_over_is_not_a_problem_of_play(connect: Any, serve: Any) -> None:
+    with serve("arm", play=True) as server:
         client, other = connect(server), connect(server)
         await client.discover()
         await other.discover()
@@ -41,15 +41,15 @@ async def test_a_session_that_was_taken_over_is_not_a_problem_of_play(connect: A
         assert "Call discover()" in taken.text
 
 
-async def test_no_play(connect: Any) -> None:
-    with SimulatedServer("arm") as server:
+async def test_no_play(connect: Any, serve: Any) -> None:
+    with serve("arm") as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         assert "Play is off. Call sim.start()" in problems(await client.explain())
 
 
-async def test_paused(connect: Any) -> None:
-    with SimulatedServer("arm", play=True) as server:
+async def test_paused(connect: Any, serve: Any) -> None:
+    with serve("arm", play=True) as server:
         client = connect(server, step_mode="live")
         await client.discover()
         assert "it is paused. Call runtime.set_paused(False)" in problems(await client.explain())
@@ -57,8 +57,8 @@ async def test_paused(connect: Any) -> None:
         assert "paused" not in problems(await client.explain())
 
 
-async def test_forgotten_set_points_then_healthy(connect: Any) -> None:
-    with SimulatedServer("arm", play=True) as server:
+async def test_forgotten_set_points_then_healthy(connect: Any, serve: Any) -> None:
+    with serve("arm", play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         text = str(await client.explain())
@@ -72,8 +72,8 @@ async def test_forgotten_set_points_then_healthy(connect: Any) -> None:
         assert "Set-points act directly" in str(diagnosis)
 
 
-async def test_control_source(connect: Any) -> None:
-    with SimulatedServer("arm", play=True) as server:
+async def test_control_source(connect: Any, serve: Any) -> None:
+    with serve("arm", play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         (arm,) = client.articulations.values()
@@ -83,15 +83,15 @@ async def test_control_source(connect: Any) -> None:
         assert "set_control_source('zmq')" in problems(await client.explain())
 
 
-async def test_a_torque_limit_of_zero(connect: Any) -> None:
-    with SimulatedServer("quadruped", play=True, controllers={"*": ControllerConfig(torque_limit=0)}) as server:
+async def test_a_torque_limit_of_zero(connect: Any, serve: Any) -> None:
+    with serve("quadruped", play=True, controllers={"*": ControllerConfig(torque_limit=0)}) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         assert "A torque limit of 0 means no torque at all" in problems(await client.explain())
 
 
-async def test_another_client_changed_the_mode(connect: Any) -> None:
-    with SimulatedServer("ball", play=True) as server:
+async def test_another_client_changed_the_mode(connect: Any, serve: Any) -> None:
+    with serve("ball", play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         reply = await client.call(_live())

@@ -5,12 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pytest
 
-from urlab_client.server import SimulatedServer
 
-
-async def test_snapshots_arrive_and_the_robot_follows(connect: Any) -> None:
-    with SimulatedServer("ball", play=True, unpaused=True) as server:
+async def test_snapshots_arrive_and_the_robot_follows(connect: Any, serve: Any) -> None:
+    with serve("ball", play=True, unpaused=True) as server:
         client = connect(server, step_mode="live")
         await client.discover()
         stream = client.state_stream()
@@ -28,8 +27,9 @@ async def test_snapshots_arrive_and_the_robot_follows(connect: Any) -> None:
             assert np.array_equal(client.data.qpos[:3], ball.qpos_array[:3])
 
 
-async def test_rows_on_demand(connect: Any) -> None:
-    with SimulatedServer("quadruped", play=True, unpaused=True) as server:
+@pytest.mark.parametrize("dialect", ["alpha"])
+async def test_rows_on_demand(connect: Any, serve: Any) -> None:
+    with serve("quadruped", play=True, unpaused=True) as server:
         client = connect(server, step_mode="live")
         await client.discover()
         (robot,) = client.articulations.values()
@@ -42,8 +42,8 @@ async def test_rows_on_demand(connect: Any) -> None:
         assert set(seen) == set(robot.joints) - {"root"}
 
 
-async def test_events_tell_the_story(connect: Any) -> None:
-    with SimulatedServer("ball", play=True) as server:
+async def test_events_tell_the_story(connect: Any, serve: Any) -> None:
+    with serve("ball", play=True) as server:
         client = connect(server, step_mode="direct")
         events = client.events()
         await client.discover()
@@ -52,8 +52,8 @@ async def test_events_tell_the_story(connect: Any) -> None:
         assert told == ["ServerConnected", "SessionOpened", "PlayStarted", "PlayEnded"]
 
 
-async def test_pictures_by_themselves(connect: Any) -> None:
-    with SimulatedServer("quadruped", play=True, unpaused=True, camera_size=(64, 48)) as server:
+async def test_pictures_by_themselves(connect: Any, serve: Any) -> None:
+    with serve("quadruped", play=True, unpaused=True, camera_size=(64, 48)) as server:
         client = connect(server, step_mode="live")
         await client.discover()
         (robot,) = client.articulations.values()

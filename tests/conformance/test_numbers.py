@@ -30,11 +30,11 @@ BOT = """
 NAN, INF = math.nan, math.inf
 
 
-@pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    path = Path(tmp_path_factory.mktemp("bot")) / "bot.xml"
+@pytest.fixture
+def server(serve: Any, models: Path) -> Any:
+    path = models / "bot.xml"
     path.write_text(BOT)
-    with SimulatedServer(path, play=True, controllers={"bot": ControllerConfig()}) as running:
+    with serve(path, play=True, controllers={"bot": ControllerConfig()}) as running:
         yield running
 
 
@@ -238,14 +238,14 @@ async def test_without_a_model_no_range_is_known(connect: Any, server: Simulated
 async def test_explain_names_set_points_that_cannot_be_right(client: Any) -> None:
     bot = client.articulations["bot"]
     bot.ctrl_array[:] = [NAN, 0, 0, 0]
-    (finding,) = [f for f in (await client.explain()).findings if f.subject == "bot"]
+    finding = next(f for f in (await client.explain()).findings if f.subject == "bot")
     assert finding.verdict is Verdict.PROBLEM
     assert "not finite, so that step() refuses them: 'swing' nan" in finding.text
     bot.ctrl_array[:] = [5, 0, 0, 0]
     await client.step()
-    findings = [f for f in (await client.explain()).findings if f.subject == "bot"]
-    assert findings[0].verdict is Verdict.NOTE
-    assert "Set-points out of range: 'swing' 5 (-2 to 2); MuJoCo clamps them." in findings[0].text
+    finding = next(f for f in (await client.explain()).findings if f.subject == "bot")
+    assert finding.verdict is Verdict.NOTE
+    assert "Set-points out of range: 'swing' 5 (-2 to 2); MuJoCo clamps them." in finding.text
     bot.control_mode = "ue_controller"
-    findings = [f for f in (await client.explain()).findings if f.subject == "bot"]
-    assert "'swing' 5 (-1.5 to 1.5); targets beyond the limits of their joints" in findings[0].text
+    finding = next(f for f in (await client.explain()).findings if f.subject == "bot")
+    assert "'swing' 5 (-1.5 to 1.5); targets beyond the limits of their joints" in finding.text

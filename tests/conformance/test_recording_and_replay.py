@@ -8,11 +8,10 @@ from typing import Any
 import pytest
 
 from urlab_client import PathNotWritable, ReplayRequiresStepped, ReplaySessionNotFound
-from urlab_client.server import SimulatedServer
 
 
-async def test_record_save_and_play(connect: Any, tmp_path: Path) -> None:
-    with SimulatedServer("ball", play=True, saved_dir=tmp_path) as server:
+async def test_record_save_and_play(connect: Any, serve: Any, tmp_path: Path) -> None:
+    with serve("ball", play=True, saved_dir=tmp_path) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         with pytest.raises(PathNotWritable):
@@ -39,18 +38,20 @@ async def test_record_save_and_play(connect: Any, tmp_path: Path) -> None:
             await client.replay.play("ep")
 
 
-async def test_options_reach_the_mirror(connect: Any) -> None:
-    with SimulatedServer("ball", play=True) as server:
+async def test_options_reach_the_mirror(connect: Any, serve: Any) -> None:
+    with serve("ball", play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
-        options = await client.runtime.set_sim_options(timestep=0.001, gravity=(0, 0, -1.62), solver="cg")
+        options = await client.runtime.set_sim_options(
+            timestep=0.001, gravity=(0, 0, -1.62), solver="CG", integrator="RK4"
+        )
         assert client.model.opt.timestep == options.timestep == pytest.approx(0.001)
         assert client.model.opt.gravity[2] == pytest.approx(-1.62)
-        assert options.solver == "cg"
+        assert (options.solver, options.integrator, options.cone) == ("cg", "rk4", "pyramidal")
 
 
-async def test_clearing_and_choosing_a_session(connect: Any, tmp_path: Path) -> None:
-    with SimulatedServer("ball", play=True, saved_dir=tmp_path) as server:
+async def test_clearing_and_choosing_a_session(connect: Any, serve: Any, tmp_path: Path) -> None:
+    with serve("ball", play=True, saved_dir=tmp_path) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         await client.recording.start()

@@ -10,7 +10,7 @@ import pytest
 
 import urlab_client
 from urlab_client.enums import CameraTiming, ControlMode, StepMode
-from urlab_client.server import ControllerConfig, SimulatedServer
+from urlab_client.server import ControllerConfig
 
 ROBOT = """
 <mujoco model="robot"><compiler angle="radian"/><worldbody>
@@ -30,11 +30,11 @@ PALLET = """
 
 
 @pytest.fixture
-def scene(tmp_path: Path) -> Any:
-    (tmp_path / "robot.xml").write_text(ROBOT)
-    (tmp_path / "pallet.xml").write_text(PALLET)
-    with SimulatedServer(
-        str(tmp_path / "robot.xml"), str(tmp_path / "pallet.xml"), play=True, controllers={"robot": ControllerConfig()}
+def scene(serve: Any, models: Path) -> Any:
+    (models / "robot.xml").write_text(ROBOT)
+    (models / "pallet.xml").write_text(PALLET)
+    with serve(
+        models / "robot.xml", models / "pallet.xml", play=True, controllers={"robot": ControllerConfig()}
     ) as server:
         yield server
 

@@ -10,14 +10,19 @@ from typing import Any
 import numpy as np
 import pytest
 
+from urlab_client.protocol.base import DialectName
 from urlab_client.server import SimulatedServer
 
 
 @pytest.fixture
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimulatedServer]:
-    with SimulatedServer(
-        "quadruped", play=True, camera_size=(64, 48), shm_dir=tmp_path_factory.getbasetemp()
-    ) as server:
+def transport() -> str:
+    """Of these tests, unless they say another one."""
+    return "shm"
+
+
+@pytest.fixture
+def server(serve: Any) -> Iterator[SimulatedServer]:
+    with serve("quadruped", play=True, camera_size=(64, 48)) as server:
         yield server
 
 
@@ -85,8 +90,8 @@ async def test_a_second_client_goes_on_over_zmq(connect: Any, server: SimulatedS
     assert any("another client" in reason for reason in second.transport_stats.over_zmq)
 
 
-async def test_a_server_of_ones_own_has_it_too(connect: Any) -> None:
-    client = connect(address="sim://ball", transport="shm", step_mode="direct")
+async def test_a_server_of_ones_own_has_it_too(connect: Any, dialect: DialectName) -> None:
+    client = connect(address=f"sim://ball?dialect={dialect}", transport="shm", step_mode="direct")
     await client.discover()
     for _ in range(4):
         await client.step()
@@ -94,17 +99,17 @@ async def test_a_server_of_ones_own_has_it_too(connect: Any) -> None:
     assert client.step_count == 4
 
 
-async def test_a_server_without_it_is_a_clear_error(connect: Any) -> None:
+async def test_a_server_without_it_is_a_clear_error(connect: Any, dialect: DialectName) -> None:
     from urlab_client import URLabConnectionError
 
-    with SimulatedServer("ball", play=True) as server:
+    with SimulatedServer("ball", play=True, dialect=dialect) as server:
         client = connect(server, transport="shm")
         with pytest.raises(URLabConnectionError, match="names no directory of shared memory"):
             await client.discover()
 
 
-async def test_nothing_stays_in_the_directory(connect: Any, tmp_path: Path) -> None:
-    with SimulatedServer("ball", play=True, shm_dir=tmp_path) as server:
+async def test_nothing_stays_in_the_directory(connect: Any, dialect: DialectName, tmp_path: Path) -> None:
+    with SimulatedServer("ball", play=True, shm_dir=tmp_path, dialect=dialect) as server:
         client = await discovered(connect, server, transport="shm")
         await client.step()
         await client.step()

@@ -13,7 +13,7 @@ import pytest
 
 from urlab_client import DimMismatch, NotMocapBody, UnknownArticulation, UnknownBody
 from urlab_client.enums import ActuatorType, CameraMode
-from urlab_client.server import ControllerConfig, SimulatedServer
+from urlab_client.server import ControllerConfig
 
 BOT = """
 <mujoco model="bot"><compiler angle="radian"/><worldbody>
@@ -34,14 +34,14 @@ BOT = """
 
 
 @pytest.fixture
-def bot(tmp_path: Path) -> str:
-    path = tmp_path / "bot.xml"
+def bot(models: Path) -> str:
+    path = models / "bot.xml"
     path.write_text(BOT)
     return str(path)
 
 
-async def test_who_answers(connect: Any, bot: str) -> None:
-    with SimulatedServer(bot, play=True) as server:
+async def test_who_answers(connect: Any, serve: Any, bot: str) -> None:
+    with serve(bot, play=True) as server:
         client = connect(server, step_mode="direct")
         assert (client.urlab_version, client.mujoco_version, client.session_id) == ("", "", "")
         await client.discover()
@@ -54,8 +54,8 @@ async def test_who_answers(connect: Any, bot: str) -> None:
         assert repr(getattr(client, "twin", client)).endswith("connected>")
 
 
-async def test_clocks(connect: Any, bot: str) -> None:
-    with SimulatedServer(bot, play=True) as server:
+async def test_clocks(connect: Any, serve: Any, bot: str) -> None:
+    with serve(bot, play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         before = time.time()
@@ -69,8 +69,8 @@ async def test_clocks(connect: Any, bot: str) -> None:
         assert client.step_count == 700
 
 
-async def test_arrays_follow_the_model(connect: Any, bot: str) -> None:
-    with SimulatedServer(bot, play=True) as server:
+async def test_arrays_follow_the_model(connect: Any, serve: Any, bot: str) -> None:
+    with serve(bot, play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         (art,) = client.articulations.values()
@@ -90,8 +90,8 @@ async def test_arrays_follow_the_model(connect: Any, bot: str) -> None:
         assert not np.array_equal(art.qpos_array, copy)
 
 
-async def test_what_a_user_writes_into_arrays_stays_with_the_user(connect: Any, bot: str) -> None:
-    with SimulatedServer(bot, play=True) as server:
+async def test_what_a_user_writes_into_arrays_stays_with_the_user(connect: Any, serve: Any, bot: str) -> None:
+    with serve(bot, play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover(observations="full")
         (art,) = client.articulations.values()
@@ -111,8 +111,8 @@ async def test_what_a_user_writes_into_arrays_stays_with_the_user(connect: Any, 
         assert art.get_qpos()["slide"] == before["dof_qpos"][1]
 
 
-async def test_forward_leaves_the_state_of_a_puppets_user_alone(connect: Any, bot: str) -> None:
-    with SimulatedServer(bot, play=True) as server:
+async def test_forward_leaves_the_state_of_a_puppets_user_alone(connect: Any, serve: Any, bot: str) -> None:
+    with serve(bot, play=True) as server:
         client = connect(server, step_mode="puppet")
         await client.discover()
         client.data.qpos[2] = 5.0
@@ -138,10 +138,10 @@ MIMO = """
 """
 
 
-async def test_forces_of_actuators_with_several_inputs_and_outputs(connect: Any, tmp_path: Path) -> None:
+async def test_forces_of_actuators_with_several_inputs_and_outputs(connect: Any, serve: Any, tmp_path: Path) -> None:
     """Inputs, as in `ctrl`, and outputs, as in `actuator_force`, both in actuator order, are not as many."""
     (tmp_path / "mimo.xml").write_text(MIMO)
-    with SimulatedServer(tmp_path / "mimo.xml", play=True) as server:
+    with serve(tmp_path / "mimo.xml", play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover(observations="full")
         (art,) = client.articulations.values()
@@ -155,10 +155,10 @@ async def test_forces_of_actuators_with_several_inputs_and_outputs(connect: Any,
 
 
 async def test_forces_without_a_model_are_told_where_it_is_clear_whose_they_are(
-    connect: Any, bot: str, tmp_path: Path
+    connect: Any, serve: Any, bot: str, tmp_path: Path
 ) -> None:
     (tmp_path / "mimo.xml").write_text(MIMO)
-    with SimulatedServer(bot, tmp_path / "mimo.xml", play=True) as server:
+    with serve(bot, tmp_path / "mimo.xml", play=True) as server:
         client = connect(server, step_mode="direct", local_model=False)
         await client.discover(observations="full")
         simple, mimo = client.articulations["bot"], client.articulations["mimo"]
@@ -168,8 +168,8 @@ async def test_forces_without_a_model_are_told_where_it_is_clear_whose_they_are(
         assert [actuator.force for actuator in mimo.actuators.values()] == [None] * 3
 
 
-async def test_handles(connect: Any, bot: str) -> None:
-    with SimulatedServer(bot, play=True) as server:
+async def test_handles(connect: Any, serve: Any, bot: str) -> None:
+    with serve(bot, play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover(observations="full")
         (art,) = client.articulations.values()
@@ -192,8 +192,8 @@ async def test_handles(connect: Any, bot: str) -> None:
         assert (camera.dtype, camera.latest_frame, camera.sim_time) == (np.dtype(np.uint8), None, None)
 
 
-async def test_set_qpos_is_mirrored(connect: Any, bot: str) -> None:
-    with SimulatedServer(bot, play=True) as server:
+async def test_set_qpos_is_mirrored(connect: Any, serve: Any, bot: str) -> None:
+    with serve(bot, play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         (art,) = client.articulations.values()
@@ -211,8 +211,8 @@ async def test_set_qpos_is_mirrored(connect: Any, bot: str) -> None:
             await client.runtime.set_qpos("ghost", [0] * 9)
 
 
-async def test_contacts(connect: Any, bot: str) -> None:
-    with SimulatedServer(bot, play=True) as server:
+async def test_contacts(connect: Any, serve: Any, bot: str) -> None:
+    with serve(bot, play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         (art,) = client.articulations.values()
@@ -230,8 +230,8 @@ async def test_contacts(connect: Any, bot: str) -> None:
         assert one.contacts[0].geom2 == contact.geom2
 
 
-async def test_mocap_keyframes_twist_and_speed(connect: Any, bot: str) -> None:
-    with SimulatedServer(bot, play=True) as server:
+async def test_mocap_keyframes_twist_and_speed(connect: Any, serve: Any, bot: str) -> None:
+    with serve(bot, play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         (art,) = client.articulations.values()
@@ -253,8 +253,8 @@ async def test_mocap_keyframes_twist_and_speed(connect: Any, bot: str) -> None:
         assert await client.runtime.set_sim_speed(250) == 100.0
 
 
-async def test_looking_around(connect: Any, bot: str) -> None:
-    with SimulatedServer(bot, "ball", play=True) as server:
+async def test_looking_around(connect: Any, serve: Any, bot: str) -> None:
+    with serve(bot, "ball", play=True) as server:
         client = connect(server)
         await client.discover()
         robots = await client.outliner.find_actors(class_filter="AMjArticulation")
@@ -266,8 +266,8 @@ async def test_looking_around(connect: Any, bot: str) -> None:
         assert {b.short_name for b in await client.outliner.list_blueprints()} == {"bot", "ball"}
 
 
-async def test_the_controller_knows_its_articulation(connect: Any, bot: str) -> None:
-    with SimulatedServer(bot, play=True, controllers={"bot": ControllerConfig(kp=7)}) as server:
+async def test_the_controller_knows_its_articulation(connect: Any, serve: Any, bot: str) -> None:
+    with serve(bot, play=True, controllers={"bot": ControllerConfig(kp=7)}) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         (art,) = client.articulations.values()
@@ -280,8 +280,8 @@ async def test_the_controller_knows_its_articulation(connect: Any, bot: str) -> 
         assert configured["default_kp"] == 9.0
 
 
-async def test_state_belongs_together_under_the_lock(connect: Any, bot: str) -> None:
-    with SimulatedServer(bot, play=True) as server:
+async def test_state_belongs_together_under_the_lock(connect: Any, serve: Any, bot: str) -> None:
+    with serve(bot, play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         torn: list[float] = []
@@ -303,8 +303,8 @@ async def test_state_belongs_together_under_the_lock(connect: Any, bot: str) -> 
         assert torn == []
 
 
-async def test_without_a_local_model_none_is_loaded(connect: Any) -> None:
-    with SimulatedServer("ball", play=True) as server:
+async def test_without_a_local_model_none_is_loaded(connect: Any, serve: Any) -> None:
+    with serve("ball", play=True) as server:
         client = connect(server, step_mode="direct", local_model=False)
         await client.discover()
         assert (client.model, client.data) == (None, None)
@@ -313,8 +313,8 @@ async def test_without_a_local_model_none_is_loaded(connect: Any) -> None:
         assert ball.qpos_array.tolist() == reply.per_articulation[ball.prefix].qpos.tolist()
 
 
-async def test_a_step_is_one_request_and_its_state_is_one_instant(connect: Any) -> None:
-    with SimulatedServer("quadruped", play=True) as server:
+async def test_a_step_is_one_request_and_its_state_is_one_instant(connect: Any, serve: Any) -> None:
+    with serve("quadruped", play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         (robot,) = client.articulations.values()
@@ -329,8 +329,8 @@ async def test_a_step_is_one_request_and_its_state_is_one_instant(connect: Any) 
         assert (client.transport_stats.sent, client.transport_stats.received) == (sent + 3, received + 3)
 
 
-async def test_play_that_runs_is_left_alone_by_start(connect: Any) -> None:
-    with SimulatedServer("ball", play=True) as server:
+async def test_play_that_runs_is_left_alone_by_start(connect: Any, serve: Any) -> None:
+    with serve("ball", play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         time = (await client.step(5)).time
@@ -341,7 +341,7 @@ async def test_play_that_runs_is_left_alone_by_start(connect: Any) -> None:
 
 @pytest.mark.mujoco("3.11")
 async def test_an_actuator_behind_one_of_several_controls_has_its_own_range_and_place(
-    connect: Any, tmp_path: Path
+    connect: Any, serve: Any, tmp_path: Path
 ) -> None:
     path = tmp_path / "multi.xml"
     path.write_text("""
@@ -352,7 +352,7 @@ async def test_an_actuator_behind_one_of_several_controls_has_its_own_range_and_
   <orientation name="o" joint="turn" kp="3"/>
   <motor name="last" joint="h" ctrlrange="-2 3" ctrllimited="true"/>
 </actuator></mujoco>""")
-    with SimulatedServer(path, play=True) as server:
+    with serve(path, play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         (robot,) = client.articulations.values()

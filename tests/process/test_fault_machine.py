@@ -40,7 +40,7 @@ from urlab_client.protocol.errors import (
     URLabTimeoutError,
 )
 from urlab_client.server import SimulatedServer
-from urlab_client.server.physics.engine import Engine
+from urlab_client.server.physics.integrator import Integrator
 
 LONG = bool(os.environ.get("URLAB_LONG_TESTS"))
 TIMEOUT_S = 0.3
@@ -65,7 +65,7 @@ class Steps:
 
     def __call__(self, model: Any, data: Any, nstep: int = 1) -> None:
         self._real(model, data, nstep)
-        if sys._getframe(1).f_code is Engine._integrate.__code__:
+        if sys._getframe(1).f_code is Integrator.advance.__code__:
             self.taken += nstep
 
 

@@ -21,8 +21,10 @@ from scenes import ASSETS, BALL, BOT, hasty, make_scene
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.messages.session import ArticulationCommand, Step
 from urlab_client.server.physics import engine as engine_module
+from urlab_client.server.physics import pacing
 from urlab_client.server.physics.controllers import ControllerConfig, ControlSource
-from urlab_client.server.physics.engine import Engine, parse_control_source, parse_mode
+from urlab_client.server.physics.engine import Engine
+from urlab_client.server.physics.parsing import parse_control_source, parse_mode
 from urlab_client.server.refusal import Refusal
 
 DT = 0.002
@@ -203,7 +205,8 @@ class PacedSim:
     """A live engine without its thread, driven through simulated seconds."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, clock: FakeClock) -> None:
-        monkeypatch.setattr(engine_module, "time", clock)
+        for module in (engine_module, pacing):
+            monkeypatch.setattr(module, "time", clock)
         self.clock = clock
         self.engine = Engine(make_scene(bot=BOT), paused=False)
         self.engine._wake = clock  # type: ignore[assignment] # a stand-in
@@ -320,7 +323,7 @@ class InlineOrQueued:
         if self.way == "queued":
             sim.engine._inline_budget_s = -1.0
         else:
-            sim.engine._substep_s, sim.engine._inline_budget_s = 1e-6, float("inf")
+            sim.engine._integrator.substep_s, sim.engine._inline_budget_s = 1e-6, float("inf")
 
 
 WAYS = pytest.mark.parametrize("way", [InlineOrQueued("inline"), InlineOrQueued("queued")], ids=lambda w: w.way)
@@ -544,12 +547,12 @@ def test_puppet_pushes_are_recorded(start: Start) -> None:
 def test_reset_returns_to_the_start_but_staged_set_points_survive(start: Start) -> None:
     sim = start()
     assert sim.command(ctrl=[0.25]) == [0.25]
-    sim.engine.set_twist("bot", [0.5, 0.25, 9], [9, 9, 1.5])
+    sim.engine.articulations.set_twist("bot", [0.5, 0.25, 9], [9, 9, 1.5])
     sim.engine.reset()
     assert (sim.engine.time, sim.engine.step_count) == (0.0, 0)
     assert sim.data.qpos.tolist() == sim.model.qpos0.tolist()
     assert sim.data.ctrl.tolist() == [0.0]
-    assert sim.engine.control("bot").twist.linear == (0.5, 0.25, 0.0)
+    assert sim.engine.articulations.control("bot").twist.linear == (0.5, 0.25, 0.0)
     sim.step()
     assert sim.data.ctrl.tolist() == [0.25]
 
@@ -644,49 +647,53 @@ def test_a_controller_acts_on_every_substep_and_raw_bypasses_it_for_one_request(
 def test_controllers_are_attached_by_key_with_a_default_for_the_rest() -> None:
     configs = {"a": ControllerConfig(kp=7.0), "*": ControllerConfig(kp=9.0)}
     engine = Engine(make_scene(a=BOT, b=BOT), controllers=configs)
-    gains = [control.controller.params()["default_kp"] for control in engine.controls.values() if control.controller]
+    gains = [
+        control.controller.params()["default_kp"]
+        for control in engine.articulations.controls.values()
+        if control.controller
+    ]
     assert gains == [7.0, 9.0]
 
 
 def test_configure_controller_answers_with_all_parameters_or_says_why_not(start: Start) -> None:
     sim = start(bot=BOT, two=BOT, options={"controllers": {"bot": ControllerConfig()}})
-    assert sim.engine.configure_controller("BOT", {"kp": {"m": 2.0}})["kp"] == {"m": 2.0}
-    assert sim.engine.configure_controller("bot", "nonsense")["kp"] == {"m": 2.0}
-    assert refused(lambda: sim.engine.configure_controller("who", {})) == "unknown_articulation"
-    assert refused(lambda: sim.engine.configure_controller("two", {})) == "no_controller"
+    assert sim.engine.articulations.configure_controller("BOT", {"kp": {"m": 2.0}})["kp"] == {"m": 2.0}
+    assert sim.engine.articulations.configure_controller("bot", "nonsense")["kp"] == {"m": 2.0}
+    assert refused(lambda: sim.engine.articulations.configure_controller("who", {})) == "unknown_articulation"
+    assert refused(lambda: sim.engine.articulations.configure_controller("two", {})) == "no_controller"
 
 
 def test_the_control_source_is_switched_for_one_or_for_all(start: Start) -> None:
     sim = start(a=BOT, b=BOT)
     sim.command("a", ctrl=[0.5])
     sim.command("b", ctrl=[0.25])
-    sim.engine.set_control_source(ControlSource.UI, "a")
+    sim.engine.articulations.set_source(ControlSource.UI, "a")
     assert sim.command("a", ctrl=[0.75]) == [0.0, 0.25]
-    sim.engine.set_control_source(ControlSource.UI)
+    sim.engine.articulations.set_source(ControlSource.UI)
     assert sim.command("a") == [0.0, 0.0]
-    sim.engine.set_control_source(ControlSource.ZMQ)
+    sim.engine.articulations.set_source(ControlSource.ZMQ)
     assert sim.command("a") == [0.75, 0.25]
-    assert refused(lambda: sim.engine.set_control_source(ControlSource.UI, "who")) == "unknown_articulation"
+    assert refused(lambda: sim.engine.articulations.set_source(ControlSource.UI, "who")) == "unknown_articulation"
 
 
 def test_articulations_are_found_in_any_case_the_exact_spelling_first(start: Start) -> None:
     sim = start(Bot=BOT, bot=BOT)
-    assert [sim.engine.control(key).index.key for key in ("Bot", "bot", "BOT")] == ["Bot", "bot", "Bot"]
-    assert sim.engine.find("who") is None
+    assert [sim.engine.articulations.control(key).index.key for key in ("Bot", "bot", "BOT")] == ["Bot", "bot", "Bot"]
+    assert sim.engine.articulations.find("who") is None
     with pytest.raises(Refusal) as caught:
-        sim.engine.control("who")
+        sim.engine.articulations.control("who")
     assert (caught.value.code, caught.value.message) == ("unknown_articulation", "who")
 
 
 def test_a_twist_moves_nothing(start: Start) -> None:
     sim = start()
-    twist = sim.engine.set_twist("bot", [5, 0, 0], [])
+    twist = sim.engine.articulations.set_twist("bot", [5, 0, 0], [])
     assert (twist.linear, twist.angular) == ((5.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     local = fresh(sim.model)
     sim.step(10)
     mujoco.mj_step(sim.model, local, 10)
     assert sim.data.qpos.tobytes() == local.qpos.tobytes()
-    assert refused(lambda: sim.engine.set_twist("who", [], [])) == "unknown_articulation"
+    assert refused(lambda: sim.engine.articulations.set_twist("who", [], [])) == "unknown_articulation"
 
 
 @WAYS

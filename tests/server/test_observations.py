@@ -63,7 +63,7 @@ def engine() -> Iterator[Engine]:
 
 @pytest.fixture
 def observer(engine: Engine) -> Observer:
-    return Observer(engine.scene, engine.controls)
+    return Observer(engine.scene, engine.articulations.controls)
 
 
 MINIMAL = {"qpos", "qvel", "twist", "actions"}
@@ -136,7 +136,7 @@ def test_what_was_observed_does_not_change_with_later_steps(engine: Engine, obse
 
 
 def test_the_twist_is_reported_at_every_level_and_survives_reset(engine: Engine, observer: Observer) -> None:
-    engine.set_twist("bot", [0.5, 0.25, 9], [9, 9, 1.5])
+    engine.articulations.set_twist("bot", [0.5, 0.25, 9], [9, 9, 1.5])
     engine.reset()
     for level in ObservationLevel:
         states = observer.articulations(level)
@@ -150,7 +150,7 @@ def test_the_twist_is_reported_at_every_level_and_survives_reset(engine: Engine,
 def test_a_single_robot_is_the_whole_model(asset: str) -> None:
     scene = make_scene(robot=ASSETS / asset)
     engine = Engine(scene)
-    state = Observer(scene, engine.controls).articulations(ObservationLevel.FULL)["robot"]
+    state = Observer(scene, engine.articulations.controls).articulations(ObservationLevel.FULL)["robot"]
     assert state.qpos.tolist() == scene.data.qpos.tolist()
     assert state.qvel.tolist() == scene.data.qvel.tolist()
     assert len(state.ctrl) == len(state.act) == len(state.actuator_force) == scene.model.nu
@@ -191,7 +191,7 @@ def test_entities_have_coordinates_only_with_a_free_joint() -> None:
     scene = make_scene(dataclasses.replace(free, quick_convert=ConversionSettings()), fixed, bot=BOT)
     with Engine(scene) as engine:
         engine.set_mode(StepMode.DIRECT)
-        entities = engine.step(Step(n_steps=10), lambda mode: Observer(scene, engine.controls).entities())
+        entities = engine.step(Step(n_steps=10), lambda mode: Observer(scene, engine.articulations.controls).entities())
     prop, wall = entities.values()
     assert wall.xpos == (4.0, 5.0, 6.0)
     assert (wall.qpos, wall.qvel) == (None, None)
@@ -206,9 +206,9 @@ def test_entities_have_coordinates_only_with_a_free_joint() -> None:
 
 def test_where_there_is_nothing_to_observe_the_collections_are_empty() -> None:
     scene = make_scene(floor='<mujoco><worldbody><geom type="plane" size="1 1 1"/></worldbody></mujoco>')
-    state = Observer(scene, Engine(scene).controls).articulations(ObservationLevel.FULL)["floor"]
+    state = Observer(scene, Engine(scene).articulations.controls).articulations(ObservationLevel.FULL)["floor"]
     assert keys(state) == FULL
     assert (state.sensors, state.bodies) == ({}, {})
     empty = make_scene()
-    observer = Observer(empty, Engine(empty).controls)
+    observer = Observer(empty, Engine(empty).articulations.controls)
     assert (observer.articulations(ObservationLevel.FULL), observer.entities()) == ({}, {})

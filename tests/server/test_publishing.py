@@ -180,7 +180,7 @@ def test_action_keys_travel_only_while_one_is_down(play: Play) -> None:
     bench = play()
     stream = ticks(bench.subscribe(b""))
     assert b"bot/actions" not in dict(next(stream))
-    twist = bench.engine.control("bot").twist
+    twist = bench.engine.articulations.control("bot").twist
     twist.actions = 0b101
     tick = next(tick for tick in stream if b"bot/actions" in dict(tick))
     assert [topic for topic, _ in tick] == [*ROWS, b"bot/actions", b"state/full"]

@@ -44,11 +44,11 @@ def engine() -> Iterator[Engine]:
 
 @pytest.fixture(scope="module")
 def frames(engine: Engine) -> StepReplies:
-    return StepReplies(engine.scene, engine.controls)
+    return StepReplies(engine.scene, engine.articulations.controls)
 
 
 def encoded(engine: Engine, level: ObservationLevel, wall_time: Clock) -> bytes:
-    observer = Observer(engine.scene, engine.controls)
+    observer = Observer(engine.scene, engine.articulations.controls)
     return encode_reply(
         StepOk(
             time=engine.time,
@@ -101,7 +101,7 @@ def test_whatever_the_numbers_are(
             array.flat = state
         data.time = time
         engine._step_count = step
-        mine = engine.control("bot").twist
+        mine = engine.articulations.control("bot").twist
         mine.vx, mine.vy, mine.yaw_rate, mine.actions = twist
         frame, wall_time = filled(engine, frames, level)
         assert frame == encoded(engine, level, wall_time)
@@ -111,7 +111,7 @@ def test_a_number_that_looks_like_a_mark_stays_a_number(engine: Engine, frames: 
     with engine.lock:
         engine.scene.data.qpos[:] = 2.0**52 + np.arange(engine.scene.model.nq)
         for level in ObservationLevel:
-            fresh = StepReplies(engine.scene, engine.controls)
+            fresh = StepReplies(engine.scene, engine.articulations.controls)
             for taken in (frames, fresh):
                 frame, wall_time = filled(engine, taken, level)
                 assert frame == encoded(engine, level, wall_time)

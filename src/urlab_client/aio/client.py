@@ -7,23 +7,18 @@ import contextlib
 import logging
 import operator
 import os
-import re
 from collections.abc import Collection, Mapping
-from threading import RLock
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, NoReturn, Self, TypeVar
+from typing import NoReturn, Self, TypeVar
 
-from urlab_client.aio.articulation import URLabArticulation, URLabEntity
-from urlab_client.aio.cameras import URLabCameraView
+from urlab_client.aio.address import transport_to
+from urlab_client.aio.client_state import ClientState
 from urlab_client.aio.control import Control
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.explain import diagnose
-from urlab_client.aio.launch import SCHEME, LaunchedTransport
 from urlab_client.aio.live.camera_switch import CameraSwitch
 from urlab_client.aio.live.publishers import Publishers
-from urlab_client.aio.model.mirror import model_names
-from urlab_client.aio.model.numbers import finite
 from urlab_client.aio.namespaces.debug import DebugNamespace
 from urlab_client.aio.namespaces.farm import FarmNamespace
 from urlab_client.aio.namespaces.outliner import OutlinerNamespace
@@ -34,28 +29,25 @@ from urlab_client.aio.namespaces.sim import SimNamespace
 from urlab_client.aio.namespaces.viewport import ViewportNamespace
 from urlab_client.aio.session import Session
 from urlab_client.aio.state.connection_monitor import ConnectionMonitor
-from urlab_client.aio.state.recovery import leaves_open, resync
+from urlab_client.aio.state.discovery import Discovery
+from urlab_client.aio.state.recovery import resync
+from urlab_client.aio.state.resetting import take_reset
 from urlab_client.aio.state.sim_state import SimState
+from urlab_client.aio.state.step_mode import ask_mode
 from urlab_client.aio.state.stepping import take_steps
 from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS, Stream
-from urlab_client.aio.transport.base import RequestTransport, TransportStats
-from urlab_client.aio.transport.curve import ClientKeys, client_keys, is_local
+from urlab_client.aio.transport.curve import client_keys, is_local
 from urlab_client.aio.transport.server_regions import SharedMemoryRegions
 from urlab_client.aio.transport.shm import ShmTransport
-from urlab_client.aio.transport.zmq import ZmqTransport
 from urlab_client.protocol.base import Reply, Request
 from urlab_client.protocol.enums import CameraTiming, ObservationLevel, StepMode, Transport
-from urlab_client.protocol.errors import UnknownKeyframe, URLabError
+from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.protocol.messages.session import Hello, MetaOk, OpInfo, Reset, ResetOk, Step, StepOk
 from urlab_client.protocol.messages.session import Meta as MetaRequest
 from urlab_client.protocol.messages.streams import ClientEvent, RowSample, StateSnapshot, StreamPolicy
-from urlab_client.protocol.names import NameMap
 from urlab_client.protocol.rows import TopicKind
-from urlab_client.protocol.types import ClientConfig, Diagnosis, Resync, ServerInfo
-
-if TYPE_CHECKING:
-    import mujoco
+from urlab_client.protocol.types import ClientConfig, Diagnosis, Resync
 
 __all__ = ["SESSION_LEVEL", "SessionLevel", "URLabClient"]
 
@@ -64,9 +56,6 @@ log = logging.getLogger("urlab_client.client")
 R = TypeVar("R", bound=Reply)
 
 _REVERT_S = 1.0
-
-_HOST = re.compile(r"(\[[^\[\]\s]+\]|[^:\[\]\s]+)(:(?P<port>[0-9]+))?")
-_LAST_PORT = 65535
 
 
 class SessionLevel(str):
@@ -79,7 +68,7 @@ SESSION_LEVEL = SessionLevel("standard")
 """The level chosen in `discover()`, which is `standard` unless it was told otherwise."""
 
 
-class URLabClient:
+class URLabClient(ClientState):
     """A session with one server.
 
     Nothing is sent and nothing is started before the first call. Concurrent calls go one at a time.
@@ -138,7 +127,7 @@ class URLabClient:
         live_pictures: bool = True,
         claim_control: bool = True,
     ) -> None:
-        self._config = ClientConfig(
+        config = ClientConfig(
             address=address,
             step_mode=StepMode(step_mode),
             step_port=step_port,
@@ -164,12 +153,12 @@ class URLabClient:
             raise ValueError("shm_dir is for transport='shm'")
         if rcv_timeout_ms <= 0:
             raise ValueError(f"rcv_timeout_ms must be above 0, got {rcv_timeout_ms}")
-        keys = client_keys(address, self._config.server_key, self._config.client_key)
+        keys = client_keys(address, config.server_key, config.client_key)
         memory = SharedMemoryRegions(shm_dir) if Transport(transport) is Transport.SHM else None
-        plain = _transport(address, step_port, keys, shm=memory is not None)
+        plain = transport_to(address, step_port, keys, shm=memory is not None)
         self._transport = plain if memory is None else ShmTransport(plain, memory)
-        self._session = Session(self._transport, default_timeout=rcv_timeout_ms / 1000, json=encoding == "json")
-        self._session.control = Control(self._session, wanted=claim_control)
+        session = Session(self._transport, default_timeout=rcv_timeout_ms / 1000, json=encoding == "json")
+        session.control = Control(session, wanted=claim_control)
         self._publishers = Publishers(
             lambda: self._transport.endpoint,
             self._state_port,
@@ -178,29 +167,28 @@ class URLabClient:
             keys=keys,
             memory=memory,
         )
-        self._publishers.camera_switch = CameraSwitch(self._session, self._publishers.subscriptions.refresh)
-        self._state = SimState(
-            self._session,
-            self._publishers,
-            wanted_mode=StepMode(step_mode),
+        self._publishers.camera_switch = CameraSwitch(session, self._publishers.subscriptions.refresh)
+        state = SimState(session, self._publishers, wanted_mode=StepMode(step_mode), live_pictures=live_pictures)
+        super().__init__(config, session, state)
+        self._discovery = Discovery(
+            state,
             local_model=local_model,
             check_version=mujoco_version_check,
             promote=auto_promote_step_mode,
             trusted=trust_server or keys is not None or is_local(address),
-            live_pictures=live_pictures,
         )
-        self._watch = ConnectionMonitor(self._session, self._state)
+        self._watch = ConnectionMonitor(session, state)
         self._transport.on_event = self._watch.on_connection
         self._closed = False
-        self._scene = SceneNamespace(self._session)
-        self._sim = SimNamespace(self._session, self._state)
-        self._runtime = RuntimeNamespace(self._session, self._state)
-        self._outliner = OutlinerNamespace(self._session)
-        self._debug = DebugNamespace(self._session)
-        self._viewport = ViewportNamespace(self._session)
-        self._farm = FarmNamespace(self._session)
-        self._recording = RecordingNamespace(self._session)
-        self._replay = ReplayNamespace(self._session)
+        self._scene = SceneNamespace(session)
+        self._sim = SimNamespace(session, state, self._discovery)
+        self._runtime = RuntimeNamespace(session, state)
+        self._outliner = OutlinerNamespace(session)
+        self._debug = DebugNamespace(session)
+        self._viewport = ViewportNamespace(session)
+        self._farm = FarmNamespace(session)
+        self._recording = RecordingNamespace(session)
+        self._replay = ReplayNamespace(session)
 
     # Namespaces
 
@@ -249,145 +237,6 @@ class URLabClient:
         """Playing recordings back."""
         return self._replay
 
-    # Session state
-
-    @property
-    def address(self) -> str:
-        """The address the client was made with."""
-        return self._config.address
-
-    @property
-    def config(self) -> ClientConfig:
-        """What the client was made with: picklable and JSON-able, so that an equal client can be made elsewhere."""
-        return self._config
-
-    @property
-    def connected(self) -> bool:
-        """Whether a server is on the line right now."""
-        return self._transport.connected
-
-    @property
-    def transport_stats(self) -> TransportStats:
-        """Counters of requests, replies and connections, and of what went which way with `transport="shm"`."""
-        return self._transport.stats
-
-    @property
-    def session_id(self) -> str:
-        """RPC session id; empty before `discover()`."""
-        return self._session.session_id
-
-    @property
-    def urlab_version(self) -> str:
-        """Version of the server; empty before `discover()`."""
-        return "" if self._state.hello is None else self._state.hello.urlab_version
-
-    @property
-    def mujoco_version(self) -> str:
-        """MuJoCo version of the server; empty before `discover()`."""
-        return "" if self._state.hello is None else self._state.hello.mujoco_version
-
-    @property
-    def server(self) -> ServerInfo:
-        """What the server is and can do, as far as its answers have shown."""
-        hello = self._state.hello
-        return ServerInfo(
-            features=self._session.features,
-            instance=None if hello is None else hello.instance,
-            urlab_version=self.urlab_version,
-            mujoco_version=self.mujoco_version,
-            step_mode=self._state.mode_word,
-        )
-
-    @property
-    def user(self) -> dict[str, Any]:
-        """Values of the user channels that the level declares for the scene, by name, from the last snapshot."""
-        return dict(self._state.user)
-
-    @property
-    def manager_present(self) -> bool:
-        """Whether a play session runs, as far as this client knows."""
-        return self._state.hello is not None and self._state.hello.manager_present
-
-    @property
-    def step_mode(self) -> StepMode:
-        """Step mode in force, as far as this client knows."""
-        return self._state.mode
-
-    @property
-    def model(self) -> mujoco.MjModel | None:
-        """The compiled model, or None before play or with local_model=False."""
-        return self._state.mirror.model
-
-    @property
-    def data(self) -> mujoco.MjData | None:
-        """Local state that mirrors the server's after each reply, or None without a model."""
-        return self._state.mirror.data
-
-    @property
-    def model_is_approximate(self) -> bool:
-        """True when the model was compiled here because the server runs another MuJoCo build."""
-        return self._state.mirror.approximate
-
-    @property
-    def articulations(self) -> NameMap[URLabArticulation]:
-        """Articulations by key. An actor id or a class name is found, too, where it means one of them."""
-        return self._state.articulations
-
-    @property
-    def articulations_by_id(self) -> dict[str, URLabArticulation]:
-        """Articulations that have an actor id, by that id."""
-        return self._state.articulations_by_id
-
-    @property
-    def entities(self) -> NameMap[URLabEntity]:
-        """Every dynamic body by name, articulations included."""
-        return self._state.entities
-
-    @property
-    def global_cameras(self) -> NameMap[URLabCameraView]:
-        """Scene-level cameras by name."""
-        return self._state.global_cameras
-
-    @property
-    def step_count(self) -> int:
-        """Steps since `discover()` or `reset()`, as the server counts; constant in live mode."""
-        return self._state.step_count
-
-    @property
-    def sim_time(self) -> float:
-        """Simulation time of the last reply, seconds."""
-        return self._state.sim_time
-
-    @property
-    def sim_time_sec(self) -> int:
-        """Whole seconds of the simulation time."""
-        return self._state.sim_time_sec
-
-    @property
-    def sim_time_nsec(self) -> int:
-        """Nanoseconds within the second of the simulation time."""
-        return self._state.sim_time_nsec
-
-    @property
-    def wall_time_sec(self) -> int:
-        """Whole seconds of the server's UTC clock when the last reply was built."""
-        return self._state.wall_time_sec
-
-    @property
-    def wall_time_nsec(self) -> int:
-        """Nanoseconds within the second of the server's UTC clock when the last reply was built."""
-        return self._state.wall_time_nsec
-
-    @property
-    def recv_wall_time_ns(self) -> int:
-        """This machine's UTC clock when the last reply arrived, nanoseconds."""
-        return self._state.recv_wall_time_ns
-
-    @property
-    def _data_lock(self) -> RLock:
-        """Reentrant lock to hold while reading state from a thread other than the one that steps."""
-        return self._state.mirror.lock
-
     # Operations
 
     async def discover(self, observations: str | ObservationLevel = "standard", *, timeout: Timeout = DEFAULT) -> None:
@@ -408,7 +257,7 @@ class URLabClient:
         """
         level = ObservationLevel(observations)
         async with self._session.turn(Hello, timeout=timeout) as turn:
-            await self._state.open(turn, level)
+            await self._discovery.open(turn, level)
 
     async def step(
         self,
@@ -445,8 +294,13 @@ class URLabClient:
         """
         n_steps = operator.index(n_steps)  # a hot op: its request is not checked again before it is sent
         level = None if isinstance(observations, SessionLevel) else ObservationLevel(observations)
-        async with self._session.turn(Step, timeout=timeout) as turn:
+        turn = self._session.turn(Step, timeout=timeout)
+        if not turn.begin_at_once():  # which `async with` would take three coroutines for
+            await turn.begin()
+        try:
             return await take_steps(self._state, turn, n_steps, include_cameras, level)
+        finally:
+            turn.end()
 
     async def reset(
         self,
@@ -473,27 +327,8 @@ class URLabClient:
             TypeError: A position is not a number; nothing was sent.
             ValueError: A position is NaN or infinite; nothing was sent.
         """
-        state = self._state
         async with self._session.turn(Reset, timeout=timeout) as turn:
-            state.require_handshake("reset")
-            overrides = {
-                self.articulations[key].prefix: self._joint_values(key, values)
-                for key, values in (per_articulation_qpos or {}).items()
-            }
-            request = Reset(
-                keyframe_name=None if keyframe_name is None else self._keyframe(keyframe_name),
-                seed=seed,
-                per_articulation_qpos=overrides or None,
-            )
-            try:
-                reply = await turn.call(request)
-                state.absorb_reset(reply, request.keyframe_name)
-            except BaseException as error:
-                if turn.sent and leaves_open(error):
-                    state.pending.add_reset(state, request.keyframe_name)
-                raise
-            state.pending.clear()
-            return reply
+            return await take_reset(self._state, turn, keyframe_name, seed, per_articulation_qpos or {})
 
     async def resync(self, *, timeout: Timeout = DEFAULT) -> Resync:
         """Find out what became of steps, resets and mode changes whose replies were lost, and go on from there.
@@ -512,7 +347,7 @@ class URLabClient:
         Raises:
             URLabConnectionError: The server is not back yet. What is in doubt stays so for the next attempt.
         """
-        return await resync(self._state, timeout=timeout)
+        return await resync(self._state, self._discovery, timeout=timeout)
 
     def state_stream(
         self,
@@ -637,7 +472,7 @@ class URLabClient:
             if promoted_from is not None and self.connected and self.manager_present:
                 with contextlib.suppress(URLabError):  # a courtesy: the server may have moved on
                     async with self._session.turn(SetMode, timeout=_REVERT_S) as turn:
-                        await self._state.ask_mode(turn, promoted_from)
+                        await ask_mode(self._state, turn, promoted_from)
         finally:
             await self._session.aclose()
 
@@ -666,43 +501,3 @@ class URLabClient:
         # What the user has chosen goes before what the server says: there may be a tunnel between.
         chosen = self._config.state_port
         return self._transport.state_port or (told if told and chosen == ClientConfig().state_port else chosen)
-
-    def _joint_values(self, key: str, values: Mapping[str, float]) -> dict[str, float]:
-        joints = self.articulations[key].joints
-        live = {(joints[name].name if joints else name): value for name, value in values.items()}
-        return {name: finite(f"reset: joint {name!r} of {key!r}", value) for name, value in live.items()}
-
-    def _keyframe(self, name: str) -> str:
-        """Return the compiled name; only that is known to the server."""
-        if self.model is None:
-            return name
-        compiled = [key for key in model_names(self.model, "key") if key]
-        if name in compiled:
-            return name
-        wanted = {f"{art.compiled_prefix}_{name}" for art in self.articulations.values()}
-        matches = [key for key in compiled if key in wanted]
-        if len(matches) == 1:
-            return matches[0]
-        problem = (
-            f"{name!r} could mean {', '.join(matches)}"
-            if matches
-            else f"there is no {name!r}, only: {', '.join(compiled) or 'none'}"
-        )
-        raise UnknownKeyframe("unknown_keyframe", f"{problem}. Nothing was sent.", op="reset")
-
-
-def _transport(address: str, step_port: int, keys: ClientKeys | None, *, shm: bool) -> RequestTransport:
-    if address.startswith(SCHEME):
-        return LaunchedTransport(address, shm=shm)
-    scheme, separator, rest = address.partition("://")
-    if not separator or scheme not in {"tcp", "ipc"} or not rest:
-        raise ValueError(f"{address!r} is not a valid address; write tcp://HOST, ipc://PATH or sim://MODEL")
-    own_port = False
-    if scheme == "tcp":
-        host = _HOST.fullmatch(rest)
-        if host is None or not 0 < int(host["port"] or 1) <= _LAST_PORT:
-            raise ValueError(
-                f"{address!r} is not a valid address; write tcp://HOST or tcp://HOST:PORT, as in tcp://[::1]:5559"
-            )
-        own_port = host["port"] is not None
-    return ZmqTransport(address if own_port else f"{address}:{step_port}", keys)

@@ -90,7 +90,7 @@ def _control(config: ClientConfig, session: Session, state: SimState) -> Iterato
     """Look at who may write to the robots, on a server where each has one owner."""
     if not session.features.claims:
         return
-    for key, record in state.records.items():
+    for key, record in state.objects.records.items():
         owner = session.control.owner_of(key)
         if owner == session.control.owner:
             yield Finding(Verdict.OK, key, "This client controls it.")
@@ -188,9 +188,9 @@ def _modes(config: ClientConfig, state: SimState) -> Iterator[Finding]:
 
 
 def _articulations(state: SimState) -> Iterator[Finding]:
-    if not state.records:
+    if not state.objects.records:
         yield Finding(Verdict.PROBLEM, "articulations", "The play session has none. Spawn a robot before sim.start().")
-    for key, record in state.records.items():
+    for key, record in state.objects.records.items():
         if not len(record.ctrl):
             yield Finding(Verdict.NOTE, key, "It has no actuators: it moves by contacts and gravity only.")
             continue

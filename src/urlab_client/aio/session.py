@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable
-from types import TracebackType
-from typing import Any, NamedTuple, Self, TypeVar
+import time
+from collections.abc import Callable, Coroutine
+from typing import Any, TypeVar
 
 from urlab_client.aio.control import Control
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.jobs import OnProgress, finish
+from urlab_client.aio.mutex import Mutex
 from urlab_client.aio.transport.base import RequestTransport
+from urlab_client.aio.turn import Limits, Turn, at_once
 from urlab_client.protocol.base import ControlRequest, Needs, Op, Reply, Request
 from urlab_client.protocol.codec import (
     check_finite,
@@ -25,7 +27,6 @@ from urlab_client.protocol.codec import (
 from urlab_client.protocol.errors import (
     ConnectionLost,
     NoSession,
-    ProtocolError,
     ServerUnreachable,
     SessionTakenOver,
     UnknownOp,
@@ -42,17 +43,8 @@ __all__ = ["Session", "Turn"]
 log = logging.getLogger("urlab_client.session")
 
 R = TypeVar("R", bound=Reply)
-T = TypeVar("T")
-
-
+_HELLO = op_of(Hello)
 _UNLISTED = frozenset({"hello", "meta"})  # every server has them, none lists them
-
-
-class Limits(NamedTuple):
-    """Loop times by which a request must have been answered, and a connection must stand; None waits."""
-
-    deadline: float | None
-    connect_by: float | None
 
 
 class Session:
@@ -87,9 +79,9 @@ class Session:
         self._default_timeout = default_timeout
         self._json = json
         self.control = Control(self)
-        self.line = asyncio.Lock()
-        self.turns = asyncio.Lock()
-        self.editing = asyncio.Lock()
+        self.line = Mutex()
+        self.turns = Mutex()
+        self.editing = Mutex()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._queued = 0
         self._aside: asyncio.Task[Reply] | None = None
@@ -236,25 +228,44 @@ class Session:
         seconds = op.timeout if takes is None else takes
         return Limits(since + max(seconds or 0.0, default), since + default)
 
-    async def exchange(self, request: Request[R], op: Op, limits: Limits) -> R | OpStarted:
+    def exchange(self, request: Request[R], op: Op, limits: Limits) -> Coroutine[Any, Any, R | OpStarted]:
         """Send a request and return its answer; for whoever holds the line."""
         if self.features.claims and isinstance(request, ControlRequest):
-            return await self.control.send(request, self._ask, limits)
-        return await self._answer(request, op, limits)
+            return self.control.send(request, self._ask, limits)
+        return self._answer(request, op, limits)
 
     async def _ask(self, request: Request[R], limits: Limits) -> R:
         op = op_of(request)
         return at_once(op, await self._answer(request, op, limits))
 
-    async def _answer(self, request: Request[R], op: Op, limits: Limits) -> R | OpStarted:
+    async def _answer(self, request: Request[R], op: Op, limits: Limits, *, again: bool = False) -> R | OpStarted:
+        # One coroutine, though it does several things: each one between a step and its socket costs every step.
         stamped = self.session_id
+        frame = encode_request(request, stamped, json=self._json)
+        if not op.hot:
+            check_finite(request)
+            if not self._json:
+                check_request(request, frame)
+        late = self._await_later if op is _HELLO else None
+        sent, began = self._transport.stats.sent, time.perf_counter()
         try:
-            return await self._send(request, op, limits)
+            try:
+                deadline, connect_by = limits
+                answer = await self._transport.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
+            except ConnectionLost as lost:
+                answer = await self._ask_again(frame, op, lost, limits)
+            finally:
+                if late is not None and self._transport.stats.sent > sent:
+                    self.greeted = self._unanswered = True  # until its answer has been read
+            if log.isEnabledFor(logging.DEBUG):
+                took = 1e3 * (time.perf_counter() - began)
+                log.debug("%s: %d bytes out, %d back in %.3f ms", op.name, len(frame), len(answer), took)
+            return self._read(op_reply(request, op), op, stamped, answer)
         except SessionTakenOver as refusal:
             # A handshake of our own that was given up opens a session all the same. What it made the server refuse
             # was not executed, and is sent once more in that session.
-            if await self._settled(limits.deadline) and self.session_id != stamped:
-                return await self._send(request, op, limits)
+            if not again and await self._settled(limits.deadline) and self.session_id != stamped:
+                return await self._answer(request, op, limits, again=True)
             if not stamped:
                 raise NoSession("no session is open.", op=op.name) from None
             if self.on_refusal is not None:
@@ -263,37 +274,10 @@ class Session:
                 raise _by_ourselves(refusal) from None
             raise
 
-    async def _send(self, request: Request[R], op: Op, limits: Limits) -> R | OpStarted:
-        hello = op.request is Hello
-        loop = asyncio.get_running_loop()
-        began = loop.time()
-        stamped = self.session_id
-        frame = encode_request(request, stamped, json=self._json)
-        if not op.hot:
-            check_finite(request)
-            if not self._json:
-                check_request(request, frame)
-        sent = self._transport.stats.sent
+    def _read(self, kind: type[R], op: Op, stamped: str, answer: bytes) -> R | OpStarted:
+        """Decode the answer to a request that was sent in the session `stamped`, and learn what it tells."""
         try:
-            try:
-                answer = await self._transport.request(
-                    frame,
-                    op,
-                    deadline=limits.deadline,
-                    connect_by=limits.connect_by,
-                    late=self._await_later if hello else None,
-                )
-            except ConnectionLost as lost:
-                answer = await self._ask_again(frame, op, lost, limits)
-        finally:
-            if hello and self._transport.stats.sent > sent:
-                self.greeted = self._unanswered = True  # until its answer has been read
-        if log.isEnabledFor(logging.DEBUG):
-            log.debug(
-                "%s: %d bytes out, %d back in %.3f ms", op.name, len(frame), len(answer), 1e3 * (loop.time() - began)
-            )
-        try:
-            reply = decode_answer(op, op_reply(request, op), answer)
+            reply = decode_answer(op, kind, answer)
         except URLabRPCError as refusal:
             # A refusal of what was sent before the latest hello says nothing about the session of now.
             taken_over = isinstance(refusal, SessionTakenOver)
@@ -343,7 +327,7 @@ class Session:
 
     async def _ask_again(self, frame: bytes, op: Op, lost: ConnectionLost, limits: Limits) -> bytes:
         """Repeat a request that changes nothing, whose connection broke, until there is an answer or time is up."""
-        late = self._await_later if op.request is Hello else None
+        late = self._await_later if op is _HELLO else None
         while True:
             log.debug("%s: asking again, because the connection was lost", op.name)
             try:
@@ -355,14 +339,13 @@ class Session:
             except ServerUnreachable as unreachable:
                 raise lost from unreachable
 
-    async def acquire(self, lock: asyncio.Lock, op: Op, deadline: float | None) -> None:
+    async def acquire(self, lock: Mutex, op: Op, deadline: float | None) -> None:
         """Wait for `line`, `turns` or `editing`.
 
         Raises:
             URLabTimeoutError: Another call held it until the deadline; nothing was sent.
         """
-        if not lock.locked() and not self._queued:
-            await lock.acquire()
+        if lock.acquire_nowait():
             return
         if self._aside is not None:
             self._aside.cancel()
@@ -378,117 +361,6 @@ class Session:
             ) from None
         finally:
             self._queued -= 1
-
-
-class Turn:
-    """The time in which one task alone reads and changes the client's state, and sends what depends on it.
-
-    Within it a request is built, sent, accounted for and taken over. Requests that do not depend on the client's state
-    may go in between only during `aside`.
-
-    Attributes:
-        sent: Whether the request of the latest `call` left, so that the server may have executed it.
-    """
-
-    __slots__ = ("_asked", "_began", "_each", "_first", "_op", "_ready", "_session", "_timeout", "sent")
-
-    def __init__(self, session: Session, op: Op, timeout: Timeout, *, each: bool) -> None:
-        self.sent = False
-        self._session = session
-        self._op = op
-        self._timeout: Timeout = timeout
-        self._each = each
-        self._asked: Limits | None = None
-        self._began = 0.0
-        self._first = True
-        self._ready = False
-
-    async def __aenter__(self) -> Self:
-        session, op = self._session, self._op
-        self._began = session.bound_loop().time()
-        limits = self._asked = session.limits(op, self._timeout, self._began)
-        await session.acquire(session.turns, op, limits.deadline)
-        try:
-            await self._take_line(limits.deadline)
-        except BaseException:
-            session.turns.release()
-            raise
-        return self
-
-    async def __aexit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        if self._ready:
-            self._give_line()
-        self._session.turns.release()
-
-    async def call(self, request: Request[R], *, takes: float | None = None) -> R:
-        """Send a request, built since the last wait of this turn, and return its reply.
-
-        Args:
-            request: The request.
-            takes: Seconds that the server may take, in place of those its op declares; for the default timeout.
-
-        Raises:
-            URLabError: As `Session.call`.
-        """
-        session, op = self._session, op_of(request)
-        session.check_offered(op)
-        limits = self._asked
-        if limits is None or op is not self._op or takes is not None:
-            limits = self._limits(op, takes)
-        self._asked = None
-        self._first = False
-        stats = session.transport.stats
-        before = stats.sent
-        self.sent = False
-        try:
-            return at_once(op, await session.exchange(request, op, limits))
-        finally:
-            self.sent = stats.sent > before
-
-    async def aside(self, work: Awaitable[T]) -> T:
-        """Let requests that do not depend on the client's state pass while `work`, which sends nothing, is done."""
-        self._give_line()
-        result = await work
-        await self._take_line(self._limits(self._op).deadline)
-        return result
-
-    async def _take_line(self, deadline: float | None) -> None:
-        session, op = self._session, self._op
-        editing = op.needs is Needs.EDITOR
-        if editing:
-            await session.acquire(session.editing, op, deadline)
-        try:
-            await session.acquire(session.line, op, deadline)
-        except BaseException:
-            if editing:
-                session.editing.release()
-            raise
-        self._ready = True
-
-    def _give_line(self) -> None:
-        self._ready = False
-        self._session.line.release()
-        if self._op.needs is Needs.EDITOR:
-            self._session.editing.release()
-
-    def _limits(self, op: Op, takes: float | None = None) -> Limits:
-        # What is waited for the turn counts for the first request, and for all where one timeout covers them.
-        counted = self._first or (self._timeout is not DEFAULT and not self._each)
-        since = self._began if counted else asyncio.get_running_loop().time()
-        return self._session.limits(op, self._timeout, since, takes)
-
-
-def at_once(op: Op, answer: R | OpStarted) -> R:
-    """Return the answer to an op that is none of the editor's jobs.
-
-    Raises:
-        ProtocolError: The server has made a job of it.
-    """
-    if isinstance(answer, OpStarted):
-        raise ProtocolError(f"{op.name}: the server has started {answer.job_id} instead of answering.", op=op.name)
-    return answer
 
 
 def op_reply(request: Request[R], op: Op) -> type[R]:

@@ -67,7 +67,7 @@ _CLOCKS: Final = ("time", "step", "sim_time", "wall_time")
 def _beta_shapes() -> Mapping[str, _Shape]:
     """Return the shapes of the beta by the reply's `op`."""
     return {
-        "step_ok": _Shape(StepOk, *_CLOCKS, "frame_id", "arts", "scene", "cameras", "perturbation"),
+        "step_ok": _Shape(StepOk, *_CLOCKS, "frame_id", "arts", "scene", "cameras", "perturbation", "replay"),
         "reset_ok": _Shape(ResetOk, *_CLOCKS, "arts"),
         "forward_ok": _Shape(ForwardOk, *_CLOCKS, "arts"),
         "state_full": _Shape(StateSnapshot, *_CLOCKS, "arts", "scene", "user"),

@@ -9,10 +9,11 @@ import math
 from typing import Any, Final
 
 import numpy as np
+from msgspec.structs import replace
 
 from urlab_client.protocol.types import SimOptions
 
-__all__ = ["ITERATIONS", "RANGED_OPTIONS", "check_sim_options", "option_problem"]
+__all__ = ["ITERATIONS", "RANGED_OPTIONS", "check_sim_options", "in_small_letters", "option_problem"]
 
 _POSITIVE: Final = ("timestep", "impratio")
 _NOT_NEGATIVE: Final = (
@@ -58,6 +59,12 @@ def option_problem(name: str, value: Any) -> str:
     if name in ITERATIONS and value < 0:
         return f"{name} must not be negative: {value} is not possible"
     return ""
+
+
+def in_small_letters(options: SimOptions) -> SimOptions:
+    """Return options with their keywords as the reference and the alpha spell them; the beta replies `RK4` and `CG`."""
+    words = {name: getattr(options, name) for name in ("integrator", "cone", "solver")}
+    return replace(options, **{name: word.lower() for name, word in words.items() if word is not None})
 
 
 def check_sim_options(options: SimOptions) -> None:

@@ -221,8 +221,8 @@ class ServerCore:
         return Running(
             scene,
             engine.start(),
-            Observer(scene, engine.controls, channels),
-            self._camera_renderer(scene, actors, modes, engine.names),
+            Observer(scene, engine.articulations.controls, channels),
+            self._camera_renderer(scene, actors, modes, engine.articulations.names),
             files,
             self.limits,
             channels,

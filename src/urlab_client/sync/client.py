@@ -6,25 +6,21 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Mapping
-from threading import RLock
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import Self, TypeVar
 
 from urlab_client.aio import client as aio
 from urlab_client.aio.client import SESSION_LEVEL, SessionLevel
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS
-from urlab_client.aio.transport.base import TransportStats
 from urlab_client.protocol.base import Reply, Request
 from urlab_client.protocol.enums import CameraTiming, ObservationLevel, StepMode, Transport
 from urlab_client.protocol.messages.session import OpInfo, ResetOk, StepOk
 from urlab_client.protocol.messages.streams import ClientEvent, RowSample, StateSnapshot, StreamPolicy
-from urlab_client.protocol.names import NameMap
 from urlab_client.protocol.rows import TopicKind
-from urlab_client.protocol.types import ClientConfig, Diagnosis, Resync, ServerInfo
+from urlab_client.protocol.types import Diagnosis, Resync
 from urlab_client.sync._facade import FacadeRoot
-from urlab_client.sync.articulation import URLabArticulation, URLabEntity
-from urlab_client.sync.cameras import URLabCameraView
+from urlab_client.sync.client_state import ClientState
 from urlab_client.sync.namespaces.debug import DebugNamespace
 from urlab_client.sync.namespaces.farm import FarmNamespace
 from urlab_client.sync.namespaces.outliner import OutlinerNamespace
@@ -35,15 +31,12 @@ from urlab_client.sync.namespaces.sim import SimNamespace
 from urlab_client.sync.namespaces.viewport import ViewportNamespace
 from urlab_client.sync.streams import Stream
 
-if TYPE_CHECKING:
-    import mujoco
-
 __all__ = ["SESSION_LEVEL", "SessionLevel", "URLabClient"]
 
 R = TypeVar("R", bound=Reply)
 
 
-class URLabClient(FacadeRoot, twin=aio.URLabClient):
+class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
     """A session with one server.
 
     Nothing is sent and nothing is started before the first call. Concurrent calls go one at a time.
@@ -81,7 +74,7 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
     """
 
     __slots__ = ()
-    _aio: aio.URLabClient
+    _aio: aio.URLabClient  # pyright: ignore[reportIncompatibleVariableOverride]  # never assigned after construction
 
     def __init__(
         self,
@@ -172,136 +165,6 @@ class URLabClient(FacadeRoot, twin=aio.URLabClient):
     def replay(self) -> ReplayNamespace:
         """Playing recordings back."""
         return self._wrap(ReplayNamespace, self._aio.replay)
-
-    @property
-    def address(self) -> str:
-        """The address the client was made with."""
-        return self._aio.address
-
-    @property
-    def config(self) -> ClientConfig:
-        """What the client was made with: picklable and JSON-able, so that an equal client can be made elsewhere."""
-        return self._aio.config
-
-    @property
-    def connected(self) -> bool:
-        """Whether a server is on the line right now."""
-        return self._aio.connected
-
-    @property
-    def transport_stats(self) -> TransportStats:
-        """Counters of requests, replies and connections, and of what went which way with `transport="shm"`."""
-        return self._aio.transport_stats
-
-    @property
-    def session_id(self) -> str:
-        """RPC session id; empty before `discover()`."""
-        return self._aio.session_id
-
-    @property
-    def urlab_version(self) -> str:
-        """Version of the server; empty before `discover()`."""
-        return self._aio.urlab_version
-
-    @property
-    def mujoco_version(self) -> str:
-        """MuJoCo version of the server; empty before `discover()`."""
-        return self._aio.mujoco_version
-
-    @property
-    def server(self) -> ServerInfo:
-        """What the server is and can do, as far as its answers have shown."""
-        return self._aio.server
-
-    @property
-    def user(self) -> dict[str, Any]:
-        """Values of the user channels that the level declares for the scene, by name, from the last snapshot."""
-        return self._aio.user
-
-    @property
-    def manager_present(self) -> bool:
-        """Whether a play session runs, as far as this client knows."""
-        return self._aio.manager_present
-
-    @property
-    def step_mode(self) -> StepMode:
-        """Step mode in force, as far as this client knows."""
-        return self._aio.step_mode
-
-    @property
-    def model(self) -> mujoco.MjModel | None:
-        """The compiled model, or None before play or with local_model=False."""
-        return self._aio.model
-
-    @property
-    def data(self) -> mujoco.MjData | None:
-        """Local state that mirrors the server's after each reply, or None without a model."""
-        return self._aio.data
-
-    @property
-    def model_is_approximate(self) -> bool:
-        """True when the model was compiled here because the server runs another MuJoCo build."""
-        return self._aio.model_is_approximate
-
-    @property
-    def articulations(self) -> NameMap[URLabArticulation]:
-        """Articulations by key. An actor id or a class name is found, too, where it means one of them."""
-        return self._map("articulations", URLabArticulation, self._aio.articulations)
-
-    @property
-    def articulations_by_id(self) -> dict[str, URLabArticulation]:
-        """Articulations that have an actor id, by that id."""
-        return {key: self._wrap(URLabArticulation, item) for key, item in self._aio.articulations_by_id.items()}
-
-    @property
-    def entities(self) -> NameMap[URLabEntity]:
-        """Every dynamic body by name, articulations included."""
-        return self._map("entities", URLabEntity, self._aio.entities)
-
-    @property
-    def global_cameras(self) -> NameMap[URLabCameraView]:
-        """Scene-level cameras by name."""
-        return self._map("global_cameras", URLabCameraView, self._aio.global_cameras)
-
-    @property
-    def step_count(self) -> int:
-        """Steps since `discover()` or `reset()`, as the server counts; constant in live mode."""
-        return self._aio.step_count
-
-    @property
-    def sim_time(self) -> float:
-        """Simulation time of the last reply, seconds."""
-        return self._aio.sim_time
-
-    @property
-    def sim_time_sec(self) -> int:
-        """Whole seconds of the simulation time."""
-        return self._aio.sim_time_sec
-
-    @property
-    def sim_time_nsec(self) -> int:
-        """Nanoseconds within the second of the simulation time."""
-        return self._aio.sim_time_nsec
-
-    @property
-    def wall_time_sec(self) -> int:
-        """Whole seconds of the server's UTC clock when the last reply was built."""
-        return self._aio.wall_time_sec
-
-    @property
-    def wall_time_nsec(self) -> int:
-        """Nanoseconds within the second of the server's UTC clock when the last reply was built."""
-        return self._aio.wall_time_nsec
-
-    @property
-    def recv_wall_time_ns(self) -> int:
-        """This machine's UTC clock when the last reply arrived, nanoseconds."""
-        return self._aio.recv_wall_time_ns
-
-    @property
-    def _data_lock(self) -> RLock:
-        """Reentrant lock to hold while reading state from a thread other than the one that steps."""
-        return self._aio._data_lock  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
 
     def discover(self, observations: str | ObservationLevel = "standard", *, timeout: Timeout = DEFAULT) -> None:
         """Open a session, load the model, and build the wrappers of articulations, entities and cameras.

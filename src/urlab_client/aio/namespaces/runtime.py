@@ -14,6 +14,7 @@ from urlab_client.aio.namespaces._base import Vector, fill, target_by
 from urlab_client.aio.namespaces._ops import RuntimeOps
 from urlab_client.aio.session import Session
 from urlab_client.aio.state.sim_state import SimState
+from urlab_client.aio.state.step_mode import ask_mode
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.codec import building
 from urlab_client.protocol.enums import StepMode
@@ -34,7 +35,7 @@ from urlab_client.protocol.messages.runtime import (
     SetUserChannels,
 )
 from urlab_client.protocol.messages.session import Forward, ForwardOk
-from urlab_client.protocol.sim_options import check_sim_options
+from urlab_client.protocol.sim_options import check_sim_options, in_small_letters
 from urlab_client.protocol.types import ContactsResult, SimOptions
 
 __all__ = ["RuntimeNamespace"]
@@ -74,7 +75,7 @@ class RuntimeNamespace(RuntimeOps):
 
     def _positions(self, target: str, qpos: Vector, *, by_name: bool) -> Floats:
         values = tuple(qpos)
-        arts = self._state.articulations if by_name else self._state.articulations_by_id
+        arts = self._state.objects.articulations if by_name else self._state.objects.articulations_by_id
         joints = {j.qpos_local_offset: name for name, j in arts[target].joints.items()} if target in arts else {}
         joint = ""
         for i, value in enumerate(values):
@@ -133,7 +134,7 @@ class RuntimeNamespace(RuntimeOps):
         }
         try:
             with building():
-                options = msgspec.convert(plain, SimOptions)
+                options = in_small_letters(msgspec.convert(plain, SimOptions))
             check_sim_options(options)
         except msgspec.ValidationError as error:
             raise TypeError(f"set_sim_options: {error}. Nothing was sent.") from None
@@ -141,8 +142,9 @@ class RuntimeNamespace(RuntimeOps):
             raise ValueError(f"set_sim_options: {error}. Nothing was sent.") from None
         async with self._session.turn(SetSimOptions, timeout=timeout) as turn:
             reply = await turn.call(SetSimOptions(options=options))
-            self._state.mirror_options(reply.options)
-            return reply.options
+            in_force = in_small_letters(reply.options)
+            self._state.mirror_options(in_force)
+            return in_force
 
     async def set_user_channels(
         self,
@@ -166,7 +168,8 @@ class RuntimeNamespace(RuntimeOps):
             UnknownOp: The server has no such channels.
         """
         request = SetUserChannels(
-            arts={self._state.articulations[key].prefix: dict(values) for key, values in (arts or {}).items()} or None,
+            arts={self._state.objects.articulations[key].prefix: dict(values) for key, values in (arts or {}).items()}
+            or None,
             scene=None if scene is None else dict(scene),
         )
         return (await self._call(request, timeout)).rejected
@@ -229,7 +232,7 @@ class RuntimeNamespace(RuntimeOps):
 
     def _camera_topic(self, op: str, name: str) -> str:
         self._state.require_handshake(op)
-        return self._state.require_camera(name).info.zmq_topic
+        return self._state.objects.require_camera(name).info.zmq_topic
 
     def _always_on(self, name: str, wanted: CameraTransports) -> CameraStreaming:
         if not (wanted.zmq or wanted.shm):
@@ -238,7 +241,7 @@ class RuntimeNamespace(RuntimeOps):
                 f"camera {name!r} cannot be switched off: this server's cameras always stream. Nothing was sent.",
                 op="set_camera_streaming",
             )
-        info = self._state.require_camera(name).info
+        info = self._state.objects.require_camera(name).info
         return CameraStreaming(
             streaming=True, zmq=True, shm=True, zmq_endpoint=info.zmq_endpoint, zmq_topic=info.zmq_topic
         )
@@ -257,7 +260,7 @@ class RuntimeNamespace(RuntimeOps):
         wanted = StepMode(mode)
         async with self._session.turn(SetMode, timeout=timeout) as turn:
             # On the wire `auto` is a mode in which every step times out.
-            await self._state.ask_mode(turn, StepMode.LIVE if wanted is StepMode.AUTO else wanted)
+            await ask_mode(self._state, turn, StepMode.LIVE if wanted is StepMode.AUTO else wanted)
             self._state.wanted_mode = self._state.mode
             return self._state.mode
 

@@ -11,7 +11,8 @@ from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.namespaces._base import Namespace
 from urlab_client.aio.session import Session, Turn
-from urlab_client.aio.state.recovery import leaves_open
+from urlab_client.aio.state.discovery import Discovery
+from urlab_client.aio.state.pending_outcomes import leaves_open
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.protocol.enums import PIEState
 from urlab_client.protocol.errors import URLabPIEError, URLabTimeoutError
@@ -30,9 +31,10 @@ _SLACK_S = 15.0  # the server may take 10 s to reach its game thread before its 
 class SimNamespace(Namespace):
     """Starting and stopping play."""
 
-    def __init__(self, session: Session, state: SimState) -> None:
+    def __init__(self, session: Session, state: SimState, discovery: Discovery) -> None:
         super().__init__(session)
         self._state = state
+        self._discovery = discovery
 
     async def start(
         self,
@@ -64,7 +66,7 @@ class SimNamespace(Namespace):
             payload = reply.handshake_payload
             result = PIEStartResult(state=state, compile_error=reply.compile_error)
             if payload is not None:
-                await self._state.adopt(turn, payload)
+                await self._discovery.adopt(turn, payload)
                 result.handshake_payload = msgspec.to_builtins(payload)
         if raise_on_failure and not result.is_ready:
             explanation = reply.compile_error or (

@@ -1,119 +1,27 @@
-"""What the client does about requests whose replies were lost: remembers them, and finds out what became of them."""
+"""Finding out what became of requests whose replies were lost."""
 
 from __future__ import annotations
 
-from collections.abc import Generator
-from contextlib import contextmanager
-from typing import TYPE_CHECKING
-
 from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.model.articulation_state import Carried, give_back
 from urlab_client.aio.session import Turn
+from urlab_client.aio.state.discovery import Discovery
+from urlab_client.aio.state.pending_outcomes import PendingOutcomes
+from urlab_client.aio.state.sim_state import SimState
+from urlab_client.aio.state.step_mode import ask_mode
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import (
-    InternalError,
-    ModeLocked,
     NoActiveManager,
     NoSession,
     NotReady,
-    ServerUnreachable,
     SessionTakenOver,
-    ShuttingDown,
-    StepTimeout,
-    URLabRPCError,
 )
 from urlab_client.protocol.messages.session import Forward, ForwardOk
 from urlab_client.protocol.types import Resync
 
-if TYPE_CHECKING:
-    from urlab_client.aio.state.sim_state import SimState
-
-__all__ = ["PendingOutcomes", "leaves_open", "resync"]
-
-# These refusals leave open whether the op was executed. All others mean that it was not.
-_UNDECIDED = (StepTimeout, ShuttingDown, InternalError)
+__all__ = ["resync"]
 
 
-class PendingOutcomes:
-    """Requests that may or may not have been executed. Forgotten with the next reply that tells the step counter.
-
-    Attributes:
-        steps: Steps, or in puppet mode pushes.
-        since: Step counter before the first of them.
-        time: Simulation time before the first of them, seconds.
-        connects: Connections made when the latest of them was sent.
-        queued: Whether the server said that it has queued steps.
-        carried: What steps carried, each with the number of steps that must have been executed for it to have acted.
-        reset: Whether a reset is among them.
-        keyframe: Compiled keyframe of that reset.
-        mode: Step mode that was asked for, or None.
-        play: Whether a start of play was broken off, so that another world may be playing than the client knows.
-    """
-
-    def __init__(self) -> None:
-        self.connects = 0
-        self.mode: StepMode | str | None = None
-        self.play = False
-        self.clear()
-
-    def __bool__(self) -> bool:
-        return self.steps > 0 or self.reset
-
-    def clear(self) -> None:
-        """Forget steps and resets: a reply told the state."""
-        self.steps = self.since = 0
-        self.time = 0.0
-        self.queued = self.reset = False
-        self.keyframe: str | None = None
-        self.carried: list[tuple[int, Carried]] = []
-
-    def add_steps(self, state: SimState, error: BaseException, steps: int, carried: Carried) -> None:
-        """Note that steps were sent and `error` came instead of their reply."""
-        self._note(state)
-        self.steps += steps
-        if carried:
-            self.carried.append((self.steps, carried))
-        self.queued = self.queued or isinstance(error, StepTimeout)
-
-    def add_reset(self, state: SimState, keyframe: str | None) -> None:
-        """Note that a reset was sent and an error came instead of its reply."""
-        self._note(state)
-        self.reset = True
-        self.keyframe = keyframe
-
-    def give_back(self, applied: int) -> None:
-        """Buffer again what was carried by steps that were not executed."""
-        for needed, carried in reversed(self.carried):
-            if needed > applied:
-                give_back(carried)
-
-    @contextmanager
-    def about_mode(self, mode: StepMode | str) -> Generator[None]:
-        """Note, unless the body succeeds or is refused, that the server is to be brought into `mode`."""
-        try:
-            yield
-        except BaseException as error:
-            if isinstance(error, ModeLocked):
-                self.mode = None
-            elif leaves_open(error):
-                self.mode = mode
-            raise
-        self.mode = None
-
-    def _note(self, state: SimState) -> None:
-        if not self:
-            self.since, self.time = state.step_count, state.sim_time
-        self.connects = state.session.transport.stats.connects
-
-
-def leaves_open(error: BaseException) -> bool:
-    """Return whether a request that left and failed in this way may have been executed."""
-    if isinstance(error, URLabRPCError):
-        return isinstance(error, _UNDECIDED)
-    return not isinstance(error, (ServerUnreachable, TypeError, ValueError))
-
-
-async def resync(state: SimState, *, timeout: Timeout = DEFAULT) -> Resync:
+async def resync(state: SimState, discovery: Discovery, *, timeout: Timeout = DEFAULT) -> Resync:
     """Ask the server for counter and time, open a session where that is needed, and take the state over.
 
     `forward` is the only op that tells both in every mode. It integrates nothing and warm-starts nothing: the
@@ -122,14 +30,14 @@ async def resync(state: SimState, *, timeout: Timeout = DEFAULT) -> Resync:
     async with state.session.turn(Forward, timeout=timeout) as turn:
         pending, state.pending = state.pending, PendingOutcomes()
         try:
-            return await _resync(state, pending, turn)
+            return await _resync(state, discovery, pending, turn)
         except BaseException:
             pending.mode = state.pending.mode or pending.mode
             state.pending = pending  # for the next attempt
             raise
 
 
-async def _resync(state: SimState, pending: PendingOutcomes, turn: Turn) -> Resync:
+async def _resync(state: SimState, discovery: Discovery, pending: PendingOutcomes, turn: Turn) -> Resync:
     sent = pending.steps
     applied: int | None = None if sent else 0
     was_reset: bool | None = None
@@ -147,12 +55,12 @@ async def _resync(state: SimState, pending: PendingOutcomes, turn: Turn) -> Resy
         renewed = late and not (applied == sent and (was_reset or not pending.reset))
     if renewed or pending.play:
         renewed = True
-        await state.open(turn, state.level)
+        await discovery.open(turn, state.level)
         reply = await _look(turn)
         if before is not None and reply is not None and applied is not None and reply.time != before.time:
             applied = _slipped_in(state, applied, reply.time - before.time)
     if reply is not None and pending.mode is not None:
-        await state.ask_mode(turn, pending.mode)
+        await ask_mode(state, turn, pending.mode)
         reply = await _look(turn)  # in live mode it has moved on meanwhile
     if reply is not None:
         if was_reset:

@@ -7,54 +7,39 @@ from __future__ import annotations
 
 import logging
 import math
-import re
 import time
-import warnings
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from functools import partial
 from typing import Any, Protocol
 
-import anyio.to_thread
 import numpy as np
 
-from urlab_client.aio.articulation import URLabArticulation, URLabEntity
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.live.live_state import LatestPicture, LiveState
 from urlab_client.aio.live.publishers import Publishers
-from urlab_client.aio.model.articulation_state import Carried, MirroredArticulation, MirroredEntity
+from urlab_client.aio.model.articulation_state import MirroredArticulation, MirroredEntity
 from urlab_client.aio.model.mirror import Mirror, write_options
-from urlab_client.aio.session import Session, Turn
-from urlab_client.aio.state.handshake import Examined, examine
-from urlab_client.aio.state.recovery import PendingOutcomes, leaves_open
+from urlab_client.aio.session import Session
+from urlab_client.aio.state.pending_outcomes import PendingOutcomes
+from urlab_client.aio.state.scene_objects import SceneObjects
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.enums import LATER_MODE_NAMES, CameraMode, StepMode, known
+from urlab_client.protocol.enums import CameraMode, StepMode
 from urlab_client.protocol.errors import (
-    BadMode,
-    ModeLocked,
     NoActiveManager,
     NoSession,
     ProtocolError,
     SessionTakenOver,
-    URLabError,
     URLabRPCError,
 )
-from urlab_client.protocol.messages.runtime import SetMode, SetPaused
 from urlab_client.protocol.messages.session import (
-    NOT_SENT,
-    ArticulationCommand,
     ArticulationState,
     CameraFrame,
-    CameraInfo,
     EntityState,
-    Hello,
     HelloOk,
     Perturbation,
     StateReply,
     StepOk,
 )
-from urlab_client.protocol.messages.streams import PlayEnded, PlayStarted, SessionLost, SessionOpened, StateSnapshot
-from urlab_client.protocol.names import NameMap
+from urlab_client.protocol.messages.streams import PlayEnded, SessionLost, SessionOpened, StateSnapshot
 from urlab_client.protocol.rows import Pixels, decode_camera
 from urlab_client.protocol.sim_options import check_sim_options
 from urlab_client.protocol.types import SimOptions
@@ -65,9 +50,6 @@ log = logging.getLogger("urlab_client.client")
 
 # By the server's clock. More than this means that the clock was set, not that a message was overtaken.
 _OVERTAKEN_S = 1.0
-
-# Unreal's actor names: class, then a number or a generated id.
-_ENGINE_NAME = re.compile(r"(?P<stem>.+)_C_(?:\d+|UAID_\w+)")
 
 
 _Parts = tuple[
@@ -97,6 +79,7 @@ class SimState:
         session: The RPC session.
         publishers: What the server publishes.
         mirror: Local model and data.
+        objects: Articulations, entities and cameras.
         wanted_mode: Step mode the user asked for.
         mode_assumed: Whether nothing the server said shows yet that `mode` is in force.
         promoted_from: Mode to go back to on close, after a promotion of our own; maybe one that only the server knows.
@@ -104,9 +87,6 @@ class SimState:
         level: Observation level of the session.
         sent_level: Observation level the server has, which an earlier step may have changed.
         hello: The last handshake, without the model's bytes.
-        articulations: Articulations by key.
-        entities: Every dynamic body by name, articulations included.
-        global_cameras: Scene-level cameras.
         step_count: Steps since the last handshake or reset.
         sim_time: Simulation time of the last reply, seconds.
         on_adopted: Told of each handshake taken over, and of the end of play.
@@ -121,15 +101,12 @@ class SimState:
         publishers: Publishers,
         *,
         wanted_mode: StepMode,
-        local_model: bool,
-        check_version: bool,
-        promote: bool,
-        trusted: bool,
         live_pictures: bool,
     ) -> None:
         self.session = session
         self.publishers = publishers
         self.mirror = Mirror()
+        self.objects = SceneObjects(session, publishers, self.mirror)
         self.wanted_mode = wanted_mode
         self._mode = StepMode.LIVE
         self.mode_assumed = False
@@ -139,31 +116,20 @@ class SimState:
         self.level = "standard"
         self.sent_level = "standard"
         self.hello: HelloOk | None = None
-        self.articulations: NameMap[URLabArticulation] = NameMap(kind="articulation")
-        self.articulations_by_id: dict[str, URLabArticulation] = {}
-        self.entities: NameMap[URLabEntity] = NameMap(kind="entity")
-        self.global_cameras: NameMap[URLabCameraView] = NameMap(kind="camera")
         self.step_count = 0
         self.sim_time = 0.0
         self.sim_time_sec = self.sim_time_nsec = 0
         self.wall_time_sec = self.wall_time_nsec = 0
         self.recv_wall_time_ns = 0
         self.user: dict[str, Any] = {}
-        self._local_model = local_model
-        self._check_version = check_version
-        self._mismatch_said = False
         session.on_opened = self._note_session
         session.on_refusal = self._note_refusal
         session.control.resolve = self._articulation_key
-        self._promote = promote
-        self._trusted = trusted
         self._live_pictures = live_pictures
         self.pending = PendingOutcomes()
         self.on_adopted: Callable[[], None] | None = None
         self.stopping = False
         self.observers: list[StateObserver] = []
-        self._records: dict[str, MirroredArticulation] = {}
-        self._entity_records: dict[str, MirroredEntity] = {}
 
     @property
     def mode(self) -> StepMode:
@@ -177,7 +143,7 @@ class SimState:
         live = mode is StepMode.LIVE and self.hello is not None and self.hello.manager_present
         receivers: list[LiveState | LatestPicture] = [self._live]
         if self._live_pictures:
-            receivers.extend(view.pictures for view in self._views())
+            receivers.extend(view.pictures for view in self.objects.views())
         for receiver in receivers:
             if live:
                 receiver.start()
@@ -200,59 +166,13 @@ class SimState:
         return self._live.stats.received
 
     @property
-    def records(self) -> Mapping[str, MirroredArticulation]:
-        """Records of the articulations, by key."""
-        return self._records
-
-    @property
-    def entity_records(self) -> Mapping[str, MirroredEntity]:
-        """Records of the plain entities, by name."""
-        return self._entity_records
-
-    @property
     def local_time(self) -> float:
         """Simulation time of the local data, or without them of the last reply, seconds."""
         return self.sim_time if self.mirror.data is None else self.mirror.data.time
 
     def _articulation_key(self, name: str) -> str | None:
-        articulation = self.articulations.get(name)
+        articulation = self.objects.articulations.get(name)
         return None if articulation is None else articulation.prefix
-
-    def direct_commands(self, carried: Carried) -> dict[str, ArticulationCommand]:
-        """Return what a step tells the articulations and entities, with the wrenches that it carries."""
-        commands = {record.name: record.direct_command(carried.get(record)) for record in self._ours()}
-        for name, record in self._entity_records.items():
-            if record not in carried:
-                continue
-            if not self.session.features.claims:
-                # Under its own name: the server tries the body's name alone after `<key>_<body>`.
-                commands[name] = record.wrench_command(carried[record])
-            else:
-                # An entity has no owner, so one of the robots takes it along.
-                key = next(iter(commands or self._records))
-                carrier = commands.setdefault(key, ArticulationCommand())
-                carrier.xfrc_applied = {**(carrier.xfrc_applied or {}), **carried[record]}
-        return commands
-
-    def live_commands(self, carried: Carried) -> dict[str, ArticulationCommand]:
-        """Return what a step in live mode tells the articulations."""
-        if self.session.features.live_pictures_in_steps:
-            return self.direct_commands(carried)
-        return {record.name: record.live_command() for record in self._ours()}
-
-    def _ours(self) -> list[MirroredArticulation]:
-        # A server whose robots have owners refuses a step that writes to others' robots, so it hears of ours only.
-        records = self._records.values()
-        return [record for record in records if record.driven] if self.session.features.claims else [*records]
-
-    def take_wrenches(self) -> Carried:
-        """Take what the step that is being built carries out of its buffers."""
-        carried: Carried = {record: record.take_wrenches() for record in self._ours() if record.wrenches}
-        if self._records or not self.session.features.claims:
-            for record in self._entity_records.values():
-                if record.wrenches:
-                    carried[record] = record.take_wrenches()
-        return carried
 
     def require_handshake(self, op: str) -> None:
         """Refuse an op that goes by what a handshake said, when that is not known.
@@ -269,41 +189,6 @@ class SimState:
                 hint="Call sim.start(), discover() or resync().",
             )
 
-    async def open(self, turn: Turn, observations: str) -> HelloOk:
-        """Open a session and take over what the server says."""
-        hello = await self.session.hello(turn, Hello(observations=observations))
-        self.level = self.sent_level = observations
-        await self.adopt(turn, hello)
-        return hello
-
-    async def _loadable(self, turn: Turn, hello: HelloOk) -> HelloOk:
-        """Return a handshake whose model this process can and may load.
-
-        Raises:
-            URLabVersionMismatch: It is another MuJoCo's, and the user wants to hear of that.
-            URLabError: The server is not trusted with binary models and offers no other.
-        """
-        mismatch = self.mirror.check_version(hello)
-        if mismatch is not None:
-            if self._check_version:
-                raise mismatch
-            if not self._mismatch_said:
-                self._mismatch_said = True
-                warnings.warn(
-                    f"{mismatch.args[0]} The local model is compiled here from XML and only approximates the server's.",
-                    stacklevel=2,
-                )
-            if hello.mjcf_compiled is None:
-                hello = await self._hello_with_assets(turn)
-        if hello.mjb is not None and not self._trusted:
-            hello = await self._without_binary(turn, hello)
-        return hello
-
-    async def _hello_with_assets(self, turn: Turn) -> HelloOk:
-        hello = await self.session.hello(turn, Hello(observations=self.level, include_assets=True))
-        self.sent_level = self.level
-        return hello
-
     def _note_session(self, hello: HelloOk) -> None:
         """Note that a session was opened, maybe by a handshake that its caller had given up."""
         self.pending.clear()  # what belonged to the session before is refused now
@@ -315,188 +200,19 @@ class SimState:
             )
         )
 
-    async def _without_binary(self, turn: Turn, hello: HelloOk) -> HelloOk:
-        """Return the handshake with a model in XML alone: MuJoCo's binary loader is no match for a hostile model.
-
-        Raises:
-            URLabError: The server has none.
-        """
-        if hello.mjcf_compiled is None:
-            log.info("the server is not trusted with binary models: the local model is compiled here from XML")
-            hello = await self._hello_with_assets(turn)
-        if hello.manager_present and hello.mjcf_compiled is None:
-            raise URLabError(
-                "The server offers its model only in MuJoCo's binary format, which is loaded from servers on this "
-                "machine and from servers known by their key.",
-                op="hello",
-                hint="Pass server_key=…, or trust_server=True if you trust the network in between, or "
-                "local_model=False.",
-            )
-        hello.mjb = None
-        return hello
-
-    async def adopt(self, turn: Turn, hello: HelloOk) -> None:
-        """Take over a handshake: load its model, bind the wrappers, bring the server into the wanted step mode."""
-        hello.mjb_base64 = NOT_SENT  # it keeps the whole reply in memory
-        await self.session.transport.follow(hello)
-        loaded = None
-        if self._local_model:
-            if hello.mjb is not None:
-                hello = await self._loadable(turn, hello)
-            load = partial(self.mirror.load, hello, trusted=self._trusted)
-            loaded = await turn.aside(anyio.to_thread.run_sync(load, abandon_on_cancel=True))
-        examined = examine(hello, None if loaded is None else loaded.model)
-        self.publishers.check_open()
-        # From here on nothing waits until all is taken over: cancelled or not, model and wrappers belong together.
-        # The model's bytes, several times its size, are not needed any more.
-        hello.mjb = hello.mjcf_compiled = hello.vfs_assets = None
-        played = self.hello is not None and self.hello.manager_present
-        with self.mirror.lock:
-            if self._local_model:
-                self.mirror.use(loaded)
-            self.hello = hello
-            self._bind_articulations(hello, examined)
-            self._bind_entities(examined)
-            cameras = hello.global_cameras or {}
-            self.global_cameras = NameMap(
-                {n: self._global_camera(n, info) for n, info in cameras.items()}, kind="camera"
-            )
-            self.step_count = 0
-        self.pending.play = False
-        self._views()  # binds the cameras to what the handshake says of them
-        self.publishers.refresh()
-        if self.publishers.camera_switch is not None:
-            self.publishers.camera_switch.restart([view.info for view in self._views()])
-        if hello.manager_present and not played:
-            self.publishers.events.publish(PlayStarted(articulations=list(self.articulations)))
-        if self.on_adopted is not None:
-            self.on_adopted()
-        if not hello.manager_present:
-            self.mode = StepMode.LIVE
-        elif self._promote and self.wanted_mode is not StepMode.AUTO:
-            await self._promote_to(turn, self.wanted_mode)
-        else:
-            self.assume_mode(StepMode.LIVE if self.wanted_mode is StepMode.AUTO else self.wanted_mode)
-        log.info(
-            "session with %s, MuJoCo %s: %d articulations, mode %s",
-            hello.urlab_version, hello.mujoco_version, len(self.articulations), self.mode,
-        )  # fmt: skip
-
-    async def _promote_to(self, turn: Turn, mode: StepMode) -> None:
-        self.pending.mode = mode  # until the server has agreed, whatever comes between
-        try:
-            previous = await self.ask_mode(turn, mode)
-        except ModeLocked as locked:
-            if locked.pinned is not None:
-                raise
-            self.assume_mode(mode)  # which mode it is pinned to shows in the reply to the first step
-            return
-        except BaseException as error:
-            if leaves_open(error) and self.promoted_from is None:
-                self.promoted_from = StepMode.LIVE  # what play begins in; the reply would have told
-            raise
-        if previous is not self.mode:
-            self.promoted_from = previous
-
-    async def ask_mode(self, turn: Turn, mode: StepMode | str) -> StepMode | str:
-        """Bring the server into a step mode, take over the one in force, and return the one before.
-
-        A word that no mode is known by is the server's own for the mode that it was asked for.
-
-        Raises:
-            ModeLocked: The project pins another one, which has been taken over if its name is known.
-        """
-        try:
-            with self.pending.about_mode(mode):
-                try:
-                    reply = await turn.call(SetMode(mode=mode))
-                except BadMode:
-                    # Servers after the beta call the modes by other names.
-                    later = LATER_MODE_NAMES.get(mode) if isinstance(mode, StepMode) else None
-                    reply = await turn.call(SetMode(mode=later or mode))
-        except ModeLocked as locked:
-            if locked.pinned is not None:
-                self.mode = locked.pinned
-            if locked.pinned is not mode:
-                raise
-            if mode is StepMode.DIRECT:
-                # Play starts paused, and no change of mode can resume it where the mode is pinned.
-                await turn.call(SetPaused(paused=False))
-            return mode
-        previous, current = known(StepMode, reply.previous_mode), known(StepMode, reply.current_mode)
-        self.mode_word = reply.current_mode
-        if not isinstance(current, StepMode):
-            log.warning("the server calls step mode %s %r", mode, current)
-            current = mode if isinstance(mode, StepMode) else StepMode.LIVE
-        try:
-            if self.session.features.idles_in_puppet:
-                await self._still_puppet(turn, previous, current)
-        finally:
-            self.mode = current
-        return previous
-
-    async def _still_puppet(self, turn: Turn, previous: StepMode | str, current: StepMode) -> None:
-        """Keep physics from taking steps of its own between the pushes of puppet mode, and undo that afterwards."""
-        if current is StepMode.PUPPET:
-            await turn.call(SetPaused(paused=True))
-        elif previous is StepMode.PUPPET and current is StepMode.LIVE:  # direct mode takes the pause back itself
-            await turn.call(SetPaused(paused=False))
-
-    def _global_camera(self, name: str, info: CameraInfo) -> URLabCameraView:
-        view = self.global_cameras.get(name)
-        if view is None:
-            return URLabCameraView(name, info, self.publishers)
-        view.info = info
-        return view
-
-    def _views(self) -> list[URLabCameraView]:
-        own = [view for art in self.articulations.values() for view in art.cameras.values()]
-        return [*own, *self.global_cameras.values()]
-
-    def _bind_articulations(self, hello: HelloOk, examined: Examined) -> None:
-        wrappers: dict[str, URLabArticulation] = {}
-        aliases: dict[str, list[str]] = {}
-        for info in hello.articulations:
-            key = info.prefix
-            layout = examined.layouts[key]
-            record = self._records.get(key)
-            if record is None:
-                record = self._records[key] = MirroredArticulation(self.mirror, info, layout)
-            else:
-                record.bind(info, layout)
-            wrappers[key] = self.articulations.get(key) or URLabArticulation(record, self.session, self.publishers)
-            found = _ENGINE_NAME.fullmatch(info.compiled_prefix)
-            for alias in {info.actor_id, info.compiled_prefix, found["stem"] if found else ""} - {"", key}:
-                aliases.setdefault(alias, []).append(key)
-        self._records = {key: self._records[key] for key in wrappers}
-        self.articulations = NameMap(wrappers, aliases, kind="articulation")
-        self.articulations_by_id = {art.actor_id: art for art in wrappers.values() if art.actor_id}
-
-    def _bind_entities(self, examined: Examined) -> None:
-        plain: dict[str, URLabEntity] = {}
-        records: dict[str, MirroredEntity] = {}
-        for name, info in examined.entities.items():
-            record = self._entity_records.get(name) or MirroredEntity(self.mirror, name)
-            record.bind_entity(info)
-            records[name] = record
-            known = self.entities.get(name)
-            plain[name] = known if known is not None and type(known) is URLabEntity else URLabEntity(record)
-        self._entity_records = records
-        self.entities = NameMap({**self.articulations, **plain}, kind="entity")
-
     def absorb_reset(self, reply: StateReply, keyframe: str | None) -> None:
         """Take over the state after a reset, whole or not at all; raises as `absorb` does."""
         received = time.time_ns()
         parts = self._checked(reply, "reset")
         with self.mirror.lock:
             self.mirror.reset(keyframe)
-            for record in self._entity_records.values():
+            for record in self.objects.entity_records.values():
                 record.pose = None
             self._take_over(reply, parts, received, into_mirror=True)
 
     def matches(self, snapshot: StateSnapshot) -> bool:
         """Whether a published state is of the world that the handshake described, as far as that can be seen."""
-        if not self.session.confirmed or snapshot.per_articulation.keys() != self._records.keys():
+        if not self.session.confirmed or snapshot.per_articulation.keys() != self.objects.records.keys():
             return False
         try:
             self._checked(snapshot, "state/full")
@@ -510,9 +226,10 @@ class SimState:
             return  # sent before the last reply, arrived after it
         if not self.session.confirmed:
             return  # the connection was lost: this may be another server's
-        if snapshot.per_articulation.keys() != self._records.keys():
+        known = self.objects.records
+        if snapshot.per_articulation.keys() != known.keys():
             raise ProtocolError(
-                f"state/full: it holds {_listed(snapshot.per_articulation)}, the handshake {_listed(self._records)}.",
+                f"state/full: it holds {_listed(snapshot.per_articulation)}, the handshake {_listed(known)}.",
                 hint="The world changed on the server: call discover().",
             )
         self.absorb(snapshot, "state/full")
@@ -539,12 +256,13 @@ class SimState:
         """
         if not math.isfinite(reply.time):
             raise ProtocolError(f"{op}: the simulation time is {reply.time}.", op=op)
-        articulations = [(self._records[key], s) for key, s in reply.per_articulation.items() if key in self._records]
+        records = self.objects.records
+        articulations = [(records[key], s) for key, s in reply.per_articulation.items() if key in records]
         for record, state in articulations:
             record.check(state, op)
         entities: list[tuple[MirroredEntity, EntityState]] = []
         if isinstance(reply, (StepOk, StateSnapshot)) and reply.entities:
-            known = self._entity_records
+            known = self.objects.entity_records
             entities = [(known[name], state) for name, state in reply.entities.items() if name in known]
             for entity, pose in entities:
                 entity.check_pose(pose, op)
@@ -606,10 +324,10 @@ class SimState:
         Raises:
             ProtocolError: They are neither all of its positions nor those of its free base.
         """
-        articulation = self.articulations.get(key)
+        articulation = self.objects.articulations.get(key)
         if articulation is None:
             return
-        record = self._records[articulation.prefix]
+        record = self.objects.records[articulation.prefix]
         record.check_written(qpos)
         with self.mirror.lock:
             record.qpos = np.concatenate([qpos, record.qpos[len(qpos) :]])
@@ -653,86 +371,14 @@ class SimState:
             if self.on_adopted is not None:
                 self.on_adopted()
 
-    def note_missing_frames(self, asked: Iterable[str], reply: StepOk) -> None:
-        """Mark the cameras whose frame was asked for and did not come: the server just leaves them out."""
-        views = [view for view in map(self.camera, asked) if view is not None]
-        came = {id(self.camera(name)) for name in reply.cameras or {}}
-        for view in views:
-            if view.delivered and id(view) not in came:
-                log.warning("camera %s delivered no frame; its latest_frame is older than the state", view.name)
-            view.delivered = id(view) in came
-
     def _frames(self, cameras: Mapping[str, CameraFrame]) -> list[tuple[URLabCameraView, CameraFrame]]:
         found: list[tuple[URLabCameraView, CameraFrame]] = []
         for name, frame in cameras.items():
-            view = self.camera(name) or self._scene_camera(name, frame)
+            view = self.objects.camera(name) or self.objects.announced_camera(name, frame)
             if view is None:
                 raise ProtocolError(f"step: a frame of camera {name!r}, which the handshake does not list.", op="step")
             found.append((view, frame))
         return found
-
-    def _scene_camera(self, name: str, frame: CameraFrame) -> URLabCameraView | None:
-        """Return a view of a camera of the scene that was announced by its picture alone."""
-        if not self.hidden_cameras:
-            return None
-        mode = CameraMode.DEPTH if frame.dtype == "float32" else CameraMode.REAL
-        info = CameraInfo(mode=mode, resolution=(frame.width, frame.height), fovy=0.0, zmq_endpoint="", zmq_topic=name)
-        view = URLabCameraView(name, info, self.publishers)
-        self.global_cameras = NameMap({**self.global_cameras, name: view}, kind="camera")
-        return view
-
-    def camera_names(self) -> list[str]:
-        """Return a name of each camera that no other has: `<articulation>/<camera>`, or the scene's."""
-        own = [f"{art.prefix}/{name}" for art in self.articulations.values() for name in art.cameras]
-        return [*own, *self.global_cameras]
-
-    def shown_cameras(self, names: Iterable[str]) -> dict[str, str]:
-        """Return what users call cameras by `camera_names`: by the name alone where that means one of them."""
-        short = {name: name.rpartition("/")[2] for name in names}
-        counts = Counter(short.values())
-        return {name: bare if counts[bare] == 1 else name for name, bare in short.items()}
-
-    def camera_name(self, name: str) -> str:
-        """Return which of `camera_names` a user means by `<articulation>/<camera>` or just `<camera>`.
-
-        Raises:
-            KeyError: None of them, or several.
-        """
-        names = self.camera_names()
-        owner, slash, short = name.rpartition("/")
-        if slash:
-            art = self.articulations.get(owner)
-            found = [f"{art.prefix}/{short}"] if art is not None and short in art.cameras else []
-        else:
-            found = [known for known in names if known == name or known.endswith(f"/{name}")]
-        if not found:
-            raise KeyError(f"no camera {name!r}; there are: {', '.join(names) or 'none'}")
-        if len(found) > 1:
-            raise KeyError(f"camera {name!r} is ambiguous: it could mean {' or '.join(map(repr, found))}")
-        return found[0]
-
-    @property
-    def hidden_cameras(self) -> bool:
-        """Whether the scene may have cameras that the handshake does not list."""
-        return any("/" in name for record in self._records.values() for name in record.info.camera_topics)
-
-    def camera(self, name: str) -> URLabCameraView | None:
-        """Return the camera that a user means by `<articulation>/<camera>` or just `<camera>`, or None."""
-        try:
-            return self.require_camera(name)
-        except KeyError:
-            return None
-
-    def require_camera(self, name: str) -> URLabCameraView:
-        """Return the camera that a user means by `<articulation>/<camera>` or just `<camera>`.
-
-        Raises:
-            KeyError: None, or several.
-        """
-        if name in self.global_cameras:
-            return self.global_cameras[name]
-        owner, _, short = self.camera_name(name).rpartition("/")
-        return self.articulations[owner].cameras[short] if owner else self.global_cameras[short]
 
 
 def _listed(keys: Iterable[str]) -> str:

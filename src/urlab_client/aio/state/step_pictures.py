@@ -42,18 +42,18 @@ class StepPictures:
         self._all = False
         if asked is False:  # as nearly every step has it
             return
-        names = state.camera_names()
+        names = state.objects.camera_names()
         if isinstance(asked, bool):
             self._wanted = dict.fromkeys(names, str(CameraTiming.LATEST))
-            shown = state.shown_cameras(names)
+            shown = state.objects.shown_cameras(names)
             self._shown = {name: shown[name] for name in self._wanted}
         else:
-            self._shown = {state.camera_name(name): name for name in asked}
-            self._wanted = {state.camera_name(name): timing for name, timing in asked.items()}
+            self._shown = {state.objects.camera_name(name): name for name in asked}
+            self._wanted = {state.objects.camera_name(name): timing for name, timing in asked.items()}
         # Asked for all of them, a server that calls two cameras alike brings one. One that has cameras which it does
         # not announce shows them to nobody else.
         unique = all("/" not in name for name in self._shown.values())
-        self._all = asked is True and (unique or state.hidden_cameras)
+        self._all = asked is True and (unique or state.objects.hidden_cameras)
         self._sync = {name for name, timing in self._wanted.items() if timing == CameraTiming.SYNC}
 
     def __bool__(self) -> bool:

@@ -7,8 +7,10 @@ from collections.abc import Mapping
 
 from urlab_client.aio.model.articulation_state import Carried, give_back
 from urlab_client.aio.session import Turn
-from urlab_client.aio.state.recovery import leaves_open
+from urlab_client.aio.state.pending_outcomes import leaves_open
 from urlab_client.aio.state.sim_state import SimState
+from urlab_client.aio.state.step_commands import direct_commands, live_commands, take_wrenches
+from urlab_client.aio.state.step_mode import ask_mode
 from urlab_client.aio.state.step_pictures import StepPictures
 from urlab_client.protocol.codec import op_of
 from urlab_client.protocol.enums import CameraTiming, StepMode
@@ -32,7 +34,7 @@ async def take_steps(state: SimState, turn: Turn, n_steps: int, cameras: Cameras
     """
     state.require_handshake("step")
     if state.pending.mode is not None:
-        await state.ask_mode(turn, state.pending.mode)
+        await ask_mode(state, turn, state.pending.mode)
     mode = state.mode
     if n_steps < (0 if mode is StepMode.PUPPET else 1):
         raise ValueError(_too_few(n_steps, mode))
@@ -60,7 +62,7 @@ async def take_steps(state: SimState, turn: Turn, n_steps: int, cameras: Cameras
         if state.mode is StepMode.PUPPET and mode is not StepMode.PUPPET:
             return await take_steps(state, turn, n_steps, cameras, level)  # all it has done is to set the clock
     if pictures and state.mode is not StepMode.LIVE:
-        state.note_missing_frames(pictures.names, reply)
+        state.objects.note_missing_frames(pictures.names, reply)
     if state.mode is StepMode.PUPPET:
         with state.mirror.lock:
             state.mirror.perturb(reply.perturbation)
@@ -81,9 +83,9 @@ async def _exchange(state: SimState, turn: Turn, request: Step, level: str, pict
 
 async def _live_step(state: SimState, turn: Turn, pictures: StepPictures) -> StepOk:
     drawn = bool(pictures) and state.session.features.live_pictures_in_steps
-    carried = state.take_wrenches()  # of no effect on servers that do not take them in this mode
+    carried = take_wrenches(state)  # of no effect on servers that do not take them in this mode
     try:
-        request = Step(per_articulation=state.live_commands(carried) or None)
+        request = Step(per_articulation=live_commands(state, carried) or None)
         if drawn:
             pictures.ask(request)
         reply = await turn.call(request, takes=_seconds(pictures) if drawn else None)
@@ -94,14 +96,14 @@ async def _live_step(state: SimState, turn: Turn, pictures: StepPictures) -> Ste
             give_back(carried)
         raise
     if drawn:
-        state.note_missing_frames(pictures.names, reply)
+        state.objects.note_missing_frames(pictures.names, reply)
     return reply
 
 
 def _direct_step(state: SimState, n_steps: int) -> tuple[Step, Carried]:
-    carried = state.take_wrenches()
+    carried = take_wrenches(state)
     try:
-        commands = state.direct_commands(carried)
+        commands = direct_commands(state, carried)
     except ValueError:
         give_back(carried)
         raise
@@ -119,10 +121,10 @@ def _puppet_step(state: SimState, n_steps: int) -> tuple[Step, Carried]:
             op="step",
             hint="Make the client with local_model=True and call discover() during play.",
         )
-    if state.take_wrenches():
+    if take_wrenches(state):
         warnings.warn("apply_xfrc() is inert in puppet mode: write client.data.xfrc_applied instead.", stacklevel=4)
     with mirror.lock:
-        for record in state.records.values():
+        for record in state.objects.records.values():
             record.write_set_points()
         mirror.check_finite()
         if n_steps > 0:

@@ -141,7 +141,7 @@ class Follower:
         if asked is True or self._due_at is None:
             return asked
         chosen = dict(asked or {})
-        known = {id(state.camera(name)) for name in chosen}
+        known = {id(state.objects.camera(name)) for name in chosen}
         for view, camera in self._current().cameras.items():
             if view not in known:
                 chosen[camera.name] = "sync"
@@ -162,14 +162,16 @@ class Follower:
         return self._scene
 
     def _every_camera(self) -> dict[str, URLabCameraView]:
-        arts = self._state.articulations
+        arts = self._state.objects.articulations
         own = {f"{key}/{name}": view for key, art in arts.items() for name, view in art.cameras.items()}
-        return own | dict(self._state.global_cameras)
+        return own | dict(self._state.objects.global_cameras)
 
     def _unknown_cameras(self) -> str:
         """Say which cameras are not there; nothing if all are."""
         missing = (
-            [] if self._wanted_cameras == "all" else [n for n in self._wanted_cameras if not self._state.camera(n)]
+            []
+            if self._wanted_cameras == "all"
+            else [n for n in self._wanted_cameras if not self._state.objects.camera(n)]
         )
         there = ", ".join(self._every_camera()) or "none"
         return f"no camera {', '.join(map(repr, missing))}; there are: {there}" if missing else ""
@@ -178,7 +180,7 @@ class Follower:
         every = self._every_camera()
         if self._wanted_cameras == "all":
             return list(every.items())
-        wanted = {id(self._state.camera(name)) for name in self._wanted_cameras}
+        wanted = {id(self._state.objects.camera(name)) for name in self._wanted_cameras}
         return [(name, view) for name, view in every.items() if id(view) in wanted]
 
     def _hand_on(self, reply: StateReply | StateSnapshot) -> None:
@@ -189,13 +191,13 @@ class Follower:
         clock, wall = reply.sim_time, reply.wall_time
         nanoseconds = round(reply.time * _NS) if clock is None else clock.sec * _NS + clock.nsec
         wall_ns = state.recv_wall_time_ns if wall is None else wall.sec * _NS + wall.nsec
-        set_points = {key: record.ctrl.tolist() for key, record in state.records.items()}
+        set_points = {key: record.ctrl.tolist() for key, record in state.objects.records.items()}
         put(State(scene, reply, set_points, nanoseconds, isinstance(reply, ResetOk), wall_ns))
         if isinstance(reply, StepOk) and self._due_at is not None:
             self._pictures.done(self._due_at)
             self._due_at = None
             for name, frame in (reply.cameras or {}).items():
-                camera = scene.cameras.get(id(state.camera(name)))
+                camera = scene.cameras.get(id(state.objects.camera(name)))
                 if camera is not None:
                     put(CameraPicture(camera, frame, nanoseconds, wall_ns))
 

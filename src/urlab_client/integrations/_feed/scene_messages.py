@@ -97,11 +97,11 @@ class SceneMessages:
     def of(cls, state: SimState, cameras: list[tuple[str, URLabCameraView]]) -> SceneMessages:
         """Describe what the client knows."""
         model = state.mirror.model
-        layouts = {key: record.layout for key, record in state.records.items()}
+        layouts = {key: record.layout for key, record in state.objects.records.items()}
         ids = _camera_ids(model)
         entities: dict[str, tuple[int, int] | None] = {}
         mocap: dict[str, int] = {}
-        for name, record in state.entity_records.items():
+        for name, record in state.objects.entity_records.items():
             offsets = record.qpos_offset, record.qvel_offset
             entities[name] = None if offsets[0] is None or offsets[1] is None else (offsets[0], offsets[1])
             if model is not None and record.body_id >= 0 and model.body_mocapid[record.body_id] >= 0:

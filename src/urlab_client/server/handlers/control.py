@@ -41,14 +41,14 @@ def check_all_owners(server: ServerCore, request: ControlRequest[Any]) -> None:
     """
     if server.dialect.claims:
         running = server.play.running()
-        keys = [control.index.key for control in running.engine.controls.values()]
+        keys = [control.index.key for control in running.engine.articulations.controls.values()]
         running.claims.check_all(keys, _owner(request))
 
 
 @handles(ClaimControl)
 def claim_control(server: ServerCore, request: ClaimControl) -> ClaimControlOk:
     running = server.play.running()
-    key = running.engine.control(need(request, request.articulation, "articulation")).index.key
+    key = running.engine.articulations.control(need(request, request.articulation, "articulation")).index.key
     owner = _owner(request)
     running.claims.claim(key, owner, request.ttl_s, force=request.force)
     return ClaimControlOk(articulation=key, owner=owner, ttl_s=request.ttl_s)
@@ -57,7 +57,7 @@ def claim_control(server: ServerCore, request: ClaimControl) -> ClaimControlOk:
 @handles(ReleaseControl)
 def release_control(server: ServerCore, request: ReleaseControl) -> ReleaseControlOk:
     running = server.play.running()
-    key = running.engine.control(need(request, request.articulation, "articulation")).index.key
+    key = running.engine.articulations.control(need(request, request.articulation, "articulation")).index.key
     running.claims.release(key, _owner(request))
     return ReleaseControlOk(articulation=key)
 
@@ -90,8 +90,8 @@ def set_user_channels(server: ServerCore, request: SetUserChannels) -> SetUserCh
     applied = 0
     rejected: dict[str, str] = {}
     for robot, values in (request.arts or {}).items():
-        control = running.engine.find(robot)
-        owner = robot if control is None else running.engine.name(control)
+        control = running.engine.articulations.find(robot)
+        owner = robot if control is None else running.engine.articulations.name(control)
         for channel, value in values.items():
             reason = running.channels.write(owner, channel, value)
             applied += reason is None

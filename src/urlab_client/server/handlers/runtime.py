@@ -42,7 +42,8 @@ from urlab_client.protocol.types import Contact, KeyframeInfo
 from urlab_client.server.core import ServerCore
 from urlab_client.server.handlers.control import check_all_owners, check_owner
 from urlab_client.server.physics.controllers import ArticulationControl
-from urlab_client.server.physics.engine import Engine, parse_control_source, parse_mode
+from urlab_client.server.physics.engine import Engine
+from urlab_client.server.physics.parsing import parse_control_source, parse_mode
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.dispatch import handles
 from urlab_client.server.rpc.requests import need
@@ -80,10 +81,12 @@ def set_control_source(server: ServerCore, request: SetControlSource) -> SetCont
     source = parse_control_source(need(request, request.source, "source"))
     if not request.articulation:
         check_all_owners(server, request)
-        engine.set_control_source(source)
+        with engine.commanding() as articulations:
+            articulations.set_source(source)
         return SetControlSourceOk(source=source, scope="global")
-    check_owner(server, request, engine.control(request.articulation))
-    engine.set_control_source(source, request.articulation)
+    check_owner(server, request, engine.articulations.control(request.articulation))
+    with engine.commanding() as articulations:
+        articulations.set_source(source, request.articulation)
     return SetControlSourceOk(source=source, scope="articulation", articulation=request.articulation)
 
 
@@ -99,8 +102,9 @@ class AnyTwist(SetTwist, tag="set_twist", kw_only=True):
 def set_twist(server: ServerCore, request: AnyTwist) -> SetTwistOk:
     engine = server.play.running().engine
     key = need(request, request.articulation, "articulation")
-    check_owner(server, request, engine.control(key))
-    twist = engine.set_twist(key, request.linear, request.angular)
+    check_owner(server, request, engine.articulations.control(key))
+    with engine.lock:
+        twist = engine.articulations.set_twist(key, request.linear, request.angular)
     return SetTwistOk(articulation=key, linear=twist.linear, angular=twist.angular)
 
 
@@ -108,7 +112,9 @@ def set_twist(server: ServerCore, request: AnyTwist) -> SetTwistOk:
 def configure_controller(server: ServerCore, request: ConfigureController) -> ConfigureControllerOk:
     engine = server.play.running().engine
     key = need(request, request.articulation, "articulation")
-    return ConfigureControllerOk(articulation=key, params=engine.configure_controller(key, request.params))
+    with engine.commanding() as articulations:
+        params = articulations.configure_controller(key, request.params)
+    return ConfigureControllerOk(articulation=key, params=params)
 
 
 @handles(SetQpos)
@@ -117,7 +123,7 @@ def set_qpos(server: ServerCore, request: SetQpos) -> SetQposOk:
     engine, model, data = running.engine, running.scene.model, running.scene.data
     target = need(request, request.target, "target")
     by_name = request.target_by == "actor_name"
-    control = engine.control(target) if by_name else _by_actor_id(engine, target)
+    control = engine.articulations.control(target) if by_name else _by_actor_id(engine, target)
     check_owner(server, request, control)
     index = control.index
     qpos = need(request, request.qpos, "qpos")
@@ -143,7 +149,7 @@ def set_qpos(server: ServerCore, request: SetQpos) -> SetQposOk:
 
 
 def _by_actor_id(engine: Engine, actor_id: str) -> ArticulationControl:
-    for control in engine.controls.values():
+    for control in engine.articulations.controls.values():
         if control.index.actor_id == actor_id:
             return control
     raise Refusal("unknown_articulation", actor_id)

@@ -77,9 +77,11 @@ def handshake(server: ServerCore, session_id: str, *, include_assets: bool = Fal
     if running is None:
         return reply
     scene, engine = running.scene, running.engine
-    with engine.look():
+    with engine.lock.look():
         reply.mjb = scene.mjb()
-        reply.articulations = [_articulation(server, name, control) for name, control in engine.controls.items()]
+        reply.articulations = [
+            _articulation(server, name, control) for name, control in engine.articulations.controls.items()
+        ]
     reply.mjb_base64 = msgspec.Raw(msgspec.msgpack.encode(base64.b64encode(reply.mjb).decode("ascii")))
     reply.mjb_size = len(reply.mjb)
     reply.entities = {entity.name: _entity(entity) for entity in scene.entities}
@@ -214,7 +216,7 @@ def _check_owners(server: ServerCore, running: Running, request: Step) -> None:
     for name, command in (request.per_articulation or {}).items():
         if command.ctrl is None and command.ctrl_map is None and command.xfrc_applied is None:
             continue
-        control = running.engine.find(name)
+        control = running.engine.articulations.find(name)
         if control is None:
             raise Refusal("not_control_owner", f"there is no articulation '{name}'", owner=UNCLAIMED)
         check_owner(server, request, control)

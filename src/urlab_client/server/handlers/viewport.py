@@ -152,7 +152,7 @@ def _tracked(server: ServerCore) -> Actor | None:
 def _pose(server: ServerCore, actor: Actor) -> tuple[Vec3, Quat]:
     """Return where an actor is: during play its root body, else as authored."""
     running = server.play.current
-    control = None if running is None else running.engine.controls.get(actor.name)
+    control = None if running is None else running.engine.articulations.controls.get(actor.name)
     if running is None or control is None:
         return actor.location, actor.rotation
     body, data = control.index.root_body, running.scene.data

@@ -118,7 +118,7 @@ class Observer:
 
         Args:
             scene: The scene.
-            controls: `Engine.controls` of the engine that steps it; holds the twists.
+            controls: `Articulations.controls` of the engine that steps it; holds the twists.
             channels: The user channels; None for none.
         """
         self._channels = channels

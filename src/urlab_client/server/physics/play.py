@@ -66,7 +66,7 @@ class Running:
     @cached_property
     def step_frames(self) -> StepReplies:
         """What encodes the replies to `step`."""
-        return StepReplies(self.scene, self.engine.controls, self.engine.dialect)
+        return StepReplies(self.scene, self.engine.articulations.controls, self.engine.dialect)
 
     @cached_property
     def options(self) -> OptionOverrides:

@@ -48,7 +48,7 @@ class StepReplies:
 
         Args:
             scene: The scene.
-            controls: `Engine.controls` of the engine that steps it; holds the twists.
+            controls: `Articulations.controls` of the engine that steps it; holds the twists.
             dialect: What the replies look like.
         """
         self._scene = scene

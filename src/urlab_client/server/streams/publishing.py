@@ -169,8 +169,8 @@ class _Broadcast:
         scene = running.scene
         # The encoders read a mirror of the data that only the sending thread touches.
         self._mirror = mujoco.MjData(scene.model)
-        self._controls = list(running.engine.controls.values())
-        mirrored = {key: _with_own_twist(control) for key, control in running.engine.controls.items()}
+        self._controls = list(running.engine.articulations.controls.values())
+        mirrored = {key: _with_own_twist(control) for key, control in running.engine.articulations.controls.items()}
         self._twists = [control.twist for control in mirrored.values()]
         self._observer = Observer(dataclasses.replace(scene, data=self._mirror), mirrored, running.channels)
         self._sources = _arrays(scene, scene.data)
@@ -276,7 +276,8 @@ class _Broadcast:
 
     def _set_gains(self, key: str, gains: dict[str, JointGains]) -> None:
         try:
-            self._engine.configure_controller(key, gains_by_parameter(gains))
+            with self._engine.commanding() as articulations:
+                articulations.configure_controller(key, gains_by_parameter(gains))
         except Refusal as refusal:
             logger.debug("gains streamed to '%s' have no effect: %s", key, refusal.message)
 

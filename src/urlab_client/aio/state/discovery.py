@@ -1,0 +1,144 @@
+"""From a handshake to what the client knows: the session, the local model, the scene, the step mode."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from functools import partial
+
+import anyio.to_thread
+
+from urlab_client.aio.session import Turn
+from urlab_client.aio.state.handshake import examine
+from urlab_client.aio.state.sim_state import SimState
+from urlab_client.aio.state.step_mode import promote
+from urlab_client.protocol.enums import StepMode
+from urlab_client.protocol.errors import URLabError
+from urlab_client.protocol.messages.session import NOT_SENT, Hello, HelloOk
+from urlab_client.protocol.messages.streams import PlayStarted
+
+__all__ = ["Discovery"]
+
+log = logging.getLogger("urlab_client.client")
+
+
+class Discovery:
+    """Opens sessions and takes over handshakes.
+
+    Args:
+        state: The client's state, into which all of it goes.
+        local_model: Load the model of the handshake.
+        check_version: Raise when the MuJoCo builds differ.
+        promote: Bring the server into the step mode that the client was made with.
+        trusted: Load models in MuJoCo's binary format.
+    """
+
+    def __init__(
+        self, state: SimState, *, local_model: bool, check_version: bool, promote: bool, trusted: bool
+    ) -> None:
+        self._state = state
+        self._local_model = local_model
+        self._check_version = check_version
+        self._promote = promote
+        self._trusted = trusted
+        self._mismatch_said = False
+
+    async def open(self, turn: Turn, observations: str) -> HelloOk:
+        """Open a session and take over what the server says."""
+        state = self._state
+        hello = await state.session.hello(turn, Hello(observations=observations))
+        state.level = state.sent_level = observations
+        await self.adopt(turn, hello)
+        return hello
+
+    async def _loadable(self, turn: Turn, hello: HelloOk) -> HelloOk:
+        """Return a handshake whose model this process can and may load.
+
+        Raises:
+            URLabVersionMismatch: It is another MuJoCo's, and the user wants to hear of that.
+            URLabError: The server is not trusted with binary models and offers no other.
+        """
+        mismatch = self._state.mirror.check_version(hello)
+        if mismatch is not None:
+            if self._check_version:
+                raise mismatch
+            if not self._mismatch_said:
+                self._mismatch_said = True
+                warnings.warn(
+                    f"{mismatch.args[0]} The local model is compiled here from XML and only approximates the server's.",
+                    stacklevel=2,
+                )
+            if hello.mjcf_compiled is None:
+                hello = await self._hello_with_assets(turn)
+        if hello.mjb is not None and not self._trusted:
+            hello = await self._without_binary(turn, hello)
+        return hello
+
+    async def _hello_with_assets(self, turn: Turn) -> HelloOk:
+        state = self._state
+        hello = await state.session.hello(turn, Hello(observations=state.level, include_assets=True))
+        state.sent_level = state.level
+        return hello
+
+    async def _without_binary(self, turn: Turn, hello: HelloOk) -> HelloOk:
+        """Return the handshake with a model in XML alone: MuJoCo's binary loader is no match for a hostile model.
+
+        Raises:
+            URLabError: The server has none.
+        """
+        if hello.mjcf_compiled is None:
+            log.info("the server is not trusted with binary models: the local model is compiled here from XML")
+            hello = await self._hello_with_assets(turn)
+        if hello.manager_present and hello.mjcf_compiled is None:
+            raise URLabError(
+                "The server offers its model only in MuJoCo's binary format, which is loaded from servers on this "
+                "machine and from servers known by their key.",
+                op="hello",
+                hint="Pass server_key=…, or trust_server=True if you trust the network in between, or "
+                "local_model=False.",
+            )
+        hello.mjb = None
+        return hello
+
+    async def adopt(self, turn: Turn, hello: HelloOk) -> None:
+        """Take over a handshake: load its model, bind the wrappers, bring the server into the wanted step mode."""
+        state = self._state
+        hello.mjb_base64 = NOT_SENT  # it keeps the whole reply in memory
+        await state.session.transport.follow(hello)
+        loaded = None
+        if self._local_model:
+            if hello.mjb is not None:
+                hello = await self._loadable(turn, hello)
+            load = partial(state.mirror.load, hello, trusted=self._trusted)
+            loaded = await turn.aside(anyio.to_thread.run_sync(load, abandon_on_cancel=True))
+        examined = examine(hello, None if loaded is None else loaded.model)
+        state.publishers.check_open()
+        # From here on nothing waits until all is taken over: cancelled or not, model and wrappers belong together.
+        # The model's bytes, several times its size, are not needed any more.
+        hello.mjb = hello.mjcf_compiled = hello.vfs_assets = None
+        played = state.hello is not None and state.hello.manager_present
+        with state.mirror.lock:
+            if self._local_model:
+                state.mirror.use(loaded)
+            state.hello = hello
+            state.objects.bind(hello, examined)
+            state.step_count = 0
+        state.pending.play = False
+        views = state.objects.views()  # binds the cameras to what the handshake says of them
+        state.publishers.refresh()
+        if state.publishers.camera_switch is not None:
+            state.publishers.camera_switch.restart([view.info for view in views])
+        if hello.manager_present and not played:
+            state.publishers.events.publish(PlayStarted(articulations=list(state.objects.articulations)))
+        if state.on_adopted is not None:
+            state.on_adopted()
+        if not hello.manager_present:
+            state.mode = StepMode.LIVE
+        elif self._promote and state.wanted_mode is not StepMode.AUTO:
+            await promote(state, turn, state.wanted_mode)
+        else:
+            state.assume_mode(StepMode.LIVE if state.wanted_mode is StepMode.AUTO else state.wanted_mode)
+        log.info(
+            "session with %s, MuJoCo %s: %d articulations, mode %s",
+            hello.urlab_version, hello.mujoco_version, len(state.objects.articulations), state.mode,
+        )  # fmt: skip

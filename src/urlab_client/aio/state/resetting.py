@@ -1,0 +1,72 @@
+"""One reset: what it sends, and what becomes of that. Everything happens within the caller's turn."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from urlab_client.aio.model.mirror import model_names
+from urlab_client.aio.model.numbers import finite
+from urlab_client.aio.session import Turn
+from urlab_client.aio.state.pending_outcomes import leaves_open
+from urlab_client.aio.state.sim_state import SimState
+from urlab_client.protocol.errors import UnknownKeyframe
+from urlab_client.protocol.messages.session import Reset, ResetOk
+
+__all__ = ["take_reset"]
+
+
+async def take_reset(
+    state: SimState, turn: Turn, keyframe: str | None, seed: int | None, qpos: Mapping[str, Mapping[str, float]]
+) -> ResetOk:
+    """Reset the simulation and take over the state.
+
+    Args:
+        state: The client's state.
+        turn: The turn in which all of it happens.
+        keyframe: Keyframe to reset to, by its short or its compiled name.
+        seed: Remembered by the server.
+        qpos: Articulation key to joint name to the first component of its position.
+    """
+    state.require_handshake("reset")
+    articulations = state.objects.articulations
+    overrides = {articulations[key].prefix: _joint_values(state, key, values) for key, values in qpos.items()}
+    request = Reset(
+        keyframe_name=None if keyframe is None else _compiled_keyframe(state, keyframe),
+        seed=seed,
+        per_articulation_qpos=overrides or None,
+    )
+    try:
+        reply = await turn.call(request)
+        state.absorb_reset(reply, request.keyframe_name)
+    except BaseException as error:
+        if turn.sent and leaves_open(error):
+            state.pending.add_reset(state, request.keyframe_name)
+        raise
+    state.pending.clear()
+    return reply
+
+
+def _joint_values(state: SimState, key: str, values: Mapping[str, float]) -> dict[str, float]:
+    joints = state.objects.articulations[key].joints
+    live = {(joints[name].name if joints else name): value for name, value in values.items()}
+    return {name: finite(f"reset: joint {name!r} of {key!r}", value) for name, value in live.items()}
+
+
+def _compiled_keyframe(state: SimState, name: str) -> str:
+    """Return the compiled name; only that is known to the server."""
+    model = state.mirror.model
+    if model is None:
+        return name
+    compiled = [key for key in model_names(model, "key") if key]
+    if name in compiled:
+        return name
+    wanted = {f"{art.compiled_prefix}_{name}" for art in state.objects.articulations.values()}
+    matches = [key for key in compiled if key in wanted]
+    if len(matches) == 1:
+        return matches[0]
+    problem = (
+        f"{name!r} could mean {', '.join(matches)}"
+        if matches
+        else f"there is no {name!r}, only: {', '.join(compiled) or 'none'}"
+    )
+    raise UnknownKeyframe("unknown_keyframe", f"{problem}. Nothing was sent.", op="reset")

@@ -1,0 +1,172 @@
+"""What the scene of the last handshake holds: articulations, entities and cameras, and which names mean them."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections import Counter
+from collections.abc import Iterable
+
+from urlab_client.aio.articulation import URLabArticulation, URLabEntity
+from urlab_client.aio.cameras import URLabCameraView
+from urlab_client.aio.live.publishers import Publishers
+from urlab_client.aio.model.articulation_state import MirroredArticulation, MirroredEntity
+from urlab_client.aio.model.mirror import Mirror
+from urlab_client.aio.session import Session
+from urlab_client.aio.state.handshake import Examined
+from urlab_client.protocol.enums import CameraMode
+from urlab_client.protocol.messages.session import CameraFrame, CameraInfo, HelloOk, StepOk
+from urlab_client.protocol.names import NameMap
+
+__all__ = ["SceneObjects"]
+
+log = logging.getLogger("urlab_client.client")
+
+# Unreal's actor names: class, then a number or a generated id.
+_ENGINE_NAME = re.compile(r"(?P<stem>.+)_C_(?:\d+|UAID_\w+)")
+
+
+class SceneObjects:
+    """Articulations, entities and cameras. Users hold on to theirs: a later handshake binds the same ones again.
+
+    Attributes:
+        articulations: Articulations by key.
+        articulations_by_id: Those that have an actor id, by that id.
+        entities: Every dynamic body by name, articulations included.
+        global_cameras: Scene-level cameras.
+        records: What is mirrored of the articulations, by key.
+        entity_records: What is mirrored of the plain entities, by name.
+    """
+
+    def __init__(self, session: Session, publishers: Publishers, mirror: Mirror) -> None:
+        self.articulations: NameMap[URLabArticulation] = NameMap(kind="articulation")
+        self.articulations_by_id: dict[str, URLabArticulation] = {}
+        self.entities: NameMap[URLabEntity] = NameMap(kind="entity")
+        self.global_cameras: NameMap[URLabCameraView] = NameMap(kind="camera")
+        self.records: dict[str, MirroredArticulation] = {}
+        self.entity_records: dict[str, MirroredEntity] = {}
+        self._session = session
+        self._publishers = publishers
+        self._mirror = mirror
+
+    def bind(self, hello: HelloOk, examined: Examined) -> None:
+        """Take over what a handshake lists."""
+        self._bind_articulations(hello, examined)
+        self._bind_entities(examined)
+        cameras = hello.global_cameras or {}
+        self.global_cameras = NameMap({n: self._global_camera(n, info) for n, info in cameras.items()}, kind="camera")
+
+    def views(self) -> list[URLabCameraView]:
+        """Return all cameras, bound to what the handshake says of them."""
+        own = [view for art in self.articulations.values() for view in art.cameras.values()]
+        return [*own, *self.global_cameras.values()]
+
+    def announced_camera(self, name: str, frame: CameraFrame) -> URLabCameraView | None:
+        """Return a view of a camera of the scene that was announced by its picture alone."""
+        if not self.hidden_cameras:
+            return None
+        mode = CameraMode.DEPTH if frame.dtype == "float32" else CameraMode.REAL
+        info = CameraInfo(mode=mode, resolution=(frame.width, frame.height), fovy=0.0, zmq_endpoint="", zmq_topic=name)
+        view = URLabCameraView(name, info, self._publishers)
+        self.global_cameras = NameMap({**self.global_cameras, name: view}, kind="camera")
+        return view
+
+    def camera_names(self) -> list[str]:
+        """Return a name of each camera that no other has: `<articulation>/<camera>`, or the scene's."""
+        own = [f"{art.prefix}/{name}" for art in self.articulations.values() for name in art.cameras]
+        return [*own, *self.global_cameras]
+
+    def shown_cameras(self, names: Iterable[str]) -> dict[str, str]:
+        """Return what users call cameras by `camera_names`: by the name alone where that means one of them."""
+        short = {name: name.rpartition("/")[2] for name in names}
+        counts = Counter(short.values())
+        return {name: bare if counts[bare] == 1 else name for name, bare in short.items()}
+
+    def camera_name(self, name: str) -> str:
+        """Return which of `camera_names` a user means by `<articulation>/<camera>` or just `<camera>`.
+
+        Raises:
+            KeyError: None of them, or several.
+        """
+        names = self.camera_names()
+        owner, slash, short = name.rpartition("/")
+        if slash:
+            art = self.articulations.get(owner)
+            found = [f"{art.prefix}/{short}"] if art is not None and short in art.cameras else []
+        else:
+            found = [known for known in names if known == name or known.endswith(f"/{name}")]
+        if not found:
+            raise KeyError(f"no camera {name!r}; there are: {', '.join(names) or 'none'}")
+        if len(found) > 1:
+            raise KeyError(f"camera {name!r} is ambiguous: it could mean {' or '.join(map(repr, found))}")
+        return found[0]
+
+    @property
+    def hidden_cameras(self) -> bool:
+        """Whether the scene may have cameras that the handshake does not list."""
+        return any("/" in name for record in self.records.values() for name in record.info.camera_topics)
+
+    def camera(self, name: str) -> URLabCameraView | None:
+        """Return the camera that a user means by `<articulation>/<camera>` or just `<camera>`, or None."""
+        try:
+            return self.require_camera(name)
+        except KeyError:
+            return None
+
+    def require_camera(self, name: str) -> URLabCameraView:
+        """Return the camera that a user means by `<articulation>/<camera>` or just `<camera>`.
+
+        Raises:
+            KeyError: None, or several.
+        """
+        if name in self.global_cameras:
+            return self.global_cameras[name]
+        owner, _, short = self.camera_name(name).rpartition("/")
+        return self.articulations[owner].cameras[short] if owner else self.global_cameras[short]
+
+    def note_missing_frames(self, asked: Iterable[str], reply: StepOk) -> None:
+        """Mark the cameras whose frame was asked for and did not come: the server just leaves them out."""
+        views = [view for view in map(self.camera, asked) if view is not None]
+        came = {id(self.camera(name)) for name in reply.cameras or {}}
+        for view in views:
+            if view.delivered and id(view) not in came:
+                log.warning("camera %s delivered no frame; its latest_frame is older than the state", view.name)
+            view.delivered = id(view) in came
+
+    def _bind_articulations(self, hello: HelloOk, examined: Examined) -> None:
+        wrappers: dict[str, URLabArticulation] = {}
+        aliases: dict[str, list[str]] = {}
+        for info in hello.articulations:
+            key = info.prefix
+            layout = examined.layouts[key]
+            record = self.records.get(key)
+            if record is None:
+                record = self.records[key] = MirroredArticulation(self._mirror, info, layout)
+            else:
+                record.bind(info, layout)
+            wrappers[key] = self.articulations.get(key) or URLabArticulation(record, self._session, self._publishers)
+            found = _ENGINE_NAME.fullmatch(info.compiled_prefix)
+            for alias in {info.actor_id, info.compiled_prefix, found["stem"] if found else ""} - {"", key}:
+                aliases.setdefault(alias, []).append(key)
+        self.records = {key: self.records[key] for key in wrappers}
+        self.articulations = NameMap(wrappers, aliases, kind="articulation")
+        self.articulations_by_id = {art.actor_id: art for art in wrappers.values() if art.actor_id}
+
+    def _bind_entities(self, examined: Examined) -> None:
+        plain: dict[str, URLabEntity] = {}
+        records: dict[str, MirroredEntity] = {}
+        for name, info in examined.entities.items():
+            record = self.entity_records.get(name) or MirroredEntity(self._mirror, name)
+            record.bind_entity(info)
+            records[name] = record
+            known = self.entities.get(name)
+            plain[name] = known if known is not None and type(known) is URLabEntity else URLabEntity(record)
+        self.entity_records = records
+        self.entities = NameMap({**self.articulations, **plain}, kind="entity")
+
+    def _global_camera(self, name: str, info: CameraInfo) -> URLabCameraView:
+        view = self.global_cameras.get(name)
+        if view is None:
+            return URLabCameraView(name, info, self._publishers)
+        view.info = info
+        return view

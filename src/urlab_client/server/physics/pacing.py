@@ -1,0 +1,84 @@
+"""The pace of live mode: when the next iteration is due, at a speed relative to real time."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Final
+
+import mujoco
+
+from urlab_client.server.physics.controllers import float32
+
+__all__ = ["GIVE_WAY_S", "IDLE_S", "LivePacing"]
+
+MIN_SPEED: Final = 5.0
+MAX_SPEED: Final = 100.0
+
+IDLE_S: Final = 0.1
+"""Longest sleep of the physics thread while nothing integrates."""
+
+MAX_LAG_S: Final = 0.02
+"""A live step later than this is a stall and is not caught up; less is jitter and evens out."""
+
+MIN_PERIOD_S: Final = 1e-5
+MAX_PERIOD_S: Final = 3600.0
+
+HOLD_S: Final = 0.005
+"""A live loop that never sleeps because it is late lets go of the lock this often, for `GIVE_WAY_S`."""
+
+GIVE_WAY_S: Final = 0.0005
+
+
+class LivePacing:
+    """Keeps the iterations of live mode on a grid of time slots."""
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        """Pace a model's time step at the speed of real time; the first iteration is due at once."""
+        self._model = model
+        self._speed = MAX_SPEED
+        self._slot = -math.inf
+        self._last_rest = -math.inf
+
+    @property
+    def speed(self) -> float:
+        """Speed in force, percent of real time, 5 to 100, a float32."""
+        return float32(min(max(self._speed, MIN_SPEED), MAX_SPEED))
+
+    @speed.setter
+    def speed(self, percent: float) -> None:
+        self._speed = float(percent)
+
+    def restart(self) -> None:
+        """Make the next iteration due at once."""
+        self._slot = -math.inf
+
+    def take_slot(self, *, idle: bool) -> float:
+        """Take the next slot if it is due.
+
+        Args:
+            idle: Whether an iteration would change nothing and show nobody anything.
+
+        Returns:
+            0 when the slot is taken; else the seconds to wait before asking again.
+        """
+        now = time.perf_counter()
+        due = self._slot + (IDLE_S if idle else self._period())
+        if now < due:
+            return min(due - now, IDLE_S)
+        self._slot = now if now - due > MAX_LAG_S else due
+        return 0.0
+
+    @property
+    def rest_due(self) -> bool:
+        """Whether the loop has kept the lock for so long that others should have a turn."""
+        return time.perf_counter() - self._last_rest > HOLD_S
+
+    def rested(self) -> None:
+        """Note that the lock was free for a while."""
+        self._last_rest = time.perf_counter()
+
+    def _period(self) -> float:
+        """Seconds between two live iterations."""
+        period = float(self._model.opt.timestep) * 100.0 / self.speed
+        return min(period, MAX_PERIOD_S) if period > MIN_PERIOD_S else MIN_PERIOD_S

@@ -1,0 +1,65 @@
+"""A direct step that waits for the physics thread, and the caller that waits for it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+from urlab_client.protocol.enums import StepMode
+from urlab_client.protocol.messages.session import Step
+from urlab_client.server.refusal import Refusal
+
+__all__ = ["QueuedStep"]
+
+T = TypeVar("T")
+
+
+class QueuedStep(Generic[T]):
+    """A direct step that waits for the physics thread."""
+
+    def __init__(self, request: Step, observe: Callable[[StepMode], T]) -> None:
+        self.request = request
+        self._observe = observe
+        self._settled = threading.Event()
+        self._abandoned = False
+        self._begun = False
+        self._dropped = False
+        self._lock = threading.Lock()
+        self._results: list[T] = []
+        self._error: Exception | None = None
+
+    def begin(self) -> bool:
+        """Return whether it is to be done; its caller may have been told that it will not be."""
+        with self._lock:
+            self._begun = True
+            return not self._dropped
+
+    def succeed(self) -> None:
+        """Observe for the caller, if it still waits, and release it. The engine's lock is held."""
+        if not self._abandoned:
+            self._results.append(self._observe(StepMode.DIRECT))
+        self._settled.set()
+
+    def fail(self, error: Exception) -> None:
+        """Release the caller with an error."""
+        self._error = error
+        self._settled.set()
+
+    def wait(self, remaining: float, timeout: float, *, runs_late: bool) -> T:
+        """Return the observation, or raise what the step raised.
+
+        Args:
+            remaining: Seconds until `step_timeout` is raised.
+            timeout: Seconds since the request came in by then.
+            runs_late: Whether it stays queued then although it has not begun.
+        """
+        if not self._settled.wait(max(0.0, remaining)):
+            self._abandoned = True
+            with self._lock:
+                self._dropped = not (runs_late or self._begun)
+            fate = "is not done any more" if self._dropped else "runs to its end when physics gets to it"
+            raise Refusal("step_timeout", f"the step did not finish within {timeout:g} s; it {fate}")
+        if self._error is not None:
+            raise self._error
+        return self._results[0]
