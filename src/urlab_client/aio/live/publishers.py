@@ -6,17 +6,11 @@ from collections.abc import Callable, Collection
 
 import numpy as np
 
+from urlab_client.aio.live.camera_source import CameraSource, HasCamera, SharedCameraSource
 from urlab_client.aio.live.camera_switch import CameraSwitch
-from urlab_client.aio.live.sources import (
-    CameraSource,
-    EventBus,
-    HasCamera,
-    OwnSteps,
-    RowSource,
-    SharedCameraSource,
-    SharedStateSource,
-    StateSource,
-)
+from urlab_client.aio.live.event_bus import EventBus
+from urlab_client.aio.live.row_source import RowSource
+from urlab_client.aio.live.state_source import OwnSteps, SharedStateSource, StateSource
 from urlab_client.aio.transport.curve import ClientKeys
 from urlab_client.aio.transport.regions import Regions
 from urlab_client.aio.transport.server_regions import SharedMemoryRegions
