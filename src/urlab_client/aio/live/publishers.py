@@ -6,17 +6,11 @@ from collections.abc import Callable, Collection
 
 import numpy as np
 
+from urlab_client.aio.live.camera_source import CameraSource, HasCamera, SharedCameraSource
 from urlab_client.aio.live.camera_switch import CameraSwitch
-from urlab_client.aio.live.sources import (
-    CameraSource,
-    EventBus,
-    HasCamera,
-    OwnSteps,
-    RowSource,
-    SharedCameraSource,
-    SharedStateSource,
-    StateSource,
-)
+from urlab_client.aio.live.event_bus import EventBus
+from urlab_client.aio.live.row_source import RowSource
+from urlab_client.aio.live.state_source import OwnSteps, SharedStateSource, StateSource
 from urlab_client.aio.transport.curve import ClientKeys
 from urlab_client.aio.transport.regions import Regions
 from urlab_client.aio.transport.server_regions import SharedMemoryRegions
@@ -109,12 +103,20 @@ class Publishers:
         """Return what brings rows; see `RowSource`."""
         return RowSource(self.subscriptions, self._state_endpoint, articulations, kinds, components, entities=entities)
 
-    def camera(self, view: HasCamera, policy: str = StreamPolicy.LATEST) -> CameraSource:
-        """Return what brings a camera's pictures to a stream of that policy."""
+    def camera(self, view: HasCamera, policy: str = StreamPolicy.LATEST, *, asked: bool = True) -> CameraSource:
+        """Return what brings a camera's pictures to a stream of that policy; see `CameraSource`."""
         if self.regions is None or policy == StreamPolicy.ALL:
-            return CameraSource(self.subscriptions, view, self._host, live=self._live, switch=self.camera_switch)
+            return CameraSource(
+                self.subscriptions, view, self._host, live=self._live, switch=self.camera_switch, asked=asked
+            )
         return SharedCameraSource(
-            self.regions, self.subscriptions, view, self._host, live=self._live, switch=self.camera_switch
+            self.regions,
+            self.subscriptions,
+            view,
+            self._host,
+            live=self._live,
+            switch=self.camera_switch,
+            asked=asked,
         )
 
     def shared_frame(self, view: HasCamera) -> SharedFrame | None:
