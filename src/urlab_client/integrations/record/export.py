@@ -19,7 +19,7 @@ from PIL import Image
 from urlab_client.integrations._extras import need
 from urlab_client.integrations.record.reader import Camera, Run, Table
 from urlab_client.integrations.record.writer import RecordingError
-from urlab_client.protocol.rows import Pixels
+from urlab_client.protocol.pixels import Pixels
 
 __all__ = ["write_csv", "write_lerobot", "write_mp4", "write_npz", "write_parquet"]
 

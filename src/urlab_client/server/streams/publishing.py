@@ -25,26 +25,19 @@ from numpy.typing import NDArray
 from urlab_client._mujoco import actuator_count, control_counts, control_starts
 from urlab_client._uninterrupted import uninterrupted
 from urlab_client.protocol.codec import encode_reply
-from urlab_client.protocol.enums import ObservationLevel, StepMode
-from urlab_client.protocol.errors import ProtocolError
-from urlab_client.protocol.messages.session import ArticulationState, Clock, EntityState
-from urlab_client.protocol.rows import (
-    STATE_FULL,
-    ActionsRow,
+from urlab_client.protocol.control_messages import (
     ActuatorInfo,
-    BaseStateRow,
     CameraEndpoint,
     ControlPayload,
     JointGains,
-    JointRow,
-    SceneRow,
-    SensorRow,
-    StreamTopic,
-    TopicKind,
-    TwistRow,
     decode_gains,
     gains_by_parameter,
 )
+from urlab_client.protocol.enums import ObservationLevel, StepMode
+from urlab_client.protocol.errors import ProtocolError
+from urlab_client.protocol.messages.session import ArticulationState, Clock, EntityState
+from urlab_client.protocol.rows import ActionsRow, BaseStateRow, JointRow, SceneRow, SensorRow, TwistRow
+from urlab_client.protocol.topics import STATE_FULL, StreamTopic, TopicKind
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.physics.controllers import ArticulationControl, Twist
 from urlab_client.server.physics.observe import Observer, sim_clock, wall_clock
