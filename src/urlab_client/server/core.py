@@ -22,7 +22,8 @@ from urlab_client.protocol.enums import CameraMode, PIEState, StepMode
 from urlab_client.protocol.messages.session import ErrorReply, Hello, InstanceInfo, Step
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.assets.uploads import UPLOADS, Uploads
-from urlab_client.server.compile.scene import ArticulationIndex, CompiledScene, compile_scene
+from urlab_client.server.compile.scene import CompiledScene, compile_scene
+from urlab_client.server.compile.scene_index import ArticulationIndex
 from urlab_client.server.editor.jobs import EditorJobs
 from urlab_client.server.editor.markers import Drawings
 from urlab_client.server.editor.viewport import Viewport

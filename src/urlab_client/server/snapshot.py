@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.server.compile.scene import CompileFailed
+from urlab_client.server.compile.failure import CompileFailed
 from urlab_client.server.core import ServerCore
 from urlab_client.server.handlers.viewport import look
 from urlab_client.server.refusal import Refusal

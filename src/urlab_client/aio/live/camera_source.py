@@ -54,6 +54,7 @@ class CameraSource(SocketSource):
         host: Tells under which name or address the server was reached.
         live: Tells whether the server is in live mode, as far as is known.
         switch: Switches the camera on and off; None where it always streams.
+        asked: Whether the user asked for these pictures, rather than having them received in the background.
     """
 
     name = "frames"
@@ -75,12 +76,14 @@ class CameraSource(SocketSource):
         *,
         live: Callable[[], bool] = lambda: True,
         switch: CameraSwitch | None = None,
+        asked: bool = True,
     ) -> None:
         super().__init__(subscriptions)
         self.view = view
         self._host = host
         self._live = live
         self._switch = switch
+        self._asked = asked
         self._users: set[MessageHandler] = set()
 
     def attach(self, handler: MessageHandler) -> None:
@@ -96,7 +99,7 @@ class CameraSource(SocketSource):
     def _use(self, handler: MessageHandler) -> None:
         if self._switch is not None and handler not in self._users:
             self._users.add(handler)
-            self._switch.use(self.view.info)
+            self._switch.use(self.view.info, asked=self._asked)
 
     def _leave(self, handler: MessageHandler) -> None:
         if self._switch is not None and handler in self._users:
@@ -141,6 +144,7 @@ class SharedCameraSource(SharedMemorySource, CameraSource):
         host: Tells under which name or address the server was reached.
         live: Tells whether the server is in live mode, as far as is known.
         switch: Switches the camera on and off; None where it always streams.
+        asked: Whether the user asked for these pictures, rather than having them received in the background.
     """
 
     def __init__(
@@ -152,8 +156,9 @@ class SharedCameraSource(SharedMemorySource, CameraSource):
         *,
         live: Callable[[], bool] = lambda: True,
         switch: CameraSwitch | None = None,
+        asked: bool = True,
     ) -> None:
-        super().__init__(subscriptions, view, host, live=live, switch=switch)
+        super().__init__(subscriptions, view, host, live=live, switch=switch, asked=asked)
         self.regions = regions
         self._taken: SharedPicture | None = None
 

@@ -41,7 +41,8 @@ from urlab_client.protocol.dialects import ALPHA, Dialect
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import CameraChoice, CameraFrame
-from urlab_client.server.compile.scene import CompiledScene, SceneCamera
+from urlab_client.server.compile.scene import CompiledScene
+from urlab_client.server.compile.scene_index import SceneCamera
 from urlab_client.server.editor.viewport import ViewMode
 from urlab_client.server.render.viewport_picture import (
     ViewportPicture,
