@@ -40,7 +40,7 @@ from urlab_client.protocol.messages.session import (
     StepOk,
 )
 from urlab_client.protocol.messages.streams import PlayEnded, SessionLost, SessionOpened, StateSnapshot
-from urlab_client.protocol.rows import Pixels, decode_camera
+from urlab_client.protocol.pixels import Pixels, decode_camera
 from urlab_client.protocol.sim_options import check_sim_options
 from urlab_client.protocol.types import SimOptions
 
