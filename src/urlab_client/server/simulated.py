@@ -24,12 +24,12 @@ from numpy.typing import NDArray
 
 from urlab_client._landlock import is_available
 from urlab_client.protocol.base import DialectName
+from urlab_client.protocol.control_messages import CameraEndpoint
 from urlab_client.protocol.dialects import DIALECTS, Dialect
 from urlab_client.protocol.enums import CameraMode, PIEState, StepMode, Transport
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.instances import registry_directory
 from urlab_client.protocol.messages.session import InstanceInfo
-from urlab_client.protocol.rows import CameraEndpoint
 from urlab_client.server.assets.bundled_robots import bundled_models
 from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.core import PhysicsConfig, ServerCore, unmatched_names
