@@ -12,7 +12,7 @@ from wire import Wire
 
 from urlab_client.server import RenderingUnavailable, SimulatedServer
 from urlab_client.server.editor.markers import Drawings
-from urlab_client.server.render import camera_renderer, drawing, opengl
+from urlab_client.server.render import drawing, opengl
 from urlab_client.server.render.viewport_picture import SELECTED
 
 # A grey cube that collides, on a stick that does not, and a ball that falls away.
