@@ -11,17 +11,14 @@ from urlab_client.aio.transport.regions import Place, Regions, SharedPicture
 from urlab_client.aio.transport.subscriber import MessageHandler, Subscription, Subscriptions
 from urlab_client.protocol import doorbell
 from urlab_client.protocol.enums import CameraMode
+from urlab_client.protocol.layouts import BytesLike
 from urlab_client.protocol.messages.session import CameraInfo
 from urlab_client.protocol.messages.streams import (
     CameraSample,
 )
-from urlab_client.protocol.rows import (
-    BytesLike,
-    camera_filter,
-    decode_camera,
-    resolve_endpoint,
-)
+from urlab_client.protocol.pixels import decode_camera
 from urlab_client.protocol.shm import camera_file
+from urlab_client.protocol.topics import camera_filter, resolve_endpoint
 
 __all__ = ["CameraSource", "HasCamera", "SharedCameraSource"]
 
@@ -57,6 +54,7 @@ class CameraSource(SocketSource):
         host: Tells under which name or address the server was reached.
         live: Tells whether the server is in live mode, as far as is known.
         switch: Switches the camera on and off; None where it always streams.
+        asked: Whether the user asked for these pictures, rather than having them received in the background.
     """
 
     name = "frames"
@@ -78,12 +76,14 @@ class CameraSource(SocketSource):
         *,
         live: Callable[[], bool] = lambda: True,
         switch: CameraSwitch | None = None,
+        asked: bool = True,
     ) -> None:
         super().__init__(subscriptions)
         self.view = view
         self._host = host
         self._live = live
         self._switch = switch
+        self._asked = asked
         self._users: set[MessageHandler] = set()
 
     def attach(self, handler: MessageHandler) -> None:
@@ -99,7 +99,7 @@ class CameraSource(SocketSource):
     def _use(self, handler: MessageHandler) -> None:
         if self._switch is not None and handler not in self._users:
             self._users.add(handler)
-            self._switch.use(self.view.info)
+            self._switch.use(self.view.info, asked=self._asked)
 
     def _leave(self, handler: MessageHandler) -> None:
         if self._switch is not None and handler in self._users:
@@ -144,6 +144,7 @@ class SharedCameraSource(SharedMemorySource, CameraSource):
         host: Tells under which name or address the server was reached.
         live: Tells whether the server is in live mode, as far as is known.
         switch: Switches the camera on and off; None where it always streams.
+        asked: Whether the user asked for these pictures, rather than having them received in the background.
     """
 
     def __init__(
@@ -155,8 +156,9 @@ class SharedCameraSource(SharedMemorySource, CameraSource):
         *,
         live: Callable[[], bool] = lambda: True,
         switch: CameraSwitch | None = None,
+        asked: bool = True,
     ) -> None:
-        super().__init__(subscriptions, view, host, live=live, switch=switch)
+        super().__init__(subscriptions, view, host, live=live, switch=switch, asked=asked)
         self.regions = regions
         self._taken: SharedPicture | None = None
 

@@ -18,7 +18,8 @@ from urlab_client.aio.transport.subscriber import Subscriptions, client_closed
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.streams import StreamPolicy
-from urlab_client.protocol.rows import Pixels, TopicKind
+from urlab_client.protocol.pixels import Pixels
+from urlab_client.protocol.topics import TopicKind
 
 __all__ = ["Publishers", "SharedFrame"]
 
@@ -103,12 +104,20 @@ class Publishers:
         """Return what brings rows; see `RowSource`."""
         return RowSource(self.subscriptions, self._state_endpoint, articulations, kinds, components, entities=entities)
 
-    def camera(self, view: HasCamera, policy: str = StreamPolicy.LATEST) -> CameraSource:
-        """Return what brings a camera's pictures to a stream of that policy."""
+    def camera(self, view: HasCamera, policy: str = StreamPolicy.LATEST, *, asked: bool = True) -> CameraSource:
+        """Return what brings a camera's pictures to a stream of that policy; see `CameraSource`."""
         if self.regions is None or policy == StreamPolicy.ALL:
-            return CameraSource(self.subscriptions, view, self._host, live=self._live, switch=self.camera_switch)
+            return CameraSource(
+                self.subscriptions, view, self._host, live=self._live, switch=self.camera_switch, asked=asked
+            )
         return SharedCameraSource(
-            self.regions, self.subscriptions, view, self._host, live=self._live, switch=self.camera_switch
+            self.regions,
+            self.subscriptions,
+            view,
+            self._host,
+            live=self._live,
+            switch=self.camera_switch,
+            asked=asked,
         )
 
     def shared_frame(self, view: HasCamera) -> SharedFrame | None:

@@ -40,7 +40,7 @@ from urlab_client.protocol.messages.session import (
     StepOk,
 )
 from urlab_client.protocol.messages.streams import PlayEnded, SessionLost, SessionOpened, StateSnapshot
-from urlab_client.protocol.rows import Pixels, decode_camera
+from urlab_client.protocol.pixels import Pixels, decode_camera
 from urlab_client.protocol.sim_options import check_sim_options
 from urlab_client.protocol.types import SimOptions
 
@@ -82,7 +82,8 @@ class SimState:
         objects: Articulations, entities and cameras.
         wanted_mode: Step mode the user asked for.
         mode_assumed: Whether nothing the server said shows yet that `mode` is in force.
-        promoted_from: Mode to go back to on close, after a promotion of our own.
+        promoted_from: Mode to go back to on close, after a promotion of our own; maybe one that only the server knows.
+        mode_word: What the server called the step mode when it last told it.
         level: Observation level of the session.
         sent_level: Observation level the server has, which an earlier step may have changed.
         hello: The last handshake, without the model's bytes.
@@ -110,7 +111,8 @@ class SimState:
         self._mode = StepMode.LIVE
         self.mode_assumed = False
         self._live = LiveState(publishers.state(), self._absorb_live, self.mirror.lock)
-        self.promoted_from: StepMode | None = None
+        self.promoted_from: StepMode | str | None = None
+        self.mode_word = ""
         self.level = "standard"
         self.sent_level = "standard"
         self.hello: HelloOk | None = None
@@ -362,6 +364,8 @@ class SimState:
             self.hello.manager_present = False
         self.publishers.release_regions()
         self.session.control.forget()
+        if self.publishers.camera_switch is not None:
+            self.publishers.camera_switch.forget()
         self.mode = StepMode.LIVE
         self.promoted_from = None
         if played:
