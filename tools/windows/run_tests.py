@@ -23,7 +23,7 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-RESULT = re.compile(r"(tests/\S.*?)(?: (PASSED|FAILED|ERROR|SKIPPED)\b.*)?")
+RESULT = re.compile(r"(tests/\S.*?)(?: (PASSED|FAILED|ERROR|SKIPPED)\b.*| \++ Timeout \++)?")
 TEST_S = 200
 FILE_S = 1200
 
@@ -67,10 +67,9 @@ def run(file: str, interpreter: Path, prefix: Path, log: Path) -> Outcome:
         interrupted = [test for test, result in outcome.results.items() if not result]
         for test in interrupted:
             outcome.results[test] = "ERROR"
-        if code in {0, 1, 5}:
-            break
-        if not (interrupted and found and left > 0):
+        if code not in {0, 1, 5} and not (interrupted and found):
             outcome.problems.append(f"the interpreter ended with {code}")
+        if not interrupted or left < 0:
             break
     outcome.seconds = time.monotonic() - started
     outcome.problems += [

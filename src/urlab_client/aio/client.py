@@ -46,7 +46,7 @@ from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.protocol.messages.session import Hello, MetaOk, OpInfo, Reset, ResetOk, Step, StepOk
 from urlab_client.protocol.messages.session import Meta as MetaRequest
 from urlab_client.protocol.messages.streams import ClientEvent, RowSample, StateSnapshot, StreamPolicy
-from urlab_client.protocol.rows import TopicKind
+from urlab_client.protocol.topics import TopicKind
 from urlab_client.protocol.types import ClientConfig, Diagnosis, Resync
 
 __all__ = ["SESSION_LEVEL", "SessionLevel", "URLabClient"]

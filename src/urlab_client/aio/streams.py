@@ -23,8 +23,8 @@ from urlab_client.protocol.errors import (
     URLabError,
     URLabTimeoutError,
 )
+from urlab_client.protocol.layouts import BytesLike
 from urlab_client.protocol.messages.streams import StreamItem, StreamPolicy, StreamStats
-from urlab_client.protocol.rows import BytesLike
 
 __all__ = ["BUFFER_BYTES", "BUFFER_ITEMS", "Stream"]
 

@@ -20,7 +20,8 @@ from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.features import Features
 from urlab_client.protocol.messages.streams import StreamPolicy
-from urlab_client.protocol.rows import Pixels, TopicKind
+from urlab_client.protocol.pixels import Pixels
+from urlab_client.protocol.topics import TopicKind
 
 __all__ = ["Publishers", "SharedFrame"]
 

@@ -8,17 +8,12 @@ from urlab_client.aio.live.source import SocketSource
 from urlab_client.aio.live.state_source import StateSource
 from urlab_client.aio.transport.subscriber import Subscription, Subscriptions
 from urlab_client.protocol.errors import ProtocolError
+from urlab_client.protocol.layouts import BytesLike
 from urlab_client.protocol.messages.streams import (
     RowSample,
 )
-from urlab_client.protocol.rows import (
-    BytesLike,
-    StreamTopic,
-    TopicKind,
-    articulation_filter,
-    decode_row,
-    scene_filter,
-)
+from urlab_client.protocol.rows import decode_row
+from urlab_client.protocol.topics import StreamTopic, TopicKind, articulation_filter, scene_filter
 
 __all__ = ["RowSource"]
 

@@ -10,15 +10,13 @@ from urlab_client.aio.live.source import SharedMemorySource, SocketSource
 from urlab_client.aio.transport.regions import Place, Regions
 from urlab_client.aio.transport.subscriber import MessageHandler, Subscription, Subscriptions
 from urlab_client.protocol import doorbell
+from urlab_client.protocol.layouts import BytesLike
 from urlab_client.protocol.messages.session import StateReply
 from urlab_client.protocol.messages.streams import (
     StateSnapshot,
 )
-from urlab_client.protocol.rows import (
-    STATE_FULL,
-    BytesLike,
-)
 from urlab_client.protocol.shm import STATE_FILE
+from urlab_client.protocol.topics import STATE_FULL
 
 __all__ = ["OwnSteps", "SharedStateSource", "StateSource"]
 

@@ -12,7 +12,7 @@ from urlab_client.integrations._feed.scene_messages import CameraLayout, SceneMe
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraFrame, StateReply
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.protocol.rows import Pixels, decode_camera
+from urlab_client.protocol.pixels import Pixels, decode_camera
 
 __all__ = ["CameraPicture", "SampleClock", "Schedule", "State", "compressed", "picture_message"]
 
