@@ -157,6 +157,12 @@ class OpenServer:
         return self._memory
 
     @property
+    def scene_warnings(self) -> tuple[str, ...]:
+        """What compiling the scene gave occasion to say; nothing outside play."""
+        core = self._core
+        return core.play.running().scene.warnings if core is not None and core.world.pie_running else ()
+
+    @property
     def saved_dir(self) -> Path:
         """Folder of the content root."""
         if self._core is None:

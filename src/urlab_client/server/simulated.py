@@ -364,6 +364,11 @@ class SimulatedServer:
         return self._running.cameras.port
 
     @property
+    def scene_warnings(self) -> tuple[str, ...]:
+        """What compiling the scene that plays gave occasion to say, as options of a model that have no effect."""
+        return self._running.scene_warnings
+
+    @property
     def saved_dir(self) -> Path:
         """Folder of levels and imported models."""
         return self._running.saved_dir
