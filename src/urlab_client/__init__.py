@@ -178,6 +178,8 @@ _HOMES = (
     "urlab_client.protocol.enums",
     "urlab_client.protocol.errors",
     "urlab_client.protocol.names",
+    "urlab_client.protocol.client_types",
+    "urlab_client.protocol.scene_types",
     "urlab_client.protocol.types",
     "urlab_client.protocol.messages.cameras",
     "urlab_client.protocol.messages.streams",
