@@ -16,7 +16,7 @@ from typing import Final, Literal, NamedTuple
 
 from urlab_client.protocol.base import Quat, Vec3
 from urlab_client.protocol.rotation import IDENTITY, euler_to_quat, swap_frame
-from urlab_client.protocol.types import ActorBounds, ActorHierarchyNode, BlueprintInfo
+from urlab_client.protocol.scene_types import ActorBounds, ActorHierarchyNode, BlueprintInfo
 from urlab_client.server.assets.actors import (
     ORIGIN,
     UNIT_SCALE,
