@@ -456,17 +456,19 @@ def test_what_the_file_cannot_keep_up_with_is_dropped_and_counted(
         write(self, item)
 
     monkeypatch.setattr(writing._Sink, "write", slowly)
-    lossy: Any = {"buffer_mib": 0.1, "lossless": False}
-    with (
-        pytest.warns(UserWarning, match=r"run\.mcap: 1\d\d states and 0 pictures were lost"),
-        record(client, tmp_path / "run.mcap", **lossy) as recorder,
-    ):
-        for _ in range(200):
-            client.step()
-        dropped = recorder.stats.dropped_states
-        assert recorder.stats.waiting_bytes <= 0.1 * 2**20
-        assert 100 < dropped < 200
-        going.set()
+
+    def drive() -> Any:
+        with record(client, tmp_path / "run.mcap", buffer_mib=0.1, lossless=False) as recorder:
+            for _ in range(200):
+                client.step()
+            assert recorder.stats.waiting_bytes <= 0.1 * 2**20
+            going.set()
+        return recorder
+
+    with pytest.warns(UserWarning, match=r"run\.mcap: 1\d\d states and 0 pictures were lost"):
+        recorder = drive()
+    dropped = recorder.stats.dropped_states
+    assert 100 < dropped < 200
     table, summary = read_run(recorder.path).table(), read_run(recorder.path).summary()
     assert (len(table), summary.dropped_states) == (200 - dropped, dropped)
     assert table.step.tolist() == list(range(1, 201 - dropped))
@@ -526,26 +528,30 @@ def test_a_file_that_takes_nothing_any_more_is_not_waited_for_without_end(
 
     monkeypatch.setattr(writing._Sink, "write", never)
     monkeypatch.setattr(writing, "_STALL_S", 0.1)
-    with (
-        pytest.warns(UserWarning, match=r"\d\d+ states and 0 pictures were lost"),
-        record(client, tmp_path / "run.mcap", buffer_mib=0.05),
-    ):
-        for _ in range(100):
-            client.step()
-        going.set()
+
+    def drive() -> None:
+        with record(client, tmp_path / "run.mcap", buffer_mib=0.05):
+            for _ in range(100):
+                client.step()
+            going.set()
+
+    with pytest.warns(UserWarning, match=r"\d\d+ states and 0 pictures were lost"):
+        drive()
 
 
 def test_pictures_that_a_server_did_not_send_are_told(
     seeing: urlab_client.URLabClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(StepPictures, "take", lambda self, reply: setattr(reply, "cameras", {}))
-    with (
-        pytest.warns(UserWarning, match="0 states and 3 pictures were lost"),
-        record(seeing, tmp_path / "run.mcap", cameras=["arm/wrist"], camera_hz=500) as recorder,
-    ):
-        for _ in range(3):
-            seeing.step()
-    assert read_run(recorder.path).summary().dropped_frames == 3
+
+    def drive() -> None:
+        with record(seeing, tmp_path / "run.mcap", cameras=["arm/wrist"], camera_hz=500):
+            for _ in range(3):
+                seeing.step()
+
+    with pytest.warns(UserWarning, match="0 states and 3 pictures were lost"):
+        drive()
+    assert read_run(tmp_path / "run.mcap").summary().dropped_frames == 3
 
 
 # Messages
