@@ -116,7 +116,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Run tests on Windows' Python under Wine.")
     parser.add_argument("interpreter", type=Path)
     parser.add_argument("python")
-    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--logs", type=Path, metavar="FOLDER", help="keep the output there")
     parser.add_argument("paths", nargs="+", metavar="PATH")
     arguments = parser.parse_args()
