@@ -43,7 +43,8 @@ from urlab_client.server.limits import Limits
 from urlab_client.server.physics.channels import channel_problem
 from urlab_client.server.physics.controllers import ControllerConfig
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.render.camera_renderer import RenderQuality, find_backend
+from urlab_client.server.render.drawing import RenderQuality
+from urlab_client.server.render.opengl import find_backend
 from urlab_client.server.rpc.dispatch import Dispatcher
 from urlab_client.server.rpc.watchdog import Watchdog
 from urlab_client.server.session import ServerSession
@@ -432,6 +433,11 @@ class SimulatedServer:
         return self._running.cameras.port
 
     @property
+    def scene_warnings(self) -> tuple[str, ...]:
+        """What compiling the scene that plays gave occasion to say, as options of a model that have no effect."""
+        return self._running.scene_warnings
+
+    @property
     def saved_dir(self) -> Path:
         """Folder of levels and imported models."""
         return self._running.saved_dir
@@ -546,6 +552,12 @@ class _Opened:
     def memory(self) -> SharedMemoryServer | None:
         """The shared memory, if there is any."""
         return self._memory
+
+    @property
+    def scene_warnings(self) -> tuple[str, ...]:
+        """What compiling the scene gave occasion to say; nothing outside play."""
+        core = self._core
+        return core.play.running().scene.warnings if core is not None and core.world.pie_running else ()
 
     @property
     def saved_dir(self) -> Path:
