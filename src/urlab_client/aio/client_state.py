@@ -10,9 +10,9 @@ from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.session import Session
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.transport.base import TransportStats
+from urlab_client.protocol.client_types import ClientConfig, ServerInfo
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.names import NameMap
-from urlab_client.protocol.types import ClientConfig, ServerInfo
 
 if TYPE_CHECKING:
     import mujoco

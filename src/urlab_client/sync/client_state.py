@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 from urlab_client.aio import client_state as aio
 from urlab_client.aio.transport.base import TransportStats
+from urlab_client.protocol.client_types import ClientConfig, ServerInfo
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.names import NameMap
-from urlab_client.protocol.types import ClientConfig, ServerInfo
 from urlab_client.sync._facade import Facade
 from urlab_client.sync.articulation import URLabArticulation, URLabEntity
 from urlab_client.sync.cameras import URLabCameraView

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from urlab_client.protocol.types import BlueprintInfo
+from urlab_client.protocol.scene_types import BlueprintInfo
 from urlab_client.server.assets.blueprint import PARENT_CLASS, Blueprint
 from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.editor import checks

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from urlab_client.protocol.base import Quat, Vec3
 from urlab_client.protocol.rotation import IDENTITY, euler_to_quat, swap_frame
-from urlab_client.protocol.types import ActorBounds, ActorHierarchyNode
+from urlab_client.protocol.scene_types import ActorBounds, ActorHierarchyNode
 from urlab_client.server.assets.actors import (
     ORIGIN,
     UNIT_SCALE,
