@@ -34,7 +34,7 @@ class JointRow(Struct, frozen=True):
         id: MuJoCo joint id; negative for a component that is not in the compiled model, whose row is to be dropped.
         position: `qpos` of the joint, radians or metres.
         velocity: `qvel` of the joint, per second.
-        acceleration: `qacc` of the joint, per second squared.
+        acceleration: `qacc` of the joint, per second squared; NaN where the server does not tell it.
     """
 
     id: int

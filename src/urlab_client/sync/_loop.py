@@ -30,6 +30,7 @@ from collections.abc import Callable, Coroutine
 from typing import Any, Generic, TypeVar
 
 from urlab_client.protocol.errors import ClientClosed
+from urlab_client.sync._caller_loop import CallerLoop
 from urlab_client.sync._signals import DeferredSignals
 
 __all__ = ["GRACE", "CallerDrivenLoop", "Job", "client_closed"]
@@ -113,7 +114,7 @@ class CallerDrivenLoop:
 
     def __init__(self, at_stop: Callable[[], Coroutine[Any, Any, object]] | None) -> None:
         # Not new_event_loop(): the user's loop policy is about the user's loop, and pyzmq needs a selector on Windows.
-        self._loop = asyncio.SelectorEventLoop()
+        self._loop = CallerLoop()
         self._thread = threading.Thread(target=self._run, name="urlab-io", daemon=True)
         self._pid = os.getpid()
         self._at_stop = at_stop
@@ -282,7 +283,7 @@ class CallerDrivenLoop:
     def _run_loop(self) -> None:
         # A task that raises one of these breaks out of the loop. If it is a job, its caller gets it through that.
         try:
-            self._loop.run_forever()
+            self._loop.run_until_stopped()
         except (KeyboardInterrupt, SystemExit) as error:
             _log.debug("a task on the loop raised %r", error)
 
