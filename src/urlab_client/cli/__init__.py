@@ -50,6 +50,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Arguments without the program's name; default those of this process.
     """
     argv = sys.argv[1:] if argv is None else argv
+    if (reconfigure := getattr(sys.stdout, "reconfigure", None)) is not None:
+        reconfigure(errors="backslashreplace")  # not every terminal has the characters of every file's name
     # Every `sim://` server is an `urlab serve`, which starts sooner without the modules of the other commands.
     parser = _parser(*(name for name in argv[:1] if name in _COMMANDS))
     arguments = parser.parse_args(argv)
