@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -19,6 +20,8 @@ from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
 
 __all__ = ["AsyncRecorder", "Recorder", "record"]
+
+log = logging.getLogger("urlab_client.record")
 
 _MIB = 1 << 20
 _LIVE_ITEMS = 10_000
@@ -64,6 +67,12 @@ class AsyncRecorder:
         """Whether writing has failed; leaving the block raises the reason."""
         return self._writer is not None and self._writer.error is not None
 
+    @property
+    def without_pictures(self) -> list[str]:
+        """Cameras to record that have no picture in the file up to now."""
+        there = frozenset[str]() if self._writer is None else self._writer.cameras
+        return [name for name in self._follower.cameras if name not in there]
+
     async def __aenter__(self) -> Self:
         if self._writer is not None:
             raise URLabError("A recorder records once.", hint="Call record() again.")
@@ -88,6 +97,12 @@ class AsyncRecorder:
         except URLabError:
             if exc is None:
                 raise  # else it has been logged, and what ends the block matters more
+        if missing := self.without_pictures:
+            log.warning(
+                "%s: no picture of %s came. A server without OpenGL sends none; its own log says so.",
+                self._path,
+                ", ".join(missing),
+            )
 
     def finish(self) -> None:
         """Finish the file when the client's loop is gone already. Blocks."""
@@ -113,6 +128,11 @@ class Recorder(BlockingTwin[AsyncRecorder]):
     def failed(self) -> bool:
         """Whether writing has failed; leaving the block raises the reason."""
         return self._aio.failed
+
+    @property
+    def without_pictures(self) -> list[str]:
+        """Cameras to record that have no picture in the file up to now."""
+        return self._aio.without_pictures
 
 
 @overload

@@ -22,7 +22,7 @@ from urlab_client.protocol.rotation import IDENTITY, normalized
 from urlab_client.server.assets.actors import ORIGIN, UNIT_SCALE, Actor, ActorKind, ConversionSettings, Light, Mesh
 from urlab_client.server.assets.bundled_robots import BUNDLED_PREFIX
 from urlab_client.server.assets.content import Blueprint, ContentRoot, sanitized, write_atomic
-from urlab_client.server.assets.decomposition import ADVICE, is_available
+from urlab_client.server.assets.decomposition import advice, is_available
 from urlab_client.server.refusal import Refusal
 
 __all__ = ["LevelError", "read_level", "write_level"]
@@ -300,7 +300,7 @@ def _check_mesh(mesh: Mesh, convert: ConversionSettings | None) -> None:
     if mesh.shape == "plane" and convert is not None and not convert.static:
         raise ValueError("a plane cannot move: its 'quick_convert' must be static")
     if convert is not None and convert.complex_mesh and not is_available():
-        raise ValueError(ADVICE)
+        raise ValueError(advice())
 
 
 def _check_parents(path: Path, actor: Actor, actors: Mapping[str, Actor]) -> None:

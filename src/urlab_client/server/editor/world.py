@@ -29,7 +29,7 @@ from urlab_client.server.assets.actors import (
     scene_problem,
 )
 from urlab_client.server.assets.content import PARENT_CLASS, Blueprint, ContentRoot, level_package, sanitized
-from urlab_client.server.assets.decomposition import ADVICE, is_available
+from urlab_client.server.assets.decomposition import advice, is_available
 from urlab_client.server.assets.level import LevelError, read_level, write_level
 from urlab_client.server.compile.scene import CompileFailed, actor_bounds
 from urlab_client.server.editor import checks
@@ -572,7 +572,7 @@ class EditorWorld:
         if actor.mesh is None:
             raise Refusal(code, f"'{actor.name}' is a {actor.class_name} without a mesh of its own")
         if complex_mesh and not is_available():
-            raise Refusal(code, ADVICE)
+            raise Refusal(code, advice())
         if actor.mesh.shape == "plane" and not static:
             raise Refusal(code, f"'{actor.name}' is a plane, which cannot move: pass static")
         checks.refuse_infinite((coacd_threshold, *friction), "coacd_threshold and friction", code)
