@@ -8,7 +8,7 @@ import urlab_client.integrations.gym  # registers the environments  # noqa: F401
 
 env = gymnasium.make("urlab/Arm-v0", render_mode="rgb_array", render_camera="arm/overview")
 observation, info = env.reset(seed=1)
-arm = info["articulations"]["arm"]
+arm = env.unwrapped.articulations["arm"]
 target = np.array([0.52, -0.1, 0.15, 0.0, -0.05, 0.0, 0.04], dtype=np.float32)
 score = 0.0
 for _ in range(env.spec.max_episode_steps):

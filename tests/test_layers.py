@@ -122,6 +122,8 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "handlers",
         "faults",
         "snapshot",
+        "initial_level",
+        "open_server",
         "simulated",
         "",
     ),

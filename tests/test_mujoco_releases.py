@@ -142,9 +142,19 @@ def test_attributes_of_a_newer_release_are_left_out_and_named() -> None:
     assert model.geom("g").size[0] == 0.1
 
 
-@pytest.mark.parametrize("body", ["<novelty/>", '<geom size="-1"/>'])
+def test_attributes_with_keywords_of_a_newer_release_are_left_out_and_named() -> None:
+    xml = (
+        '<mujoco><worldbody><body name="novel"><joint name="novel" type="novel"/><geom size="0.1" name="novel"/></body>'
+        '</worldbody><actuator><motor joint="novel" ctrllimited="novel" name="novel"/></actuator></mujoco>'
+    )
+    model, left_out = _mujoco.without_newer_attributes(xml, mujoco.MjModel.from_xml_string)
+    assert left_out == ["motor.ctrllimited", "joint.type"]
+    assert model.actuator("novel").trnid[0] == model.joint("novel").id
+
+
+@pytest.mark.parametrize("body", ["<novelty/>", '<geom size="-1"/>', '<geom size="1" type=" novel"/><geom/>'])
 def test_whatever_else_a_newer_release_writes_is_an_error(body: str) -> None:
-    with pytest.raises(ValueError, match=r"novelty|size"):
+    with pytest.raises(ValueError, match=r"novel|size"):
         _mujoco.without_newer_attributes(
             f"<mujoco><worldbody>{body}</worldbody></mujoco>", mujoco.MjModel.from_xml_string
         )

@@ -1,38 +1,56 @@
 """Run the core of the test suite with other versions of what the package stands on.
 
-Run: python tools/check_versions.py [ENVIRONMENT ...] [--keep FOLDER] [-- PYTEST ARGUMENTS]
+Run: python tools/check_versions.py [ENVIRONMENT ...] [--quick] [--keep FOLDER] [-- PYTEST ARGUMENTS]
 
-Each environment is made afresh with this interpreter's venv and pip. `lowest` has every core dependency at the version
-that pyproject.toml allows as the lowest; the others have one release of MuJoCo each. The core is what depends on these:
-protocol, both clients, server, conformance and Gymnasium environments. Then a client there drives a server of this
-interpreter's, which so needs the package, too, and the other way round. Exit code 1 says that something failed.
+Each environment is made with uv where that is installed, otherwise with pip, for this interpreter's release of Python.
+`lowest` has every core dependency at the version that pyproject.toml allows as the lowest; the others have one release
+of MuJoCo each. The core is what depends on these: protocol, both clients, server, conformance and Gymnasium
+environments. Then a client there drives a server of this interpreter's, which so needs the package, too, and the other
+way round. Exit code 1 says that something failed.
+
+With --quick, for CI: the core in `lowest`, whose MuJoCo is the oldest, too, and with the release between that and the
+newest those tests alone whose outcome MuJoCo decides.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
 import time
 import tomllib
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
+DRIVE = ROOT / "tools" / "drive_other_release.py"
 
-CORE = (
-    *("tests/protocol", "tests/aio", "tests/sync", "tests/server", "tests/conformance"),
-    *("tests/integrations/test_gym.py", "tests/integrations/test_vector_env.py"),
-)
+PHYSICS = ("tests/test_mujoco_releases.py", "tests/server", "tests/conformance", "tests/integrations/test_gym.py")
+CORE = (*PHYSICS, "tests/protocol", "tests/aio", "tests/sync", "tests/integrations/test_vector_env.py")
+
+QUICK = {"lowest": CORE, "mujoco-3.11": PHYSICS}
+
+# What the core's tests use of the extra `test`; the rest is for integrations, and takes long to install.
+TESTS_NEED = {"gymnasium", "hypothesis", "pillow", "trio", "uvloop"}
+
+
+def project() -> dict[str, Any]:
+    """Return what pyproject.toml says of the project."""
+    return tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+
+
+def name(requirement: str) -> str:
+    """Return the package that a requirement is for."""
+    return re.split(r"[<>=!~; ]", requirement)[0]
 
 
 def lowest() -> list[str]:
     """Return the core dependencies, each at the lowest version allowed."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-    return [re.sub(r">=(\d+\.\d+)$", r"==\1.0", requirement) for requirement in project["dependencies"]]
+    return [re.sub(r">=(\d+\.\d+)$", r"==\1.0", requirement) for requirement in project()["dependencies"]]
 
 
 def environments() -> dict[str, list[str]]:
@@ -47,54 +65,73 @@ def environments() -> dict[str, list[str]]:
 
 def make(folder: Path, requirements: list[str]) -> Path:
     """Make an environment; return its interpreter."""
-    subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)  # noqa: S603
+    tests = project()["optional-dependencies"]["test"]
+    needed = [one for one in tests if name(one) in TESTS_NEED or name(one).startswith("pytest")]
     python = folder / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
-    command = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
-    subprocess.run([*command, "-e", f"{ROOT}[test]", *requirements], check=True)  # noqa: S603
+    if uv := shutil.which("uv"):
+        commands = [
+            [uv, "venv", "--quiet", "--allow-existing", "--python", sys.executable, str(folder)],
+            [uv, "pip", "install", "--quiet", "--python", str(python)],
+        ]
+    else:
+        commands = [
+            [sys.executable, "-m", "venv", str(folder)],
+            [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"],
+        ]
+    subprocess.run(commands[0], check=True)  # noqa: S603
+    subprocess.run([*commands[1], "-e", str(ROOT), *needed, *requirements], check=True)  # noqa: S603
     return python
 
 
 def versions(python: Path) -> str:
-    """Return what is installed there of the core dependencies."""
-    listed = subprocess.run(  # noqa: S603
-        [str(python), "-m", "pip", "list", "--format", "json", "--disable-pip-version-check"],
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout
-    core = {re.split(r"[<>=!~ ]", requirement)[0] for requirement in lowest()}
-    return ", ".join(f"{one['name']} {one['version']}" for one in json.loads(listed) if one["name"] in core)
+    """Return what is installed there of Python and the core dependencies."""
+    program = (
+        "import platform, sys; from importlib.metadata import version\n"
+        "print(*(f'{one} {version(one)},' for one in sys.argv[1:]), 'Python', platform.python_version())"
+    )
+    core = [name(requirement) for requirement in lowest()]
+    done = subprocess.run([str(python), "-c", program, *core], capture_output=True, text=True, check=True)  # noqa: S603
+    return done.stdout.strip()
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description="Run the core tests with other versions of the core dependencies.")
     parser.add_argument("environments", nargs="*", metavar="ENVIRONMENT", help=", ".join(environments()))
+    parser.add_argument("--quick", action="store_true", help=f"what CI runs: {', '.join(QUICK)}")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the environments there, and use them again")
     ours, pytest = split(sys.argv[1:])
     arguments = parser.parse_args(ours)
     known = environments()
     if unknown := set(arguments.environments) - set(known):
         parser.error(f"unknown: {', '.join(sorted(unknown))}. There are {', '.join(known)}.")
+    if arguments.quick and arguments.environments:
+        parser.error("--quick has environments of its own")
+    chosen = QUICK if arguments.quick else dict.fromkeys(arguments.environments or known, CORE)
     failed: list[str] = []
     with tempfile.TemporaryDirectory(prefix="urlab-versions-") as scratch:
         folder = (arguments.keep or Path(scratch)).absolute()
-        for name in arguments.environments or known:
-            started = time.monotonic()
-            python = make(folder / name, known[name])
-            print(f"=== {name}: {versions(python)}", flush=True)
-            done = subprocess.run(  # noqa: S603
-                [str(python), "-m", "pytest", "-q", "-p", "no:cacheprovider", *(pytest or CORE)], cwd=ROOT, check=False
-            )
-            print(f"=== {name}: exit code {done.returncode}, {time.monotonic() - started:.0f} s", flush=True)
-            if done.returncode:
-                failed.append(name)
-            for client, server in ((str(python), sys.executable), (sys.executable, str(python))):
-                done = subprocess.run([client, "tools/drive_other_release.py", server], cwd=ROOT, check=False)  # noqa: S603
-                if done.returncode:
-                    failed.append(f"{name} with {sys.executable}")
+        for environment, tests in chosen.items():
+            failed += check(environment, make(folder / environment, known[environment]), pytest or list(tests))
     if failed:
         print(f"failed: {', '.join(failed)}", file=sys.stderr)
     return 1 if failed else 0
+
+
+def check(environment: str, python: Path, pytest: list[str]) -> list[str]:
+    """Run tests in an environment, and drive servers between it and this one; return what failed."""
+    started = time.monotonic()
+    print(f"=== {environment}: {versions(python)}", flush=True)
+    tests = [str(python), "-m", "pytest", "-q", "-p", "no:cacheprovider", *pytest]
+    commands = {f"{environment}: pytest": tests}
+    for client, server in ((str(python), sys.executable), (sys.executable, str(python))):
+        commands[f"{environment}: client of {client}, server of {server}"] = [client, str(DRIVE), server]
+    failed = [
+        what
+        for what, command in commands.items()
+        if subprocess.run(command, cwd=ROOT, check=False).returncode  # noqa: S603
+    ]
+    print(f"=== {environment}: {len(failed)} of {len(commands)} failed, {time.monotonic() - started:.0f} s", flush=True)
+    return failed
 
 
 def split(arguments: list[str]) -> tuple[list[str], list[str]]:

@@ -103,6 +103,12 @@ if TYPE_CHECKING:
         URLabVersionMismatch,
         WrongTransport,
     )
+    from urlab_client.protocol.messages.cameras import (
+        CameraDelay,
+        CameraDelayInForce,
+        CameraStreaming,
+        CameraTransports,
+    )
     from urlab_client.protocol.messages.streams import (
         CameraSample,
         ClientEvent,
@@ -176,6 +182,7 @@ _HOMES = (
     "urlab_client.protocol.errors",
     "urlab_client.protocol.names",
     "urlab_client.protocol.types",
+    "urlab_client.protocol.messages.cameras",
     "urlab_client.protocol.messages.streams",
     "urlab_client.sync",
 )
@@ -223,10 +230,14 @@ __all__ = [
     "BadValue",
     "BlueprintInfo",
     "Body",
+    "CameraDelay",
+    "CameraDelayInForce",
     "CameraMode",
     "CameraPose",
     "CameraSample",
+    "CameraStreaming",
     "CameraTiming",
+    "CameraTransports",
     "ClientClosed",
     "ClientConfig",
     "ClientEvent",

@@ -229,6 +229,12 @@ def _written_by_hand(spec: mujoco.MjSpec) -> tuple[str, dict[str, bytes]]:
     for compiler in compilers:
         compiler.meshdir = compiler.texturedir = ""
     spec.assets = {**spec.assets, **files}
+    if not _writes_archives(spec):
+        # The compiler notes the content type of what its cache does not have. Assigning what was given undoes that:
+        # a model is written in the same way each time, so that a server knows it by its digest.
+        spec.compile()
+        for asset in (*spec.meshes, *spec.hfields, *spec.textures):
+            asset.content_type = str(asset.content_type)
     return spec.to_xml(), files
 
 
@@ -254,25 +260,47 @@ def _unwritable() -> ValueError:
 def without_newer_attributes(xml: str, compiled: Callable[[str], T]) -> tuple[T, list[str]]:
     """Compile an MJCF that a newer MuJoCo has written; return the result and which attributes were left out for that.
 
+    An attribute is left out when this MuJoCo does not know it, or does not know its value, a keyword.
+
     Raises:
-        ValueError: It cannot be compiled, for any other reason than attributes that this MuJoCo does not know.
+        ValueError: It cannot be compiled, for any other reason.
     """
     left_out: list[str] = []
+    untried: list[tuple[str, str]] = []
+    complaint: tuple[str, ...] = ()
     while True:
         try:
             return compiled(xml), left_out
         except ValueError as error:
-            found = _UNKNOWN_ATTRIBUTE.search(str(error))
+            found = _UNKNOWN.search(str(error))
             if found is None:
                 raise
-            attribute, element = found.groups()
-            xml, count = re.subn(rf'(<{element}\b[^<>]*?)\s{attribute}="[^"]*"', r"\1", xml)
-            if not count:
+            if untried and found.groups() == complaint:
+                left_out.pop()  # another attribute has the value that was meant
+            else:
+                untried = _without_one_attribute(xml, *found.groups())
+                complaint = found.groups()
+            if not untried:
                 raise
-            left_out.append(f"{element}.{attribute}")
+            name, xml = untried.pop()
+            left_out.append(name)
 
 
-_UNKNOWN_ATTRIBUTE = re.compile(r"unrecognized attribute: '([\w:-]+)'\s+Element '([\w:-]+)'")
+_UNKNOWN = re.compile(r"(unrecognized attribute|invalid keyword): '([^'\"]+)'\s+Element '([\w:-]+)'")
+
+
+def _without_one_attribute(xml: str, problem: str, word: str, element: str) -> list[tuple[str, str]]:
+    """Return what may be the attribute that MuJoCo complains of, and the MJCF without it, for each that may be it."""
+    attributes = [word]
+    if problem == "invalid keyword":
+        tags = " ".join(re.findall(rf"<{element}\b[^<>]*", xml))
+        attributes = sorted(set(re.findall(rf'\s([\w:-]+)="{re.escape(word)}"', tags)))
+    value = re.escape(word) if problem == "invalid keyword" else '[^"]*'
+    shorter = [
+        (f"{element}.{attribute}", re.sub(rf'(<{element}\b[^<>]*?)\s{re.escape(attribute)}="{value}"', r"\1", xml))
+        for attribute in attributes
+    ]
+    return [(name, text) for name, text in shorter if text != xml]
 
 
 def mujoco_version() -> str:

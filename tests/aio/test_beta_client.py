@@ -28,6 +28,7 @@ from urlab_client import (
 )
 from urlab_client.aio import URLabClient
 from urlab_client.aio.control import process_owner
+from urlab_client.protocol.messages.control import ReleaseControl
 from urlab_client.protocol.types import JobStatus
 from urlab_client.server import SimulatedServer
 
@@ -351,6 +352,14 @@ async def test_a_new_play_session_is_claimed_anew(client: URLabClient, beta: Scr
     beta.arrived()
     await client.step()
     assert names(beta.arrived()) == ["claim_control", "step"]
+
+
+async def test_a_robot_given_up_by_a_bare_request_is_not_claimed_again(client: URLabClient, beta: ScriptedBeta) -> None:
+    robot = client.articulations["arm_a"]
+    await robot.claim()
+    await client.call(ReleaseControl(articulation="arm a"))
+    assert robot.control_owner is None
+    assert beta.owners == {}
 
 
 async def test_a_refusal_where_nothing_can_be_claimed() -> None:

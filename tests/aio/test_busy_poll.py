@@ -68,11 +68,37 @@ def test_ops_that_take_long_are_not_looked_for_until_one_is_quick_again() -> Non
     looks = BusyPoll(SHORTEST, LONGEST)
     for _ in range(4):
         assert looks.pays("reset")
-        looks.note("reset", 2 * LONGEST)
+        looks.note("reset", 2 * LONGEST, awake=True)
     assert not looks.pays("reset")
     assert looks.pays("step")
-    looks.note("reset", LONGEST / 2)
+    looks.note("reset", LONGEST / 2, awake=False)
     assert looks.pays("reset")
+
+
+@pytest.mark.parametrize(("awake_s", "asleep_s", "often"), [(100e-6, 150e-6, True), (60e-6, 55e-6, False)])
+def test_the_loop_stays_awake_where_that_has_proved_quicker(awake_s: float, asleep_s: float, often: bool) -> None:
+    looks = BusyPoll(SHORTEST, LONGEST)
+
+    def ask() -> bool:
+        awake = looks.pays("step")
+        looks.note("step", awake_s if awake else asleep_s, awake=awake)
+        return awake
+
+    for _ in range(20):
+        ask()
+    chosen = [ask() for _ in range(640)]
+    assert chosen.count(not often) == 10, "now and then it does the other thing, to find out"
+
+
+def test_it_learns_that_waking_up_has_become_quick() -> None:
+    looks, asleep_s = BusyPoll(SHORTEST, LONGEST), 150e-6
+    for i in range(2000):
+        awake = looks.pays("step")
+        if i == 1000:
+            assert awake
+            asleep_s = 50e-6
+        looks.note("step", 100e-6 if awake else asleep_s, awake=awake)
+    assert not looks.pays("step")
 
 
 def test_nobody_looks_where_processors_are_short(monkeypatch: pytest.MonkeyPatch) -> None:

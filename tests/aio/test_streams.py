@@ -20,8 +20,11 @@ from hypothesis import strategies as st
 from publisher import Publisher
 from waiting import DEADLINE_S, pass_time, until
 
+from urlab_client.aio.live.camera_source import CameraSource
+from urlab_client.aio.live.event_bus import EventBus
 from urlab_client.aio.live.live_state import LiveState
-from urlab_client.aio.live.sources import CameraSource, EventBus, RowSource, StateSource
+from urlab_client.aio.live.row_source import RowSource
+from urlab_client.aio.live.state_source import StateSource
 from urlab_client.aio.streams import Stream
 from urlab_client.aio.transport.subscriber import Subscriptions
 from urlab_client.protocol.enums import CameraMode
@@ -42,7 +45,8 @@ from urlab_client.protocol.messages.streams import (
     ServerReconnected,
     StateSnapshot,
 )
-from urlab_client.protocol.rows import BaseStateRow, JointRow, SensorRow, TopicKind
+from urlab_client.protocol.rows import BaseStateRow, JointRow, SensorRow
+from urlab_client.protocol.topics import TopicKind
 
 sys.path.append(str(Path(__file__).parents[1] / "protocol"))
 import vectors

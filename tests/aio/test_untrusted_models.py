@@ -109,7 +109,6 @@ compilation._main(sys.argv[1])
 """
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="a process cannot give up opening files")
 @pytest.mark.parametrize(
     ("xml", "assets"),
     [
@@ -139,7 +138,6 @@ async def test_it_may_not_hide_names_in_entities(told: Callable[..., URLabClient
             await client.discover()
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="there is no limit of processor time")
 @pytest.mark.parametrize("xml", [HUGE, ENDLESS], ids=["huge", "endless"])
 async def test_it_takes_no_more_time_than_it_may(
     told: Callable[..., URLabClient], monkeypatch: pytest.MonkeyPatch, xml: str

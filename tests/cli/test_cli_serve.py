@@ -17,7 +17,7 @@ from urlab_client.protocol.enums import CameraMode, StepMode
 
 READY_KEYS = [
     "event", "address", "step_port", "state_port", "ctrl_port", "info_port", "camera_port", "shm_dir", "saved_dir",
-    "pid", "open_to", "server_key",
+    "pid", "scene_warnings", "open_to", "server_key",
 ]  # fmt: skip
 
 

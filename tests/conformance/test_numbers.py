@@ -24,7 +24,7 @@ BOT = """
 </worldbody><actuator>
   <motor name="swing" joint="hinge" ctrlrange="-2 2" ctrllimited="true"/>
   <motor name="free" joint="slide"/>
-  <pid name="servo" joint="slide" kp="3" kv="1"/>
+  <position name="servo" joint="slide" kp="3" kv="1"/>
 </actuator></mujoco>
 """
 NAN, INF = math.nan, math.inf
@@ -71,11 +71,11 @@ async def test_set_points_are_numbers(client: Any, value: Any, error: type[Excep
 
 async def test_assigned_arrays_are_numbers(client: Any) -> None:
     bot = client.articulations["bot"]
-    bot.ctrl_array = [1, 2, 3, 4]
-    for values, error in (([0, NAN, 0, 0], ValueError), ([0, None, 0, 0], TypeError), ([0, 0], ValueError)):
+    bot.ctrl_array = [1, 2, 3]
+    for values, error in (([0, NAN, 0], ValueError), ([0, None, 0], TypeError), ([0, 0], ValueError)):
         with pytest.raises(error):
             bot.ctrl_array = values
-    assert bot.ctrl_array.tolist() == [1, 2, 3, 4]
+    assert bot.ctrl_array.tolist() == [1, 2, 3]
 
 
 @pytest.mark.parametrize("mode", ["direct", "live", "puppet"])
@@ -83,14 +83,29 @@ async def test_what_was_written_in_place_is_looked_at_before_it_is_sent(client: 
     await client.runtime.set_mode(mode)
     bot = client.articulations["bot"]
     before = await client.step()
-    bot.ctrl_array[:] = [NAN, 0, 0, INF]
-    with pytest.raises(ValueError, match=r"are not finite: 'swing' nan, 'servo' input 1 inf\. Nothing was"):
+    bot.ctrl_array[:] = [NAN, 0, INF]
+    with pytest.raises(ValueError, match=r"are not finite: 'swing' nan, 'servo' inf\. Nothing was"):
         await client.step()
     bot.ctrl_array[:] = 0
     found = await client.resync()
     assert (found.steps_sent, found.session_renewed) == (0, False)
     assert found.step == before.step
     await client.step()
+
+
+@pytest.mark.mujoco("3.12")
+async def test_one_of_several_inputs_is_named_by_its_number(connect: Any, tmp_path: Path) -> None:
+    path = tmp_path / "bot.xml"
+    path.write_text(BOT.replace("<position", "<pid"))
+    with SimulatedServer(path, play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        bot = client.articulations["bot"]
+        bot.actuators["servo"].set_control([1.0, 2.0], out_of_range="error")
+        assert bot.ctrl_array.tolist() == [0, 0, 1, 2]
+        bot.ctrl_array[:] = [NAN, 0, 0, INF]
+        with pytest.raises(ValueError, match=r"are not finite: 'swing' nan, 'servo' input 1 inf\. Nothing was"):
+            await client.step()
 
 
 async def test_huge_set_points_are_numbers(client: Any) -> None:
@@ -212,8 +227,8 @@ async def test_values_out_of_range_are_allowed_unless_told_otherwise(client: Any
     bot.set_ctrl({"swing": -9, "free": 100.0}, out_of_range="clamp")
     assert bot.get_ctrl() == {"swing": -2.0, "free": 100.0, "servo": 0.0}
     free.set_control(1e6, out_of_range="error")
-    bot.actuators["servo"].set_control([1.0, 2.0], out_of_range="error")
-    assert bot.ctrl_array.tolist() == [-2.0, 1e6, 1.0, 2.0]
+    bot.actuators["servo"].set_control([1.0], out_of_range="error")
+    assert bot.ctrl_array.tolist() == [-2.0, 1e6, 1.0]
     with pytest.raises(ValueError, match="'wrap' is not a valid OutOfRange"):
         swing.set_control(0, out_of_range="wrap")
 
@@ -237,11 +252,11 @@ async def test_without_a_model_no_range_is_known(connect: Any, server: Simulated
 
 async def test_explain_names_set_points_that_cannot_be_right(client: Any) -> None:
     bot = client.articulations["bot"]
-    bot.ctrl_array[:] = [NAN, 0, 0, 0]
+    bot.ctrl_array[:] = [NAN, 0, 0]
     finding = next(f for f in (await client.explain()).findings if f.subject == "bot")
     assert finding.verdict is Verdict.PROBLEM
     assert "not finite, so that step() refuses them: 'swing' nan" in finding.text
-    bot.ctrl_array[:] = [5, 0, 0, 0]
+    bot.ctrl_array[:] = [5, 0, 0]
     await client.step()
     finding = next(f for f in (await client.explain()).findings if f.subject == "bot")
     assert finding.verdict is Verdict.NOTE

@@ -138,6 +138,7 @@ MIMO = """
 """
 
 
+@pytest.mark.mujoco("3.12")
 async def test_forces_of_actuators_with_several_inputs_and_outputs(connect: Any, serve: Any, tmp_path: Path) -> None:
     """Inputs, as in `ctrl`, and outputs, as in `actuator_force`, both in actuator order, are not as many."""
     (tmp_path / "mimo.xml").write_text(MIMO)
@@ -154,6 +155,7 @@ async def test_forces_of_actuators_with_several_inputs_and_outputs(connect: Any,
         assert [a.force for a in (servo, wrist, elbow)] == [1.5, 0.0, 0.25]
 
 
+@pytest.mark.mujoco("3.12")
 async def test_forces_without_a_model_are_told_where_it_is_clear_whose_they_are(
     connect: Any, serve: Any, bot: str, tmp_path: Path
 ) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -124,11 +126,19 @@ def test_an_action_lasts_for_its_substeps_and_info_tells_the_clocks(make_env: Ma
     env.reset(seed=1)
     *_, info = env.step(np.zeros(env.action_space.shape))
     timestep = env.client.model.opt.timestep  # type: ignore[union-attr]
-    assert info["client"] is env.client
     assert info["step_count"] == 5
     assert info["sim_time"] == pytest.approx(5 * timestep)
-    assert set(info["articulations"]) == {"quadruped", "arm"}
-    assert set(info["articulations"]) <= set(info["entities"])
+    assert set(env.articulations) == {"quadruped", "arm"}
+    assert set(env.articulations) <= set(env.entities)
+
+
+def test_what_an_environment_tells_can_be_copied_and_sent_to_another_process(make_env: MakeEnv) -> None:
+    env = make_env()
+    _, info = env.reset(seed=1)
+    *_, stepped = env.step(np.zeros(env.action_space.shape))
+    for told in (info, stepped):
+        assert copy.deepcopy(told) == told
+        assert pickle.loads(pickle.dumps(told)) == told
 
 
 def test_rewards_terminations_and_truncation_come_from_the_users_functions(make_env: MakeEnv) -> None:

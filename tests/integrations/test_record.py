@@ -7,9 +7,6 @@ import errno
 import gc
 import json
 import math
-import os
-import resource
-import signal
 import subprocess
 import sys
 import threading
@@ -369,7 +366,7 @@ def test_a_killed_process_leaves_what_was_written(server: SimulatedServer, tmp_p
             start = start or written
             if written > start:  # a chunk is in the file
                 break
-        os.kill(child.pid, signal.SIGKILL)
+        child.kill()
         child.wait()
         guard.cancel()
     run = read_run(path)
@@ -410,6 +407,8 @@ def test_a_cut_file_is_read_up_to_the_cut(client: urlab_client.URLabClient, tmp_
 def test_a_full_disk_is_told_and_costs_the_simulation_nothing(
     client: urlab_client.URLabClient, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
+    import resource
+
     path = tmp_path / "run.mcap"
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     recorder = record(client, path)

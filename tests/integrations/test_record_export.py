@@ -20,7 +20,10 @@ from urlab_client.cli import main
 from urlab_client.cli.figures import Quantity, Trace, plot_trace
 from urlab_client.integrations._feed.quantities import component_name, quantities
 from urlab_client.integrations._feed.scene_messages import SceneLayout
+from urlab_client.integrations.gym import URLabEnv
 from urlab_client.integrations.record import RecordingError, Run, export, read_run, record
+from urlab_client.integrations.record.pixels import visible
+from urlab_client.integrations.record.transitions import transitions
 from urlab_client.server import SimulatedServer
 
 C0_AND_C2 = (0x1F, 0x77, 0xB4), (0x2C, 0xA0, 0x2C)
@@ -32,15 +35,16 @@ import json
 from pathlib import Path
 class LeRobotDataset:
     @classmethod
-    def create(cls, repo_id, fps, features, root, use_videos):
+    def create(cls, repo_id, fps, features, root, robot_type, use_videos):
         made = cls()
         made.root, made.frames, made.log = Path(root), [], {"fps": fps, "repo_id": repo_id, "episodes": []}
+        made.log |= {"robot_type": robot_type, "use_videos": use_videos}
         made.log["features"] = {k: [v["dtype"], list(v["shape"]), v["names"]] for k, v in features.items()}
         return made
     def add_frame(self, frame):
         for name, (dtype, shape, _) in self.log["features"].items():
             assert list(frame[name].shape) == shape
-            assert str(frame[name].dtype) == ("uint8" if dtype == "image" else dtype)
+            assert str(frame[name].dtype) == ("uint8" if dtype in ("image", "video") else dtype)
         self.frames.append({k: v if isinstance(v, str) else v.ravel()[:20].tolist() for k, v in frame.items()})
     def save_episode(self):
         self.log["episodes"].append(self.frames)
@@ -83,9 +87,9 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 def test_csv_and_parquet_hold_every_value_to_the_bit(recorded: Run, tmp_path: Path) -> None:
-    flat = recorded.table().flat()
-    assert export.write_csv(recorded, tmp_path / "run.csv") == 100
-    assert export.write_parquet(recorded, tmp_path / "run.parquet") == 100
+    flat = transitions(recorded.table()).flat()
+    assert export.write_csv(recorded, tmp_path / "run.csv") == 98
+    assert export.write_parquet(recorded, tmp_path / "run.parquet") == 98
     with (tmp_path / "run.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     table = parquet.read_table(tmp_path / "run.parquet")
@@ -94,6 +98,38 @@ def test_csv_and_parquet_hold_every_value_to_the_bit(recorded: Run, tmp_path: Pa
     for name, column in flat.items():
         assert np.array([type(column[0].item())(row[name]) for row in rows], column.dtype).tobytes() == column.tobytes()
         assert table[name].to_numpy().tobytes() == column.tobytes()
+
+
+def test_rows_pair_an_observation_with_the_action_taken_at_it(tmp_path: Path) -> None:
+    """Held against what was driven, over episodes that begin with noise and pictures, which take several resets."""
+    rng = np.random.default_rng(5)
+    driven: list[list[tuple[Any, Any]]] = []
+    with (
+        SimulatedServer("arm", play=True, camera_size=(32, 24)) as server,
+        urlab_client.URLabClient(**server.client_options(), step_mode="direct") as client,
+    ):
+        client.discover()
+        env = URLabEnv(
+            client, space_mode="dict", observations=["qpos"], cameras=["arm/wrist"], n_substeps=10, reset_noise=0.1
+        )
+        with record(client, tmp_path / "run.mcap", cameras=["arm/wrist"], camera_hz=50, image_format="png"):
+            for steps in (6, 1, 4):
+                seen, _ = env.reset()
+                driven.append([])
+                for _ in range(steps):
+                    action = {"arm": rng.uniform(-0.3, 0.3, 7).astype(np.float32)}
+                    driven[-1].append((seen, action["arm"]))
+                    seen, *_ = env.step(action)
+    run = read_run(tmp_path / "run.mcap")
+    table = transitions(run.table())
+    assert table.episode.tolist() == [i for i, episode in enumerate(driven) for _ in episode]
+    expected = [pair for episode in driven for pair in episode]
+    assert np.array_equal(table.columns["arm/qpos"].values, [seen["arm"]["qpos"] for seen, _ in expected])
+    assert np.array_equal(table.columns["arm/action"].values, [action for _, action in expected])
+    assert table.columns["arm/action"].names == table.columns["arm/set_points"].names
+    pictures = {round(picture.time, 6): picture.pixels for picture in run.frames("arm/wrist")}
+    for time, (seen, _) in zip(table.time, expected, strict=True):
+        assert np.array_equal(pictures[round(float(time), 6)], seen["cameras"]["arm/wrist"][..., :3])
 
 
 def test_npz_holds_arrays_names_and_pictures(recorded: Run, tmp_path: Path) -> None:
@@ -124,7 +160,7 @@ def test_mp4_shows_each_picture_at_its_time(recorded: Run, tmp_path: Path) -> No
 
 def test_depth_becomes_grey() -> None:
     depths = np.array([[0.0, 1.0], [2.0, np.inf]], dtype=np.float32)
-    assert export._visible(depths, 2.0)[..., 0].tolist() == [[255, 128], [0, 0]]
+    assert visible(depths, 2.0)[..., 0].tolist() == [[255, 128], [0, 0]]
 
 
 @pytest.fixture
@@ -142,24 +178,37 @@ def lerobot(tmp_path: Path) -> str:
 
 
 def test_a_lerobot_dataset_is_written_by_the_other_interpreter(recorded: Run, tmp_path: Path, lerobot: str) -> None:
-    written = export.write_lerobot(recorded, tmp_path / "spins", python=lerobot, fps=50, task="spin")
+    written = export.write_lerobot(
+        recorded, tmp_path / "spins", python=lerobot, fps=25, task="spin", max_picture_age=0.05
+    )
     log: dict[str, Any] = json.loads((tmp_path / "spins" / "log.json").read_text())
     table = recorded.table()
-    assert (log["fps"], log["repo_id"]) == (50, "local/spins")
+    assert (log["fps"], log["repo_id"]) == (25, "local/spins")
     assert log["features"]["observation.state"][1:] == [
         [9],
         [f"arm.{n}" for n in table.columns["arm/qpos"].names] + ["eye.spin"],
     ]
-    assert log["features"]["observation.images.eye.up"][:2] == ["image", [21, 33, 3]]
-    assert [len(episode) for episode in log["episodes"]] == [12, 8]
+    assert (log["robot_type"], log["use_videos"]) == ("arm+eye", True)
+    assert log["features"]["observation.images.eye.up"][:2] == ["video", [22, 34, 3]]
+    assert [len(episode) for episode in log["episodes"]] == [6, 4]
     assert sum(map(len, log["episodes"])) == written
-    row = 60 + 5 * 5  # the sixth frame of the second episode: 0.02 s are five samples
-    frame = log["episodes"][1][5]
+    row = 61 + 3 * 10  # the fourth frame of the second episode, from its first picture on: 0.04 s are ten samples
+    frame = log["episodes"][1][3]
     assert frame["task"] == "spin"
     state = np.concatenate([table.columns[f"{key}/qpos"].values[row] for key in ("arm", "eye")])
     assert frame["observation.state"] == state.astype(np.float32).tolist()
+    action = np.concatenate([table.columns[f"{key}/set_points"].values[row + 1] for key in ("arm", "eye")])
+    assert frame["action"] == action.astype(np.float32).tolist()
     with pytest.raises(FileExistsError):
         export.write_lerobot(recorded, tmp_path / "spins", python=lerobot, fps=50, task="spin")
+
+
+def test_a_frame_never_shows_an_older_picture_unasked(recorded: Run, tmp_path: Path, lerobot: str) -> None:
+    with pytest.raises(
+        RecordingError, match=r"8 of 20 frames would show an older picture of eye/up.*--max-picture-age"
+    ):
+        export.write_lerobot(recorded, tmp_path / "spins", python=lerobot, fps=50, task="spin")
+    assert not (tmp_path / "spins").exists()
 
 
 def test_a_missing_lerobot_is_told(recorded: Run, tmp_path: Path) -> None:

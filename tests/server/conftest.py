@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from beta_bench import Bench
 from wire import Wire, write_models
 
 from urlab_client.server import SimulatedServer
@@ -46,3 +47,26 @@ def editor(serve: Callable[..., Wire]) -> Wire:
     wire = serve()
     wire.ask("create_level", name="fresh")
     return wire
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    models = write_models(tmp_path_factory.mktemp("models"))
+    channels = {"arm_a/grip": 1.5, "arm_a/mode": "idle", "scene/door": False, "scene/goal": {"pos": [0], "quat": [1]}}
+    with (
+        SimulatedServer(
+            dialect="beta",
+            model_roots=[models],
+            user_channels=channels,
+            shm_dir=tmp_path_factory.getbasetemp(),
+            camera_size=(64, 48),
+        ) as server,
+        Wire(server) as wire,
+    ):
+        yield Bench(server, wire, models)
+
+
+@pytest.fixture
+def playing(bench: Bench) -> Bench:
+    bench.play()
+    return bench

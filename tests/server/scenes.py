@@ -13,7 +13,8 @@ from typing import Any
 import gymnasium
 
 from urlab_client.server.assets.actors import Actor, ActorKind
-from urlab_client.server.assets.content import Blueprint, ContentRoot
+from urlab_client.server.assets.blueprint import Blueprint
+from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.compile.scene import CompiledScene, compile_scene
 from urlab_client.server.physics.engine import Engine
 

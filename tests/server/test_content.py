@@ -17,11 +17,14 @@ from hypothesis import strategies as st
 from worlds import BALL_BODY, BOT, GYMNASIUM, Workspace, mjcf, write_obj, write_stl
 
 from urlab_client.server.assets import content, sandbox
+from urlab_client.server.assets.blueprint import Blueprint
 from urlab_client.server.assets.bundled_robots import bundled_models
-from urlab_client.server.assets.content import Blueprint, ContentRoot, level_package, write_atomic
+from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.assets.importer import mujoco_messages
+from urlab_client.server.assets.package_names import level_package
 from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
+from urlab_client.server.system.atomic_write import write_atomic
 from urlab_client.server.system.temporary_folder import working_in
 
 BALL = mjcf(BALL_BODY, model="ball")

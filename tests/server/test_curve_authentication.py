@@ -174,7 +174,6 @@ def test_the_command_line_makes_and_shows_keys(tmp_path: Path, capsys: pytest.Ca
     assert main(["keys", "show", str(tmp_path / "none.key")]) == 2
 
 
-@pytest.mark.skipif(os.name != "posix", reason="Windows has no permission bits")
 def test_a_secret_that_others_can_read_is_refused(keys: Path, tmp_path: Path) -> None:
     open_file = tmp_path / "open.key_secret"
     open_file.write_bytes((keys / "server.key_secret").read_bytes())

@@ -406,6 +406,7 @@ def test_queued_steps_run_in_order_and_a_later_one_waits_its_turn(start: Start, 
 
 
 def test_a_mode_change_drops_queued_steps_and_tells_their_callers(start: Start, pool: ThreadPoolExecutor) -> None:
+    """Beta statement 41. Requests are handled one at a time, so that no other client can bring it about."""
     sim = start()
     sim.engine.set_paused(True)
     queue = Queue(sim.engine)

@@ -17,23 +17,14 @@ import zmq
 from waiting import eventually
 from wire import Wire, check_numbers, float32, server_threads, write_level
 
+from urlab_client.protocol.control_messages import ControlPayload, encode_gains
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.protocol.rows import (
-    ActionsRow,
-    BaseStateRow,
-    ControlPayload,
-    JointRow,
-    SceneRow,
-    SensorRow,
-    StreamTopic,
-    TwistRow,
-    decode_row,
-    encode_gains,
-)
+from urlab_client.protocol.rows import ActionsRow, BaseStateRow, JointRow, SceneRow, SensorRow, TwistRow, decode_row
+from urlab_client.protocol.topics import StreamTopic
 from urlab_client.server import SimulatedServer
 from urlab_client.server.physics.controllers import ControllerConfig
 from urlab_client.server.physics.engine import Engine
-from urlab_client.server.streams import publishing
+from urlab_client.server.streams import broadcast, publishing
 from urlab_client.server.transport.endpoint import bound_peers
 
 Tick = list[tuple[bytes, bytes]]
@@ -313,7 +304,7 @@ def test_only_what_is_subscribed_to_is_encoded(play: Play, monkeypatch: pytest.M
 
     for kind in (JointRow, SensorRow, TwistRow):
         count(kind, kind.__name__)
-    monkeypatch.setattr(publishing, "encode_reply", lambda reply: encoded.append("snapshot"))
+    monkeypatch.setattr(broadcast, "encode_reply", lambda reply: encoded.append("snapshot"))
     socket = play().subscribe(b"bot/joint/")
     assert {socket.recv_multipart()[0] for _ in range(20)} == {b"bot/joint/j"}
     assert set(encoded) == {"JointRow"}
@@ -548,5 +539,5 @@ def test_info_comes_often_at_first_and_rarely_later() -> None:
 def _info_ticks() -> Iterator[int]:
     tick = 0
     while True:
-        tick = publishing.next_info(tick)
+        tick = broadcast.next_info(tick)
         yield tick

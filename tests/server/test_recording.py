@@ -249,7 +249,6 @@ print(killed, file.exists())
 """
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="processes are forked")
 def test_a_kill_while_saving_leaves_one_file_or_the_other(tmp_path: Path) -> None:
     command = [sys.executable, "-c", SAVER, str(tmp_path / "ep.json")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)

@@ -10,7 +10,8 @@ import pytest
 
 from urlab_client.server.assets.bundled_robots import bundled_models
 from urlab_client.server.assets.content import ContentRoot
-from urlab_client.server.compile.scene import ArticulationIndex, CompiledScene, compile_scene
+from urlab_client.server.compile.scene import CompiledScene, compile_scene
+from urlab_client.server.compile.scene_index import ArticulationIndex
 from urlab_client.server.editor.world import EditorWorld
 
 Place = tuple[str, tuple[float, float, float]]

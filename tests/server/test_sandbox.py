@@ -39,7 +39,7 @@ HUNGRY = {
     "heightfield": '<asset><hfield name="h" nrow="100000" ncol="100000" size="1 1 1 1"/></asset>',
     "deep": "<worldbody>" + "<body>" * 100_000 + "</body>" * 100_000 + "</worldbody>",
 }
-LIMITS = Limits(model_cpu_s=1, model_wall_s=60, model_memory_bytes=512 * 2**20)
+LIMITS = Limits(model_cpu_s=1, model_wall_s=60, model_memory_bytes=512 * 2**20, data_bytes=2**26)
 
 
 @pytest.fixture(scope="module")
@@ -95,10 +95,10 @@ def test_the_limit_that_a_model_exceeds_is_named(folder: Path) -> None:
 BODY = '<worldbody><body name="b"><joint name="j"/><geom name="g" size=".1"/></body></worldbody>'
 LARGE = {
     "sensors": ('<sensor><contact geom1="g" num="2000000"/></sensor>', "2000000 numbers", "sensor_values"),
-    "more sensors": ('<sensor><contact geom1="g" num="34000000"/></sensor>', "bytes", "data_bytes"),
+    "more sensors": ('<sensor><contact geom1="g" num="8500000"/></sensor>', "bytes", "data_bytes"),
     "far more sensors": ('<sensor><contact geom1="g" num="1000000000"/></sensor>', "memory", "model_memory_bytes"),
-    "arena": ('<size memory="270M"/>', "283119", "data_bytes"),
-    "user data": ('<size nuserdata="34000000"/>', "272004", "data_bytes"),
+    "arena": ('<size memory="70M"/>', "73404", "data_bytes"),
+    "user data": ('<size nuserdata="8500000"/>', "68004", "data_bytes"),
     "constraints": ('<size njmax="2000000000"/>', "memory", "model_memory_bytes"),
     "iterations": ('<option iterations="2147483647" tolerance="0"/>', "2147483647", "solver_iterations"),
     "timestep": ('<option timestep="0"/>', "timestep must be a positive number", "timestep"),

@@ -12,7 +12,9 @@ import pytest
 from worlds import BALL_BODY, BOT, GYMNASIUM, Workspace, mjcf, write_obj, write_stl
 
 from urlab_client.server.assets.content import ContentRoot
-from urlab_client.server.compile.scene import ArticulationIndex, CompiledScene, CompileFailed, compile_scene
+from urlab_client.server.compile.failure import CompileFailed
+from urlab_client.server.compile.scene import CompiledScene, compile_scene
+from urlab_client.server.compile.scene_index import ArticulationIndex
 from urlab_client.server.editor.world import EditorWorld
 
 BALL = mjcf(BALL_BODY, model="ball")

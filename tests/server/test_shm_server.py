@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import random
-import signal
 import socket
 import stat
 import subprocess
@@ -317,8 +316,8 @@ def serve(base: Path) -> tuple[subprocess.Popen[bytes], Path]:
     return process, Path(msgspec.json.decode(process.stdout.readline())["shm_dir"])
 
 
-def end(process: subprocess.Popen[bytes], number: int) -> None:
-    process.send_signal(number)
+def end(process: subprocess.Popen[bytes], stop: Callable[[subprocess.Popen[bytes]], None]) -> None:
+    stop(process)
     process.wait(60)
     assert process.stdout is not None
     process.stdout.close()
@@ -328,20 +327,20 @@ def test_a_terminated_server_cleans_up_and_a_killed_one_is_cleaned_up_after(base
     killed, left = serve(base)
     (base / "urlab-not-ours").mkdir()
     (base / "urlab-not-ours" / "lock").write_text("somebody's")
-    end(killed, signal.SIGKILL)
+    end(killed, subprocess.Popen.kill)
     assert left.is_dir()
     terminated, directory = serve(base)
     assert not left.exists()
     assert directory.is_dir()
     with RawShm(directory, bell=True) as shm:
         assert shm.call({"op": "meta"}) is not None
-    end(terminated, signal.SIGTERM)
+    end(terminated, subprocess.Popen.terminate)
     assert {path.name for path in base.iterdir()} == {"urlab-not-ours"}
 
 
 def test_servers_that_start_at_once_leave_each_other_alone(base: Path) -> None:
     killed, left = serve(base)
-    end(killed, signal.SIGKILL)
+    end(killed, subprocess.Popen.kill)
     with ThreadPoolExecutor(8) as threads:
         directories = list(threads.map(lambda _: InstanceDirectory(base), range(64)))
     assert not left.exists()

@@ -194,7 +194,6 @@ def test_our_client_finds_it(models: Path) -> None:
         assert list(client.articulations) == ["bot"]
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this platform")
 def test_a_forked_child_leaves_the_server_alone(models: Path, connect: Connect) -> None:
     with SimulatedServer(models / "bot.xml", play=True) as server:
         with warnings.catch_warnings():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
 import warnings
@@ -47,7 +46,7 @@ def test_the_next_one_removes_what_a_killed_process_left_and_nothing_else(tempor
     foreign.mkdir()
     with TemporaryFolder():
         assert left.is_dir(), "its owner lives"
-    process.send_signal(signal.SIGKILL)
+    process.kill()
     process.communicate()
     with TemporaryFolder() as scratch:
         assert set(temporary.iterdir()) == {scratch.path, foreign}

@@ -99,6 +99,7 @@ class ScriptedBeta(ScriptedServer):
         time: Simulation time.
         frame: Number of the latest snapshot.
         ctrl: Set-points by object name.
+        streaming: Whether a camera streams over ZeroMQ and over shared memory, by its name.
         jobs: Running jobs: polls left, and the result.
         running: Polls that answer `running` before a job ends.
     """
@@ -116,6 +117,7 @@ class ScriptedBeta(ScriptedServer):
         self.steps = 0
         self.frame = 0
         self.ctrl: dict[str, list[float]] = {name: [0.0] for name, _, _ in ROBOTS}
+        self.streaming: dict[str, tuple[bool, bool]] = {}
         self.jobs: dict[str, list[Any]] = {}
         self.started = 0
         self.running = 2
@@ -376,6 +378,39 @@ class ScriptedBeta(ScriptedServer):
     def _set_user_channels(self, request: Request) -> Reply:
         return {"op": "set_user_channels_ok", "applied": 1.0, "rejected": {"arm_a/nope": "undeclared_or_kind_mismatch"}}
 
+    # Cameras.
+
+    def known_cameras(self, request: Request) -> Reply:
+        """What a request says of the cameras that there are, by their own names."""
+        names = {f"{public}/wrist".lower(): f"{public}/wrist" for _, _, public in ROBOTS}
+        return {names[name.lower()]: how for name, how in request["cameras"].items() if name.lower() in names}
+
+    def _set_camera_streaming(self, request: Request) -> Reply:
+        cameras: Reply = {}
+        for name, how in self.known_cameras(request).items():
+            both = bool(how) if not isinstance(how, dict) else not how
+            zmq = both or (isinstance(how, dict) and bool(how.get("zmq")))
+            shm = both or (isinstance(how, dict) and bool(how.get("shm")))
+            self.streaming[name] = (zmq, shm)
+            cameras[name] = {"streaming": zmq or shm, "zmq": zmq, "shm": shm}
+            if zmq:
+                cameras[name] |= {"zmq_endpoint": f"tcp://127.0.0.1:{self.port + 2}", "zmq_topic": name}
+        return {"op": "set_camera_streaming_ok", "cameras": cameras}
+
+    def _set_camera_delay(self, request: Request) -> Reply:
+        cameras = {
+            name: {
+                "delay_s": float(how.get("delay_s", 0.0)),
+                "jitter_s": float(how.get("jitter_s", 0.0)),
+                "clock": how.get("clock", "sim"),
+                "on_state_change": how.get("on_state_change", True),
+                "max_fps": float(how.get("max_fps", 0.0)),
+            }
+            for name, told in self.known_cameras(request).items()
+            for how in (told if isinstance(told, dict) else {"delay_s": told},)
+        }
+        return {"op": "set_camera_delay_ok", "cameras": cameras}
+
     # Editor.
 
     def job(self, result: Reply) -> Reply:
@@ -422,6 +457,7 @@ class ScriptedBeta(ScriptedServer):
             self.playing, self.mode, self.paused = True, "live", True
             self.time, self.steps, self.frame = 0.0, 0, 0
             self.owners.clear()
+            self.streaming.clear()
         return {
             "op": "begin_pie_ok",
             "state": "ready",

@@ -61,7 +61,7 @@ class Served:
         process, self._process = self._process, None
         if process is not None:
             with contextlib.suppress(ProcessLookupError):
-                os.kill(process.pid, signal.SIGKILL)
+                process.kill()
             await process.wait()
             assert process.stdin is not None
             process.stdin.close()

@@ -17,7 +17,7 @@ def test_values_read_under_the_data_lock_belong_together() -> None:
         over = threading.Event()
 
         def step() -> None:
-            for _ in range(300):
+            for _ in range(100):
                 reply = client.step()
                 stepped[reply.time] = reply.per_articulation[ball.prefix].qpos.tolist()
             over.set()

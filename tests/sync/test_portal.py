@@ -7,7 +7,6 @@ import contextlib
 import contextvars
 import copy
 import gc
-import os
 import pickle
 import signal
 import subprocess
@@ -78,9 +77,11 @@ class TestCall:
         assert not portal.is_open
 
     def test_runs_on_the_calling_thread(self, portal: Portal) -> None:
-        assert portal.call(running_thread) is threading.current_thread()
         with ThreadPoolExecutor(1) as pool:
             assert pool.submit(lambda: portal.call(running_thread) is threading.current_thread()).result()
+
+    def test_runs_on_the_main_thread_that_calls(self, portal: Portal) -> None:
+        assert portal.call(running_thread) is threading.current_thread()
 
     async def test_runs_on_the_daemon_thread_for_a_caller_with_a_loop(self, portal: Portal) -> None:
         thread = portal.call(running_thread)
@@ -528,7 +529,6 @@ def interrupt_when_ready(process: subprocess.Popen[str]) -> None:
     process.send_signal(signal.SIGINT)
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="console signals cannot be sent to one process there")
 class TestInterrupt:
     def test_cleans_up_before_the_caller_does_and_leaves_the_portal_usable(self) -> None:
         process = child("""
@@ -820,7 +820,6 @@ class TestInterrupt:
         assert outcome(process) == (0, ["True 42 0"], "")
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="the platform has no fork")
 class TestFork:
     IGNORE_ADVICE = ("-W", "ignore:This process:DeprecationWarning")  # Python 3.12 warns at a fork with threads
 

@@ -45,6 +45,13 @@ if [[ ! -e $target/py/python.exe ]]; then
     python3 "$here/complex_runtime.py" "$work" "$work/x/deploy_libs/api-ms-win-crt-math-l1-1-0.dll"
     x86_64-w64-mingw32-gcc -shared -O2 -w -fno-builtin -static-libgcc -o "$target/py/xpi-ms-win-crt-math-l1-1-0.dll" \
         "$work/shim.c" "$work/shim.def"
+    # Modules for any release of Python 3 ask for python3.dll, which hands all on to python311.dll.
+    {
+        printf 'EXPORTS\n'
+        x86_64-w64-mingw32-objdump -p "$target/py/python311.dll" | sed -n '/Name Pointer\] Table/,/^$/p' |
+            grep -oE '\b_?Py\w+$' | sort -u | sed 's/.*/& = python311.&/'
+    } >"$work/python3.def"
+    x86_64-w64-mingw32-gcc -shared -static-libgcc -o "$target/py/python3.dll" "$work/python3.def"
     rm -rf "$work"
 fi
 

@@ -13,7 +13,7 @@ from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS, Stream
 from urlab_client.protocol.enums import CameraMode, known
 from urlab_client.protocol.messages.session import CameraInfo
 from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
-from urlab_client.protocol.rows import Pixels
+from urlab_client.protocol.pixels import Pixels
 
 __all__ = ["SharedFrame", "URLabCameraView"]
 
@@ -34,7 +34,7 @@ class URLabCameraView:
         self.delivered = True
         self._publishers = publishers
         # Fed by the client. Not declared above, so that the façade has none.
-        self.pictures = LatestPicture(publishers.camera(self))
+        self.pictures = LatestPicture(publishers.camera(self, asked=False))
 
     @property
     def latest_frame(self) -> Pixels | None:

@@ -72,6 +72,7 @@ class ClientState:
             instance=None if hello is None else hello.instance,
             urlab_version=self.urlab_version,
             mujoco_version=self.mujoco_version,
+            step_mode=self._state.mode_word,
         )
 
     @property

@@ -126,6 +126,8 @@ class Control:
         request.control_owner = self.owner
         if isinstance(request, ClaimControl):
             return cast("R", await self._claim(request, ask, limits))
+        for key in self._given_up(request):
+            self._held.pop(key, None)  # else it would be claimed again in a while
         robots = self._robots(request)
         if self._wanted and robots:
             now = asyncio.get_running_loop().time()
@@ -204,6 +206,9 @@ class Control:
                 return self._known([name])
             case _:
                 return []
+
+    def _given_up(self, request: ControlRequest[Reply]) -> list[str]:
+        return self._known([request.articulation]) if isinstance(request, ReleaseControl) else []
 
     def _known(self, names: Iterable[str]) -> list[str]:
         return [key for name in names if (key := self.resolve(name)) is not None]

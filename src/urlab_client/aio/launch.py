@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import warnings
 from collections.abc import Callable, Sequence
 from typing import IO
 from urllib.parse import parse_qsl
@@ -31,7 +32,7 @@ from urlab_client.protocol.errors import ClientClosed, ServerUnreachable
 from urlab_client.protocol.messages.session import Hello, HelloOk
 from urlab_client.protocol.messages.streams import ClientEvent
 
-__all__ = ["SCHEME", "LaunchedTransport", "serve_arguments"]
+__all__ = ["SCHEME", "LaunchedTransport", "serve_arguments", "with_model_options"]
 
 log = logging.getLogger("urlab_client.launch")
 
@@ -47,6 +48,7 @@ class _Ready(Struct):
     address: str
     step_port: int
     state_port: int
+    scene_warnings: tuple[str, ...] = ()
 
 
 def serve_arguments(address: str) -> list[str]:
@@ -70,8 +72,25 @@ def serve_arguments(address: str) -> list[str]:
     return [*models, *options]
 
 
+def with_model_options(address: str) -> str:
+    """Return a `sim://` address whose server honours the model's `<option>`, unless the address settles that itself.
+
+    Environments and policies use it: what is trained or evaluated is the model as its author wrote it. The plugin,
+    which a plain `sim://` address stands for, ignores the options.
+    """
+    model, _, query = address.partition("?")
+    named = {key for key, _ in parse_qsl(query, keep_blank_values=True)}
+    if not address.startswith(SCHEME) or named & {"mjcf-options", "no-mjcf-options"}:
+        return address
+    return f"{model}?{query}{'&' if query else ''}mjcf-options"
+
+
 class LaunchedTransport:
-    """Transport to a simulated server of its own."""
+    """Transport to a simulated server of its own.
+
+    Attributes:
+        scene_warnings: What the server had to say of its scene when it started.
+    """
 
     def __init__(self, address: str, *, shm: bool = False) -> None:
         self.stats = TransportStats()
@@ -87,6 +106,7 @@ class LaunchedTransport:
         self._lost_at = 0.0
         self._closed = False
         self.on_event: Callable[[ClientEvent], None] | None = None
+        self.scene_warnings: tuple[str, ...] = ()
 
     @property
     def state_port(self) -> int | None:
@@ -208,6 +228,9 @@ class LaunchedTransport:
         transport.on_event = self.on_event
         transport.lost_at = self._lost_at
         self._state_port = ready.state_port
+        self.scene_warnings = ready.scene_warnings
+        for warning in ready.scene_warnings:
+            warnings.warn(f"{self._address}: {warning}", stacklevel=2)
         return transport
 
     async def _first_line(self, process: asyncio.subprocess.Process | _Watched, op: Op) -> bytes:

@@ -7,6 +7,7 @@ runs. A failure that can be foreseen is one line on standard error and exit code
 from __future__ import annotations
 
 import argparse
+import errno
 import logging
 import os
 import signal
@@ -64,15 +65,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         return run(arguments)
     except KeyboardInterrupt:
         return _INTERRUPTED
-    except BrokenPipeError:
-        # Whoever read the output has gone; what the interpreter would still flush at its end goes nowhere, too.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return _FAILED
     except (CommandError, MissingExtra, URLabError, OSError) as error:
+        if _is_broken_pipe(error):
+            # Whoever read the output has gone; what the interpreter would still flush at its end goes nowhere, too.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return _FAILED
         sys.stderr.write(f"{name}: {one_line(error)}\n")
         return _FAILED
     finally:
         logging.getLogger("urlab_client").removeHandler(handler)
+
+
+def _is_broken_pipe(error: Exception) -> bool:
+    """Whether nobody reads a pipe any more, of which Windows says that the argument is invalid."""
+    if os.name == "nt":
+        return isinstance(error, OSError) and error.errno in {errno.EPIPE, errno.EINVAL} and error.filename is None
+    return isinstance(error, BrokenPipeError)
 
 
 def _parser(*commands: str) -> Parser:

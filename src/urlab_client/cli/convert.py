@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from urlab_client.cli._arguments import Commands, count
+from urlab_client.cli._arguments import Commands, count, seconds
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._files import replaced
 from urlab_client.cli._output import progress_bar
@@ -28,8 +28,11 @@ class ConvertArguments(argparse.Namespace):
     output: Path
     format: str | None
     camera: list[str]
-    fps: int
+    fps: int | None
     task: str
+    robot_type: str | None
+    images: bool
+    max_picture_age: float | None
     python: str | None
     overwrite: bool
 
@@ -39,9 +42,9 @@ def add_parser(commands: Commands) -> None:
     parser = commands.add_parser(
         "convert",
         help="turn a recording into CSV, NumPy, Parquet, MP4 or a LeRobot dataset",
-        description="Convert a recording made by `urlab record` or record(). CSV, NumPy and Parquet hold the states, "
-        "one row each; MP4 the pictures of one camera. Needs the extra 'urlab-client[mcap]'; Parquet 'dataset', MP4 "
-        "'video', besides.",
+        description="Convert a recording made by `urlab record` or record(). CSV, Parquet and LeRobot hold states with "
+        "the actions taken at them; NumPy all states; MP4 the pictures of one camera. Needs the extra "
+        "'urlab-client[mcap]'; Parquet 'dataset', MP4 'video', besides.",
         examples=(
             ("urlab convert run.mcap run.csv", "states as a table"),
             ("urlab convert run.mcap run.mp4 --camera arm/overview", "the pictures of one camera as a video"),
@@ -59,9 +62,20 @@ def add_parser(commands: Commands) -> None:
         help="a camera, as ARTICULATION/CAMERA: for mp4 the one to show, for npz and lerobot those to add; may be "
         "repeated",
     )
-    parser.add_argument("--fps", type=count, default=30, metavar="N", help="frames per second of a LeRobot dataset")
-    parser.add_argument("--task", default="", metavar="TEXT", help="what the robot does, for a LeRobot dataset")
-    parser.add_argument(
+    lerobot = parser.add_argument_group("LeRobot datasets")
+    lerobot.add_argument(
+        "--fps", type=count, metavar="N", help="frames per second; the rate of the pictures or states by default"
+    )
+    lerobot.add_argument("--task", default="", metavar="TEXT", help="what the robot does")
+    lerobot.add_argument("--robot-type", metavar="TEXT", help="kind of robot; the articulations' names by default")
+    lerobot.add_argument("--images", action="store_true", help="store pictures as PNG files instead of video")
+    lerobot.add_argument(
+        "--max-picture-age",
+        type=seconds,
+        metavar="SECONDS",
+        help="how old a picture may be beside its state; one frame by default",
+    )
+    lerobot.add_argument(
         "--python", metavar="PATH", help="an interpreter that has LeRobot; it is not needed in this one"
     )
     parser.add_argument("--overwrite", action="store_true", help="replace OUTPUT if it exists")
@@ -106,9 +120,9 @@ def _writer(kind: str, recording: Run, arguments: ConvertArguments) -> tuple[Cal
     cameras = arguments.camera
     match kind:
         case "csv":
-            return partial(export.write_csv, recording), "states"
+            return partial(export.write_csv, recording), "rows"
         case "parquet":
-            return partial(export.write_parquet, recording), "states"
+            return partial(export.write_parquet, recording), "rows"
         case "npz":
             return partial(export.write_npz, recording, cameras=cameras), "states"
         case "mp4":
@@ -131,5 +145,8 @@ def _writer(kind: str, recording: Run, arguments: ConvertArguments) -> tuple[Cal
                 python=arguments.python,
                 fps=arguments.fps,
                 task=arguments.task,
+                robot_type=arguments.robot_type,
+                video=not arguments.images,
+                max_picture_age=arguments.max_picture_age,
                 cameras=cameras or None,
             ), "frames"

@@ -104,7 +104,7 @@ def run(arguments: RecordArguments) -> int:
     import urlab_client.integrations.record  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]  # is it there?
 
     if arguments.camera and arguments.address.startswith("sim://"):
-        from urlab_client.server.render.camera_renderer import need_backend  # noqa: PLC0415
+        from urlab_client.server.render.opengl import need_backend  # noqa: PLC0415
 
         need_backend()  # the server that starts here draws with what this machine has
     try:

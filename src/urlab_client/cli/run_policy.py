@@ -13,6 +13,7 @@ from urllib.parse import urlencode
 import msgspec
 import numpy as np
 
+from urlab_client.aio.launch import with_model_options
 from urlab_client.cli._arguments import (
     Commands,
     ServerArguments,
@@ -192,7 +193,7 @@ def _where(arguments: RunPolicyArguments, policy: Policy) -> tuple[str, str | No
     model = arguments.robot or policy.spec.robot
     actor = Path(model).stem  # what a server calls the actor of a file
     options = {"controller": f"{actor}=pd"} if policy.spec.action.via == "controller" else {}
-    return f"sim://{model}{'?' if options else ''}{urlencode(options)}", actor
+    return with_model_options(f"sim://{model}{'?' if options else ''}{urlencode(options)}"), actor
 
 
 def _others(policy: Policy) -> dict[str, Policy]:

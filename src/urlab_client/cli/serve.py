@@ -202,8 +202,9 @@ def add_parser(commands: Commands) -> None:
     )
     physics.add_argument(
         "--mjcf-options",
-        action="store_true",
-        help="honour the <option> of each model; without it the plugin's defaults apply, with a warning",
+        action=argparse.BooleanOptionalAction,
+        default=False,
+        help="honour the <option> of the first model; without it the plugin's defaults apply, with a warning",
     )
     cameras = parser.add_argument_group("cameras")
     cameras.add_argument(
@@ -393,6 +394,7 @@ def _announce(server: SimulatedServer, arguments: ServeArguments) -> None:
         ready |= {f"{name}_port": number for name, number in ports.items()}
         shm_dir = None if server.shm_dir is None else str(server.shm_dir)
         ready |= {"shm_dir": shm_dir, "saved_dir": str(server.saved_dir), "pid": os.getpid()}
+        ready |= {"scene_warnings": server.scene_warnings}
         ready |= {"open_to": server.open_to, "server_key": server.client_options().get("server_key")}
         print(json.dumps(ready), flush=True)
         return

@@ -151,7 +151,7 @@ def _check_mode(arguments: SnapshotArguments) -> None:
 def _of_models(arguments: SnapshotArguments) -> NDArray[np.uint8]:
     from urlab_client import URLabClient  # noqa: PLC0415
     from urlab_client.server import SimulatedServer  # noqa: PLC0415
-    from urlab_client.server.render.camera_renderer import need_backend  # noqa: PLC0415
+    from urlab_client.server.render.opengl import need_backend  # noqa: PLC0415
 
     need_backend()
     camera = arguments.camera

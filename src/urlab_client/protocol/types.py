@@ -162,12 +162,14 @@ class ServerInfo(Struct, frozen=True, kw_only=True):
         instance: Which of several servers it is; None before play, and from servers that do not tell.
         urlab_version: Its version; not to be relied on.
         mujoco_version: Version of its MuJoCo.
+        step_mode: What it called the step mode when the mode was last set; empty before.
     """
 
     features: Features
     instance: InstanceInfo | None = None
     urlab_version: str = ""
     mujoco_version: str = ""
+    step_mode: str = ""
 
     @property
     def generation(self) -> str:

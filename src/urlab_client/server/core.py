@@ -22,7 +22,8 @@ from urlab_client.protocol.enums import CameraMode, PIEState, StepMode
 from urlab_client.protocol.messages.session import ErrorReply, Hello, InstanceInfo, Step
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.assets.uploads import UPLOADS, Uploads
-from urlab_client.server.compile.scene import ArticulationIndex, CompiledScene, compile_scene
+from urlab_client.server.compile.scene import CompiledScene, compile_scene
+from urlab_client.server.compile.scene_index import ArticulationIndex
 from urlab_client.server.editor.jobs import EditorJobs
 from urlab_client.server.editor.markers import Drawings
 from urlab_client.server.editor.viewport import Viewport
@@ -35,7 +36,8 @@ from urlab_client.server.physics.engine import Engine
 from urlab_client.server.physics.observe import Observer
 from urlab_client.server.physics.play import Play, Running
 from urlab_client.server.physics.replay import recordings, replay_folder
-from urlab_client.server.render.camera_renderer import CameraRenderer, RenderQuality
+from urlab_client.server.render.camera_renderer import CameraRenderer
+from urlab_client.server.render.drawing import RenderQuality
 from urlab_client.server.session import ServerSession
 from urlab_client.server.system.allocator import trim
 from urlab_client.server.system.health import Health

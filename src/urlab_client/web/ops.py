@@ -11,6 +11,12 @@ import numpy as np
 
 from urlab_client.protocol.base import Effect, Op, Request
 from urlab_client.protocol.codec import from_wire_array
+from urlab_client.protocol.messages.cameras import (
+    SetCameraDelay,
+    SetCameraDelayOk,
+    SetCameraStreaming,
+    SetCameraStreamingOk,
+)
 from urlab_client.protocol.messages.runtime import (
     ConfigureController,
     ConfigureControllerOk,
@@ -82,6 +88,10 @@ async def perform(client: URLabClient, request: Request[Any]) -> object:
         case SetMode(mode=mode):
             previous = client.step_mode
             reply = SetModeOk(previous_mode=previous, current_mode=await client.runtime.set_mode(mode))
+        case SetCameraStreaming(cameras=wanted):
+            reply = SetCameraStreamingOk(cameras=await client.runtime.set_camera_streaming(wanted))
+        case SetCameraDelay(cameras=delays):
+            reply = SetCameraDelayOk(cameras=await client.runtime.set_camera_delay(delays))
         case BeginPie(level_path=level, timeout_s=limit):
             result = await client.sim.start(level, timeout_s=limit, raise_on_failure=False)
             reply = BeginPieOk(state=result.state, compile_error=result.compile_error)

@@ -18,6 +18,14 @@ from urlab_client.aio.state.step_mode import ask_mode
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.codec import building
 from urlab_client.protocol.enums import StepMode
+from urlab_client.protocol.errors import UnknownOp
+from urlab_client.protocol.messages.cameras import (
+    CameraDelay,
+    CameraDelayInForce,
+    CameraStreaming,
+    CameraTransports,
+    SetCameraDelay,
+)
 from urlab_client.protocol.messages.runtime import (
     ContactFilter,
     GetContacts,
@@ -166,6 +174,78 @@ class RuntimeNamespace(RuntimeOps):
         )
         return (await self._call(request, timeout)).rejected
 
+    async def set_camera_streaming(
+        self, cameras: Mapping[str, bool | CameraTransports], *, timeout: Timeout = DEFAULT
+    ) -> dict[str, CameraStreaming]:
+        """Switch the streams of cameras on or off, for all clients alike, until play ends.
+
+        Iterating over `frames()` does so by itself, for as long as somebody iterates. What is set here goes before
+        that: a camera switched on here stays on when its streams end and when the client is closed. One switched off
+        here brings its open streams nothing more, until another stream of it is opened.
+
+        Args:
+            cameras: Camera, by its name or as `<articulation>/<camera>`, to on or off, or to the transports it is to
+                use. Of those, what is not mentioned is switched off, unless nothing is mentioned.
+            timeout: Seconds to wait; None waits without limit.
+
+        Returns:
+            Where the cameras stream now, by the names given; without those that the server does not have any more.
+
+        Raises:
+            KeyError: Unknown camera, or one that several articulations have; nothing was sent.
+            UnknownOp: A camera is to be switched off by a server whose cameras always stream; nothing was sent.
+            GameThreadTimeout: The editor is busy; it may still do it later.
+        """
+        wanted = {name: _transports(how) for name, how in cameras.items()}
+        topics = {name: self._camera_topic("set_camera_streaming", name) for name in wanted}
+        switch = self._state.publishers.camera_switch
+        if switch is None or not self._session.features.camera_switch:
+            return {name: self._always_on(name, how) for name, how in wanted.items()}
+        told = await switch.set({topics[name]: how for name, how in wanted.items()}, timeout=timeout) if wanted else {}
+        return {name: told[topic] for name, topic in topics.items() if topic in told}
+
+    async def set_camera_delay(
+        self, cameras: Mapping[str, float | CameraDelay], *, timeout: Timeout = DEFAULT
+    ) -> dict[str, CameraDelayInForce]:
+        """Let cameras show what they saw some time ago, as slow ones do, for all clients alike, until play ends.
+
+        Streams and `latest` pictures are late by it; `sync` pictures of a step are not.
+
+        Args:
+            cameras: Camera, by its name or as `<articulation>/<camera>`, to seconds, or to a latency with jitter.
+            timeout: Seconds to wait; None waits without limit.
+
+        Returns:
+            The latencies now, by the names given; without cameras that the server does not have any more.
+
+        Raises:
+            KeyError: Unknown camera, or one that several articulations have; nothing was sent.
+            ValueError: A latency is negative, NaN or infinite, or goes by an unknown clock; nothing was sent.
+            UnknownOp: The server has no such latency.
+            GameThreadTimeout: The editor is busy; it may still do it later.
+        """
+        wanted = {name: _latency(name, delay) for name, delay in cameras.items()}
+        topics = {name: self._camera_topic("set_camera_delay", name) for name in wanted}
+        request = SetCameraDelay(cameras={topics[name]: delay for name, delay in wanted.items()})
+        told = (await self._call(request, timeout)).cameras if wanted else {}
+        return {name: told[topic] for name, topic in topics.items() if topic in told}
+
+    def _camera_topic(self, op: str, name: str) -> str:
+        self._state.require_handshake(op)
+        return self._state.objects.require_camera(name).info.zmq_topic
+
+    def _always_on(self, name: str, wanted: CameraTransports) -> CameraStreaming:
+        if not (wanted.zmq or wanted.shm):
+            raise UnknownOp(
+                "unknown_op",
+                f"camera {name!r} cannot be switched off: this server's cameras always stream. Nothing was sent.",
+                op="set_camera_streaming",
+            )
+        info = self._state.objects.require_camera(name).info
+        return CameraStreaming(
+            streaming=True, zmq=True, shm=True, zmq_endpoint=info.zmq_endpoint, zmq_topic=info.zmq_topic
+        )
+
     async def set_mode(self, mode: StepMode | str, *, timeout: Timeout = DEFAULT) -> StepMode:
         """Switch the step mode and return the one in force. Any mode but live un-pauses physics.
 
@@ -197,3 +277,23 @@ class RuntimeNamespace(RuntimeOps):
             reply = await turn.call(Forward())
             self._state.absorb(reply, "forward", into_mirror=self._state.mode is not StepMode.PUPPET)
             return reply
+
+
+def _transports(wanted: bool | CameraTransports) -> CameraTransports:
+    if isinstance(wanted, bool):
+        return CameraTransports(zmq=wanted, shm=wanted)
+    if wanted.zmq is None and wanted.shm is None:
+        return CameraTransports(zmq=True, shm=True)
+    return CameraTransports(zmq=bool(wanted.zmq), shm=bool(wanted.shm))
+
+
+def _latency(name: str, delay: float | CameraDelay) -> CameraDelay:
+    what = f"set_camera_delay: camera {name!r}"
+    wanted = delay if isinstance(delay, CameraDelay) else CameraDelay(delay_s=finite(what, delay))
+    numbers = {"delay_s": wanted.delay_s, "jitter_s": wanted.jitter_s, "max_fps": wanted.max_fps or 0.0}
+    for field, number in numbers.items():
+        if finite(f"{what}: {field}", number) < 0:
+            raise ValueError(f"{what}: {field} is at least 0, got {number}.")
+    if wanted.clock not in ("sim", "wall"):
+        raise ValueError(f"{what}: clock is 'sim' or 'wall', not {wanted.clock!r}.")
+    return wanted

@@ -50,7 +50,7 @@ class PendingOutcomes:
 
     def __init__(self) -> None:
         self.connects = 0
-        self.mode: StepMode | None = None
+        self.mode: StepMode | str | None = None
         self.play = False
         self.clear()
 
@@ -86,7 +86,7 @@ class PendingOutcomes:
                 give_back(carried)
 
     @contextmanager
-    def about_mode(self, mode: StepMode) -> Generator[None]:
+    def about_mode(self, mode: StepMode | str) -> Generator[None]:
         """Note, unless the body succeeds or is refused, that the server is to be brought into `mode`."""
         try:
             yield

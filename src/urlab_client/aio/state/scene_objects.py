@@ -108,12 +108,20 @@ class SceneObjects:
 
     def camera(self, name: str) -> URLabCameraView | None:
         """Return the camera that a user means by `<articulation>/<camera>` or just `<camera>`, or None."""
-        if name in self.global_cameras:
-            return self.global_cameras[name]
         try:
-            owner, _, short = self.camera_name(name).rpartition("/")
+            return self.require_camera(name)
         except KeyError:
             return None
+
+    def require_camera(self, name: str) -> URLabCameraView:
+        """Return the camera that a user means by `<articulation>/<camera>` or just `<camera>`.
+
+        Raises:
+            KeyError: None, or several.
+        """
+        if name in self.global_cameras:
+            return self.global_cameras[name]
+        owner, _, short = self.camera_name(name).rpartition("/")
         return self.articulations[owner].cameras[short] if owner else self.global_cameras[short]
 
     def note_missing_frames(self, asked: Iterable[str], reply: StepOk) -> None:

@@ -40,7 +40,7 @@ from urlab_client.protocol.messages.session import (
     StepOk,
 )
 from urlab_client.protocol.messages.streams import PlayEnded, SessionLost, SessionOpened, StateSnapshot
-from urlab_client.protocol.rows import Pixels, decode_camera
+from urlab_client.protocol.pixels import Pixels, decode_camera
 from urlab_client.protocol.sim_options import check_sim_options
 from urlab_client.protocol.types import SimOptions
 
@@ -82,7 +82,8 @@ class SimState:
         objects: Articulations, entities and cameras.
         wanted_mode: Step mode the user asked for.
         mode_assumed: Whether nothing the server said shows yet that `mode` is in force.
-        promoted_from: Mode to go back to on close, after a promotion of our own.
+        promoted_from: Mode to go back to on close, after a promotion of our own; maybe one that only the server knows.
+        mode_word: What the server called the step mode when it last told it.
         level: Observation level of the session.
         sent_level: Observation level the server has, which an earlier step may have changed.
         hello: The last handshake, without the model's bytes.
@@ -110,7 +111,8 @@ class SimState:
         self._mode = StepMode.LIVE
         self.mode_assumed = False
         self._live = LiveState(publishers.state(), self._absorb_live, self.mirror.lock)
-        self.promoted_from: StepMode | None = None
+        self.promoted_from: StepMode | str | None = None
+        self.mode_word = ""
         self.level = "standard"
         self.sent_level = "standard"
         self.hello: HelloOk | None = None
@@ -255,9 +257,12 @@ class SimState:
         if not math.isfinite(reply.time):
             raise ProtocolError(f"{op}: the simulation time is {reply.time}.", op=op)
         records = self.objects.records
-        articulations = [(records[key], s) for key, s in reply.per_articulation.items() if key in records]
-        for record, state in articulations:
-            record.check(state, op)
+        articulations: list[tuple[MirroredArticulation, ArticulationState]] = []
+        for key, state in reply.per_articulation.items():
+            record = records.get(key)
+            if record is not None:
+                record.check(state, op)
+                articulations.append((record, state))
         entities: list[tuple[MirroredEntity, EntityState]] = []
         if isinstance(reply, (StepOk, StateSnapshot)) and reply.entities:
             known = self.objects.entity_records
@@ -276,16 +281,15 @@ class SimState:
         articulations, entities, pictures = parts
         with self.mirror.lock:
             for record, state in articulations:
-                record.absorb(state)
-                if into_mirror:
-                    record.write_mirror(state)
+                record.absorb(state, into_mirror=into_mirror)
             for entity, pose in entities:
                 entity.absorb_pose(pose, into_mirror=into_mirror)
             for view, pixels, frame in pictures:
                 taken = reply.time if frame.sim_time is None else frame.sim_time
                 view.pictures.deliver(pixels, taken, frame.frame_id)
-            if into_mirror and self.mirror.data is not None:
-                self.mirror.data.time = reply.time
+            data = self.mirror.data
+            if into_mirror and data is not None:
+                data.time = reply.time
             self.mirror.mark_stale()
             self._absorb_clocks(reply, received)
         own = self.publishers.own_steps
@@ -360,6 +364,8 @@ class SimState:
             self.hello.manager_present = False
         self.publishers.release_regions()
         self.session.control.forget()
+        if self.publishers.camera_switch is not None:
+            self.publishers.camera_switch.forget()
         self.mode = StepMode.LIVE
         self.promoted_from = None
         if played:

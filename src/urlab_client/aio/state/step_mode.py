@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import logging
+
 from urlab_client.aio.session import Turn
 from urlab_client.aio.state.pending_outcomes import leaves_open
 from urlab_client.aio.state.sim_state import SimState
-from urlab_client.protocol.enums import LATER_MODE_NAMES, StepMode
+from urlab_client.protocol.enums import LATER_MODE_NAMES, StepMode, known
 from urlab_client.protocol.errors import BadMode, ModeLocked
 from urlab_client.protocol.messages.runtime import SetMode, SetPaused
 
 __all__ = ["ask_mode", "promote"]
 
 
-async def ask_mode(state: SimState, turn: Turn, mode: StepMode) -> StepMode:
+log = logging.getLogger("urlab_client.client")
+
+
+async def ask_mode(state: SimState, turn: Turn, mode: StepMode | str) -> StepMode | str:
     """Bring the server into a step mode, take over the one in force, and return the one before.
+
+    A word that this client does not know is the server's own for the mode that it was asked for, as it has agreed.
 
     Raises:
         ModeLocked: The project pins another one, which has been taken over if its name is known.
@@ -24,7 +31,8 @@ async def ask_mode(state: SimState, turn: Turn, mode: StepMode) -> StepMode:
                 reply = await turn.call(SetMode(mode=mode))
             except BadMode:
                 # Servers after the beta call the modes by other names.
-                reply = await turn.call(SetMode(mode=LATER_MODE_NAMES.get(mode, mode)))
+                later = LATER_MODE_NAMES.get(mode) if isinstance(mode, StepMode) else None
+                reply = await turn.call(SetMode(mode=later or mode))
     except ModeLocked as locked:
         if locked.pinned is not None:
             state.mode = locked.pinned
@@ -34,12 +42,19 @@ async def ask_mode(state: SimState, turn: Turn, mode: StepMode) -> StepMode:
             # Play starts paused, and no change of mode can resume it where the mode is pinned.
             await turn.call(SetPaused(paused=False))
         return mode
+    previous, current = known(StepMode, reply.previous_mode), known(StepMode, reply.current_mode)
+    state.mode_word = reply.current_mode
+    if not isinstance(current, StepMode):
+        if previous == current:
+            previous = state.mode
+        current = mode if isinstance(mode, StepMode) else StepMode.LIVE  # others are what play began in
+        log.warning("the server calls step mode %s %r", current, reply.current_mode)
     try:
         if state.session.features.idles_in_puppet:
-            await _still_puppet(turn, reply.previous_mode, reply.current_mode)
+            await _still_puppet(turn, previous if isinstance(previous, StepMode) else state.mode, current)
     finally:
-        state.mode = reply.current_mode
-    return reply.previous_mode
+        state.mode = current
+    return previous
 
 
 async def _still_puppet(turn: Turn, previous: StepMode, current: StepMode) -> None:

@@ -1,8 +1,9 @@
 """Looking for a reply again and again before the event loop goes to sleep for it.
 
 A processor that has gone idle takes tens of microseconds to come back, as long as a server that answers at once takes
-altogether. So the loop stays awake for replies that have come quickly before. All other tasks have their turns between
-two looks.
+altogether. One that something else keeps busy is back at once, and looking would only take its time. So the loop stays
+awake where that has proved quicker than sleeping, by a margin; now and then it does the other thing, to find out. All
+other tasks have their turns between two looks.
 """
 
 from __future__ import annotations
@@ -17,8 +18,34 @@ from urlab_client._processors import crowded
 __all__ = ["BusyPoll"]
 
 _MISSES = 4
+_FIRST = 8  # requests of an op before sleeping is tried
+_TRIAL = 64  # one of so many does the other thing
+_MARGIN = 0.85  # waiting awake takes a processor: it has to be quicker by this
+_WEIGHT = 0.2
 # One that looks keeps the loop awake for all; several would only keep each other busy.
 _looking = False
+
+
+class _Replies:
+    """How quickly the replies to one op come, in seconds, to a loop that stays awake and to one that sleeps."""
+
+    __slots__ = ("asked", "asleep", "awake", "missed")
+
+    def __init__(self) -> None:
+        self.asked = 0
+        self.missed = 0
+        self.awake = 0.0
+        self.asleep = 0.0
+
+    def choose(self) -> bool:
+        """Return whether to stay awake for the next one."""
+        self.asked += 1
+        if self.missed >= _MISSES:
+            return False
+        if self.asleep == 0.0:
+            return self.asked <= _FIRST
+        better = self.awake < _MARGIN * self.asleep
+        return better != (self.asked % _TRIAL == 0)
 
 
 class BusyPoll:
@@ -32,18 +59,24 @@ class BusyPoll:
     def __init__(self, shortest: float, longest: float) -> None:
         self._shortest = shortest
         self._longest = longest
-        self._latency: dict[str, float] = {}
-        self._missed: dict[str, int] = {}
+        self._ops: dict[str, _Replies] = {}
 
     def pays(self, op: str) -> bool:
         """Whether to look for the reply to this op."""
-        return not _looking and self._missed.get(op, 0) < _MISSES and not crowded()
+        if _looking or crowded():
+            return False
+        replies = self._ops.get(op)
+        if replies is None:
+            replies = self._ops[op] = _Replies()
+        return replies.choose()
 
     async def look(self, op: str, reply: asyncio.Future[Any], look: Callable[[], object]) -> None:
         """Call `look` until it completes `reply` or that has taken too long."""
         global _looking  # noqa: PLW0603  # about all loops of the process, as they share its interpreter
         now = time.perf_counter  # the loop's clock may tick 64 times a second
-        give_up = now() + min(max(2 * self._latency.get(op, 0.0), self._shortest), self._longest)
+        replies = self._ops.get(op)
+        usual = 0.0 if replies is None else replies.awake
+        give_up = now() + min(max(2 * usual, self._shortest), self._longest)
         _looking = True
         try:
             while True:  # once at least: whoever is late to look first would find nobody left to wake it
@@ -56,7 +89,19 @@ class BusyPoll:
         finally:
             _looking = False
 
-    def note(self, op: str, seconds: float) -> None:
-        """Learn how long a reply has taken."""
-        self._latency[op] = 0.9 * self._latency.get(op, seconds) + 0.1 * seconds
-        self._missed[op] = self._missed.get(op, 0) + 1 if seconds > self._longest else 0
+    def note(self, op: str, seconds: float, *, awake: bool) -> None:
+        """Learn how long a reply has taken, to a loop that was looking for it or asleep."""
+        replies = self._ops.get(op)
+        if replies is None:
+            return  # it has never been asked for
+        if seconds > self._longest:
+            replies.missed += 1
+            return
+        replies.missed = 0
+        before = replies.awake if awake else replies.asleep
+        # What took unusually long says more about the machine's other work than about the way of waiting.
+        after = seconds if before == 0.0 else before + _WEIGHT * (min(seconds, 2 * before) - before)
+        if awake:
+            replies.awake = after
+        else:
+            replies.asleep = after

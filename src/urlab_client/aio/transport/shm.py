@@ -289,7 +289,8 @@ class ShmTransport:
             self._ring()
             if deadline is not None:
                 timer = loop.call_at(deadline, self._expire, pending, deadline - started)
-            if self._busy_poll.pays(op.name):
+            awake = self._busy_poll.pays(op.name)
+            if awake:
                 await self._busy_poll.look(op.name, pending.future, lambda: self._look_at(channel))
             if not pending.future.done():
                 if self._memory.bell is None:
@@ -306,7 +307,7 @@ class ShmTransport:
             self._used_at = loop.time()
         channel.dirty = False
         self.stats.received += 1
-        self._busy_poll.note(op.name, time.perf_counter() - sent)
+        self._busy_poll.note(op.name, time.perf_counter() - sent, awake=awake)
         return answer
 
     def _ring(self) -> None:

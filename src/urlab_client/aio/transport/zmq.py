@@ -12,10 +12,10 @@ import errno
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, cast
 
 import zmq
+from msgspec import Struct
 from zmq.utils.monitor import recv_monitor_message
 
 from urlab_client.aio.event_loop import running_loop
@@ -62,11 +62,12 @@ _MECHANISM_MISMATCH = 0x11000002  # ZMQ_PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH
 _SPIN_S = 150e-6
 _LONGEST_SPIN_S = 500e-6
 
+_Send = Callable[[bytes, int], None]
+
 _CERTAIN = 3  # a server that is just ending breaks a handshake off once; one with another key always does
 
 
-@dataclass(slots=True)
-class _Sent:
+class _Sent(Struct):
     """A request on the wire."""
 
     op: Op
@@ -103,6 +104,7 @@ class ZmqTransport:
         self._late: dict[bytes, asyncio.Future[bytes]] = {}
         self._waiting: set[asyncio.Future[None]] = set()
         self._last_id = 0
+        self._send: _Send | None = None
         self._connected = False
         self._closed = False
         self._obstacle = connection_status.UNANSWERED
@@ -131,8 +133,7 @@ class ZmqTransport:
         self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
     ) -> bytes:
         """See `RequestTransport.request`."""
-        loop, socket, replies = self._open()
-        send = socket.send
+        loop, socket, replies, send = self._open()
         while True:
             if not self._connected:
                 await self._wait_connected(loop, op, connect_by)
@@ -152,27 +153,29 @@ class ZmqTransport:
                     raise self._clogged(op) from None
                 continue
             break
-        entry = self._sent[key] = _Sent(op, loop.create_future(), started, deadline)
+        reply = loop.create_future()
+        self._sent[key] = _Sent(op, reply, started, deadline)
         self.stats.sent += 1
         sent = time.perf_counter()
-        if deadline is not None:
+        if deadline is not None and (self._timer is None or deadline < self._due):
             self._expire_at(loop, deadline)
+        awake = self._busy_poll.pays(op.name)
         try:
-            # Sending may have consumed the descriptor's edge, so look at least once for what arrived meanwhile.
-            if self._busy_poll.pays(op.name):
-                await self._busy_poll.look(op.name, entry.reply, self._on_readable)
+            if awake:
+                await self._busy_poll.look(op.name, reply, self._look)
             elif cast("int", socket.get(_EVENTS)) & _POLLIN:
+                # Sending may have consumed the descriptor's edge.
                 loop.call_soon(self._on_readable)
-            if not entry.reply.done():
+            if not reply.done():
                 replies.expect()
-            answer = await entry.reply
+            answer = await reply
         except (asyncio.CancelledError, URLabTimeoutError):
             if late is not None:
-                late(self._reply_to_come(key, entry))
+                late(self._reply_to_come(key, reply))
             raise
         finally:
-            self._sent.pop(key, None)
-        self._busy_poll.note(op.name, time.perf_counter() - sent)
+            del self._sent[key]
+        self._busy_poll.note(op.name, time.perf_counter() - sent, awake=awake)
         return answer
 
     async def follow(self, hello: HelloOk) -> None:
@@ -201,12 +204,12 @@ class ZmqTransport:
         self._socket.close(linger=0)
         shared_context.give_back(self._context)
 
-    def _open(self) -> tuple[asyncio.AbstractEventLoop, zmq.Socket[bytes], Readiness]:
+    def _open(self) -> tuple[asyncio.AbstractEventLoop, zmq.Socket[bytes], Readiness, _Send]:
         if self._closed:
             raise ClientClosed(f"The client of {self._endpoint} is closed.", hint="Make a new client.")
         loop = running_loop(self._loop)
-        if self._socket is not None and self._replies is not None:
-            return loop, self._socket, self._replies
+        if self._socket is not None and self._replies is not None and self._send is not None:
+            return loop, self._socket, self._replies, self._send
         context = shared_context.borrow()
         socket = context.socket(zmq.DEALER)
         connection_status.configure(socket)
@@ -229,11 +232,11 @@ class ZmqTransport:
         self._events = watch_socket(loop, monitor, self._on_event)
         self._replies = watch_socket(loop, socket, self._on_readable, awaited=self._awaited)
         loop.call_soon(self._on_event)
-        return loop, socket, self._replies
+        self._send = cast("_Send", super(zmq.Socket, socket).send)  # without the wrapper's arguments for other sockets
+        return loop, socket, self._replies, self._send
 
-    def _reply_to_come(self, key: bytes, entry: _Sent) -> asyncio.Future[bytes]:
+    def _reply_to_come(self, key: bytes, reply: asyncio.Future[bytes]) -> asyncio.Future[bytes]:
         """Return what becomes of a request that its caller no longer waits for."""
-        reply = entry.reply
         if reply.done() and not reply.cancelled() and reply.exception() is None:
             return reply  # it came in the turn of the loop in which the caller was cancelled
         coming: asyncio.Future[bytes] = reply.get_loop().create_future()
@@ -310,36 +313,51 @@ class ZmqTransport:
             self._silent_since = entry.at
             self._tell(ServerSilent(endpoint=self._endpoint, op=entry.op.name, waited_s=seconds))
 
+    def _look(self) -> None:
+        """Take what is there, where nothing has told that anything is."""
+        socket = self._socket
+        if socket is not None and not self._closed and cast("int", socket.get(_EVENTS)) & _POLLIN:
+            self._on_readable()
+
     def _on_readable(self) -> None:
         socket = self._socket
         if socket is None or self._closed:
             return
+        receive, get = socket.recv, cast("Callable[[int], int]", socket.get)
         # The descriptor is edge-triggered: read until nothing is left.
-        get = cast("Callable[[int], int]", socket.get)
-        while get(_EVENTS) & _POLLIN:
+        while True:
             try:
-                frames = [socket.recv(_NOBLOCK)]
-                while get(_RCVMORE):
-                    frames.append(socket.recv(_NOBLOCK))
+                key = receive(_NOBLOCK)
+                delimiter = receive(_NOBLOCK)
+                last = receive(_NOBLOCK, copy=False)  # which says by itself whether it is the last
             except zmq.Again:
                 return
-            self._deliver(frames)
+            if delimiter or last.more:
+                while get(_RCVMORE):
+                    receive(_NOBLOCK)
+                self._drop_stray()
+            else:
+                self._deliver(key, last.bytes)
+            if not get(_EVENTS) & _POLLIN:
+                return
 
-    def _deliver(self, frames: list[bytes]) -> None:
+    def _deliver(self, key: bytes, answer: bytes) -> None:
         if self._silent_since is not None and self._loop is not None:
             silent, self._silent_since = self._loop.time() - self._silent_since, None
             self._tell(ServerAnswers(endpoint=self._endpoint, silent_s=silent))
-        entry = self._sent.get(frames[0]) if len(frames) == 3 else None
-        if entry is None or entry.reply.done():
+        entry = self._sent.get(key)
+        if entry is not None and not entry.reply.done():
+            self.stats.received += 1
+            entry.reply.set_result(answer)
+        elif (late := self._late.pop(key, None)) is not None:
             self.stats.late += 1
-            late = self._late.pop(frames[0], None) if len(frames) == 3 else None
-            if late is not None:
-                late.set_result(frames[2])
-            else:
-                log.debug("%s: dropped a reply that nobody waits for any more", self._endpoint)
-            return
-        self.stats.received += 1
-        entry.reply.set_result(frames[2])
+            late.set_result(answer)
+        else:
+            self._drop_stray()
+
+    def _drop_stray(self) -> None:
+        self.stats.late += 1
+        log.debug("%s: dropped a reply that nobody waits for any more", self._endpoint)
 
     def _on_event(self) -> None:
         while self._monitor is not None and not self._closed:

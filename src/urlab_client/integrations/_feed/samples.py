@@ -12,7 +12,7 @@ from urlab_client.integrations._feed.scene_messages import CameraLayout, SceneMe
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraFrame, StateReply
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.protocol.rows import Pixels, decode_camera
+from urlab_client.protocol.pixels import Pixels, decode_camera
 
 __all__ = ["CameraPicture", "SampleClock", "Schedule", "State", "compressed", "picture_message"]
 
@@ -82,14 +82,22 @@ class SampleClock:
     sim: int = 0
     step: int = _FALLBACK_NS
     episode: int = 0
+    moved: bool = False
 
     def advance(self, sim: int, restarts: bool) -> int:
-        """Take the next state's simulation time over, nanoseconds, and return the run's."""
+        """Take the next state's simulation time over, nanoseconds, and return the run's.
+
+        Resets that follow each other without a step in between begin one episode, not several.
+        """
         if self.last is not None and (restarts or sim < self.sim):
-            self.offset = self.last + self.step - sim
-            self.episode += 1
-        elif sim > self.sim:
-            self.step = sim - self.sim
+            if self.moved or sim != self.sim:
+                self.offset = self.last + self.step - sim
+                self.episode += 1
+            self.moved = False
+        else:
+            self.moved = self.moved or sim != self.sim
+            if sim > self.sim:
+                self.step = sim - self.sim
         self.sim, self.last = sim, self.offset + sim
         return self.last
 

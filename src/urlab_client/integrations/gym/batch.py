@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from urlab_client._mujoco import batch_class
+from urlab_client.aio.launch import with_model_options
 from urlab_client.aio.model.layout import ArticulationLayout
 from urlab_client.aio.model.mirror import model_names
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn
@@ -58,7 +59,7 @@ class URLabBatchEnv(Vectorized):
         """Fetch the scene and make the batch.
 
         Args:
-            address: Where the scene comes from: `sim://MODEL`, or a server during play.
+            address: Where the scene comes from: `sim://MODEL`, with the options of the model, or a server during play.
             num_envs: Number of copies.
             space_mode: See `URLabEnv`, here and for the arguments down to `n_substeps`.
             observations: See `URLabEnv`.
@@ -77,7 +78,7 @@ class URLabBatchEnv(Vectorized):
         """
         if num_envs < 1 or n_substeps < 1 or reset_noise < 0:
             raise ValueError("num_envs and n_substeps are at least 1, and reset_noise is 0 or more")
-        model, keys, controllers = _fetch(address, {"step_mode": "direct", **client_options})
+        model, keys, controllers = _fetch(with_model_options(address), {"step_mode": "direct", **client_options})
         mapping = SpaceMapping(model, keys, fields_of(observations), space_mode)
         super().__init__(
             num_envs=num_envs,

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, Final, Literal
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, Final, Literal, Self
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client.aio.launch import with_model_options
 from urlab_client.integrations.gym.episode import EnvEpisode
 from urlab_client.integrations.gym.spaces import Observation, SpaceMapping, SpaceMode
 from urlab_client.protocol.enums import CameraMode
+from urlab_client.protocol.names import NameMap
 from urlab_client.sync._facade import aio_of, portal_of
+from urlab_client.sync.articulation import URLabArticulation, URLabEntity
 from urlab_client.sync.client import URLabClient
 
 __all__ = ["RewardFn", "TerminationFn", "URLabEnv", "keyframe_option"]
@@ -30,8 +34,9 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
     """A Gymnasium environment over a discovered client in `direct` or `puppet` mode.
 
     An action holds the set-points of all actuators, for `n_substeps` physics steps; an observation holds what
-    `observations` names (see `SpaceMapping`). `info` carries `client`, `articulations`, `entities`, `step_count`
-    (physics steps since the reset) and `sim_time` (seconds).
+    `observations` names (see `SpaceMapping`). `info` carries `step_count` (physics steps since the reset) and
+    `sim_time` (seconds), plain numbers that can be copied and pickled; live objects are attributes of the environment,
+    `env.unwrapped.articulations` for example.
 
     A reset puts the simulation into its initial state, or into the keyframe that `options={"keyframe": NAME}` names,
     clears the set-points, and with `reset_noise` moves hinge and slide joints by uniform noise. The noise is all that
@@ -118,10 +123,41 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         self._observation: Observation = None
         self._elapsed = 0
 
+    @classmethod
+    def connect(cls, address: str, *, client_options: Mapping[str, Any] = MappingProxyType({}), **options: Any) -> Self:
+        """Make an environment over a client of its own, in `direct` mode, which closes with it.
+
+        Args:
+            address: Where the robots are. A server that is started for a `sim://` address honours the model's
+                `<option>`, unless the address says `?no-mjcf-options`.
+            client_options: Further options of the client.
+            options: Arguments of `URLabEnv`.
+
+        Raises:
+            URLabError: The server cannot be reached, or has no articulation.
+        """
+        client = URLabClient(with_model_options(address), **{"step_mode": "direct", **client_options})
+        try:
+            client.discover()
+            return cls(client, owns_client=True, **options)
+        except BaseException:
+            client.close()
+            raise
+
     @property
     def mapping(self) -> SpaceMapping:
         """The client's articulations as spaces."""
         return self._episode.mapping
+
+    @property
+    def articulations(self) -> NameMap[URLabArticulation]:
+        """The client's articulations by key."""
+        return self.client.articulations
+
+    @property
+    def entities(self) -> NameMap[URLabEntity]:
+        """The client's entities by name."""
+        return self.client.entities
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -182,13 +218,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
 
     def _info(self) -> dict[str, Any]:
         client = self.client
-        return {
-            "client": client,
-            "articulations": dict(client.articulations),
-            "entities": dict(client.entities),
-            "step_count": client.step_count,
-            "sim_time": client.sim_time,
-        }
+        return {"step_count": client.step_count, "sim_time": client.sim_time}
 
 
 def keyframe_option(options: dict[str, Any] | None) -> str | None:

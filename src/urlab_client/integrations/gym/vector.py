@@ -14,7 +14,7 @@ from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 from numpy.typing import NDArray
 
 from urlab_client.aio.client import URLabClient
-from urlab_client.aio.launch import SCHEME
+from urlab_client.aio.launch import SCHEME, with_model_options
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn
 from urlab_client.integrations.gym.episode import EnvEpisode
 from urlab_client.integrations.gym.spaces import Observation, SpaceMode
@@ -58,7 +58,7 @@ class _Session:
 
     async def open(self) -> EnvEpisode:
         """Start the session."""
-        client = URLabClient(self.address, **self._client_options)
+        client = URLabClient(with_model_options(self.address), **self._client_options)
         try:
             await client.discover()
             self.episode = EnvEpisode(client, **self._episode_options)
@@ -98,7 +98,8 @@ class URLabVectorEnv(Vectorized):
         """Start the sessions.
 
         Args:
-            addresses: One `sim://` address for all environments, or the address of each.
+            addresses: One `sim://` address for all environments, or the address of each. Servers that are started
+                honour the model's `<option>`, unless an address says `?no-mjcf-options`.
             num_envs: Number of environments; needed with one address only.
             space_mode: See `URLabEnv`, here and for the arguments down to `n_substeps`.
             observations: See `URLabEnv`.

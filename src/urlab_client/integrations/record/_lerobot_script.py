@@ -31,13 +31,18 @@ def main(work: Path) -> None:
     for i, name in enumerate(cameras):
         shape = np.array(Image.open(work / str(i) / "0.png")).shape
         features[f"observation.images.{name}"] = {
-            "dtype": "image",
+            "dtype": "video" if plan["video"] else "image",
             "shape": shape,
             "names": ["height", "width", "channels"],
         }
     folder = Path(plan["folder"])
     dataset: Any = library.LeRobotDataset.create(
-        repo_id=f"local/{folder.name}", root=folder, fps=plan["fps"], features=features, use_videos=False
+        repo_id=f"local/{folder.name}",
+        root=folder,
+        fps=plan["fps"],
+        features=features,
+        robot_type=plan["robot_type"],
+        use_videos=plan["video"],
     )
     episodes = arrays["episode"]
     for row in range(len(episodes)):

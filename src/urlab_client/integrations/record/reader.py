@@ -31,7 +31,7 @@ from urlab_client.integrations._feed.quantities import component_name, quantitie
 from urlab_client.integrations._feed.scene_messages import SceneLayout, from_metadata
 from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.rows import Pixels
+from urlab_client.protocol.pixels import Pixels
 
 __all__ = ["Camera", "Column", "Run", "Summary", "Table", "Topic", "read_run"]
 

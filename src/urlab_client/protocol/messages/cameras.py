@@ -13,7 +13,7 @@ __all__ = [
     "CameraDelay",
     "CameraDelayInForce",
     "CameraStreaming",
-    "CameraSwitch",
+    "CameraTransports",
     "SetCameraDelay",
     "SetCameraDelayOk",
     "SetCameraStreaming",
@@ -21,7 +21,7 @@ __all__ = [
 ]
 
 
-class CameraSwitch(Struct, kw_only=True, omit_defaults=True):
+class CameraTransports(Struct, kw_only=True, omit_defaults=True):
     """Where a camera is to stream: what is not mentioned is switched off, unless nothing is mentioned."""
 
     zmq: Annotated[bool | None, doc("On its socket.")] = None
@@ -47,7 +47,7 @@ class SetCameraStreamingOk(Reply, tag="set_camera_streaming_ok", kw_only=True):
 class SetCameraStreaming(Request[SetCameraStreamingOk], tag="set_camera_streaming", kw_only=True):
     """Switch the streams of cameras, for every client alike; the last call wins."""
 
-    cameras: Annotated[dict[str, bool | CameraSwitch], doc("Camera to on or off, or to where it is to stream.")]
+    cameras: Annotated[dict[str, bool | CameraTransports], doc("Camera to on or off, or to where it is to stream.")]
 
 
 class CameraDelay(Struct, kw_only=True, omit_defaults=True):

@@ -20,7 +20,6 @@ from urlab_client.protocol.base import (
     Vec3,
     doc,
 )
-from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.types import Contact, KeyframeInfo, MocapPose, SimOptions
 
 __all__ = [
@@ -58,8 +57,8 @@ __all__ = [
 class SetModeOk(Reply, tag="set_mode_ok", kw_only=True):
     """The mode before and after."""
 
-    previous_mode: Annotated[StepMode, doc("Step mode before the call.")]
-    current_mode: Annotated[StepMode, doc("Step mode now.")]
+    previous_mode: Annotated[str, doc("Step mode before the call.")]
+    current_mode: Annotated[str, doc("Step mode now.")]
 
 
 class SetMode(Request[SetModeOk], tag="set_mode", kw_only=True):

@@ -15,7 +15,7 @@ from msgspec import Struct
 
 from urlab_client.protocol.base import Quat, Vec3
 from urlab_client.protocol.rotation import IDENTITY
-from urlab_client.server.assets.content import PARENT_CLASS, Blueprint
+from urlab_client.server.assets.blueprint import PARENT_CLASS, Blueprint
 from urlab_client.server.limits import Limits
 
 __all__ = ["ORIGIN", "UNIT_SCALE", "Actor", "ActorKind", "ConversionSettings", "Light", "Mesh", "scene_problem"]

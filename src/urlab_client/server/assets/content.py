@@ -7,7 +7,7 @@ files it needs), so later edits of the source change nothing until the file is i
     MuJoCoImports/<stem>/<digest>/model.xml     the snapshot, with its meshes and textures beside it
     Levels/<name>.json                          a level
 
-For `World`, which knows what is placed where. Nothing here places, compiles scenes or talks to clients.
+For `EditorWorld`, which knows what is placed where. Nothing here places, compiles scenes or talks to clients.
 """
 
 from __future__ import annotations
@@ -16,218 +16,45 @@ import contextlib
 import hashlib
 import logging
 import os
-import re
 import shutil
-import sys
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Final, Literal
+from typing import Final
 
 import msgspec
 import mujoco
 
+from urlab_client.server.assets.blueprint import (
+    IMPORTS,
+    Blueprint,
+    BlueprintRecord,
+    from_record,
+    load_blueprint,
+    sanitized,
+    to_record,
+)
 from urlab_client.server.assets.bundled_robots import BUNDLED_PREFIX, bundled_models, bundled_root
-from urlab_client.server.assets.importer import Compiled, build_snapshot, mujoco_messages, named_kinds, one_line
+from urlab_client.server.assets.importer import Compiled, build_snapshot, one_line
+from urlab_client.server.assets.sandbox import build_confined
 from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
+from urlab_client.server.system.atomic_write import write_atomic
 from urlab_client.server.system.temporary_folder import sweep, working_in
 
-__all__ = [
-    "PARENT_CLASS",
-    "WINDOWS_DEVICES",
-    "Blueprint",
-    "ContentRoot",
-    "level_package",
-    "sanitized",
-    "write_atomic",
-]
+__all__ = ["ContentRoot"]
 
 logger = logging.getLogger("urlab_client.server")
 
-IMPORTS: Final = "MuJoCoImports"
 UPLOADED: Final = "uploaded"
 """In place of the source of a blueprint that came over the wire."""
-PARENT_CLASS: Final = "MjArticulation"
 
 _UNDER_WAY: Final = ".import-"
 """What the folders begin with that are not finished yet, or are being removed."""
 
 _DEFAULT_LIMITS: Final = Limits()
-_LEVEL_SEGMENT: Final = re.compile(r"\w(?:[\w\- ]*[\w\-])?")
-_MAX_SEGMENT_BYTES: Final = 240
-_RESERVED: Final = {IMPORTS.casefold(): "holds blueprints", "urlab": "holds recordings", "uploads": "holds uploads"}
-WINDOWS_DEVICES: Final = frozenset(
-    ("CON", "PRN", "AUX", "NUL", *(f"{kind}{number}" for kind in ("COM", "LPT") for number in range(1, 10)))
-)
-
-
-def sanitized(name: str) -> str:
-    """Return `name` with every character other than letters, digits and underscore replaced by an underscore."""
-    return re.sub(r"\W", "_", name)
-
-
-def level_package(name: str) -> str:
-    """Expand a level's name to its package path: `lab`, `/Game/Levels/lab` and `/Game/Levels/lab.lab` are one level.
-
-    Raises:
-        ValueError: The name has a part that cannot be a file name everywhere, or leads out of the content root.
-    """
-    in_game = name[:6].casefold() == "/game/"
-    parts = name[6:].split("/") if in_game else name.split("/")
-    package, _, described = parts[-1].partition(".")
-    if described.casefold() == package.casefold():  # an object path says the name again; the engine ignores case
-        parts[-1] = package
-    for part in parts:
-        if (
-            not _LEVEL_SEGMENT.fullmatch(part)
-            or len(part.encode()) > _MAX_SEGMENT_BYTES
-            or part.upper() in WINDOWS_DEVICES
-        ):
-            raise ValueError(
-                f"'{name}' is not a level's name: use letters, digits, spaces, '-' and '_', "
-                "or a path of such parts that begins with /Game/"
-            )
-    if in_game and parts[0].casefold() in _RESERVED:
-        raise ValueError(f"'{name}' is not a level's name: /Game/{parts[0]} {_RESERVED[parts[0].casefold()]}")
-    return f"/Game/{'/'.join(parts)}" if in_game else f"/Game/Levels/{'/'.join(parts)}"
-
-
-def write_atomic(path: Path, data: bytes) -> None:
-    """Write `data` to `path` so that a reader, or a crash, sees the old file or the whole new one."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
-    _sync_directory(path.parent)
-
-
-def _sync_directory(folder: Path) -> None:
-    """See to it that a new name outlives a power failure, where the system lets a directory be synchronised."""
-    if sys.platform == "win32":
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-class _Record(msgspec.Struct, frozen=True, kw_only=True):
-    """`blueprint.json`."""
-
-    format: Literal["urlab-blueprint"] = "urlab-blueprint"
-    version: Literal[1] = 1
-    stem: str
-    source: str
-    source_digest: str
-    imported_at: datetime
-    digest: str
-    model_name: str
-    joints: tuple[str, ...]
-    actuators: tuple[str, ...]
-    actuator_types: dict[str, str]
-    sensors: tuple[str, ...]
-    cameras: tuple[str, ...]
-    n_bytes: int = 0
-    n_data_bytes: int = 0
-    n_sensor_values: int = 0
-
-
-_RECORD: Final = msgspec.json.Decoder(_Record)
-_DIGEST: Final = re.compile(r"[0-9a-f]{16}")
-
-
-@dataclass(frozen=True, eq=False)
-class Blueprint:
-    """An imported MJCF.
-
-    Attributes:
-        stem: Sanitised file stem; identity of the blueprint.
-        folder: Folder of the snapshot; holds `model.xml`.
-        source: Absolute path of the imported file, or `bundled:<name>`.
-        source_digest: SHA-256 of the imported file itself, without what it includes.
-        imported_at: UTC.
-        digest: Hash of the snapshot's content.
-        model_name: The MJCF's `model` attribute; empty if it gives none.
-        joints: Joint names in compiled order, without prefix. Every element has a name: see `importer`.
-        actuators: Actuator names in compiled order.
-        actuator_types: Actuator name to MJCF element; `motor` for `<general>`.
-        sensors: Sensor names in compiled order.
-        cameras: Camera names in compiled order.
-        n_bytes: Memory of the compiled model; this and what follows is 0 where an older import did not note it.
-        n_data_bytes: Memory of its simulation, without an arena of MuJoCo's own choice.
-        n_sensor_values: Numbers that its sensors give.
-    """
-
-    stem: str
-    folder: Path
-    source: str
-    source_digest: str
-    imported_at: datetime
-    digest: str
-    model_name: str
-    joints: tuple[str, ...]
-    actuators: tuple[str, ...]
-    actuator_types: Mapping[str, str]
-    sensors: tuple[str, ...]
-    cameras: tuple[str, ...]
-    n_bytes: int = 0
-    n_data_bytes: int = 0
-    n_sensor_values: int = 0
-
-    @property
-    def short_name(self) -> str:
-        """Asset name."""
-        return self.stem
-
-    @property
-    def package_path(self) -> str:
-        """For example `/Game/MuJoCoImports/robot`."""
-        return f"/Game/{IMPORTS}/{self.stem}"
-
-    @property
-    def class_name(self) -> str:
-        """For example `robot_C`."""
-        return f"{self.stem}_C"
-
-    @property
-    def class_path(self) -> str:
-        """For example `/Game/MuJoCoImports/robot.robot_C`."""
-        return f"{self.package_path}.{self.class_name}"
-
-    @cached_property
-    def spec(self) -> mujoco.MjSpec:
-        """The parsed snapshot. Copy it before editing or compiling.
-
-        Raises:
-            ValueError: MuJoCo cannot read it; the content root was damaged.
-        """
-        with mujoco_messages():
-            return mujoco.MjSpec.from_file(str(self.folder / "model.xml"))
-
-    @cached_property
-    def element_names(self) -> frozenset[str]:
-        """Names of all elements that get the actor's prefix, of whatever kind."""
-        spec = self.spec
-        kinds = [
-            *(elements for elements, _ in named_kinds(spec)),
-            *(spec.materials, spec.flexes, spec.numerics, spec.texts, spec.tuples, spec.plugins),
-        ]
-        # A spec does not list its default classes.
-        classes = re.findall(r'<default class="([^"]*)"', (self.folder / "model.xml").read_text("utf-8"))
-        return frozenset((*classes, "main", *(element.name for elements in kinds for element in elements)))
 
 
 class ContentRoot:
@@ -249,7 +76,7 @@ class ContentRoot:
         sweep(self.root / IMPORTS, f"*/{_UNDER_WAY}*", f"{_UNDER_WAY}*")
         for record in sorted(self.root.glob(f"{IMPORTS}/*/blueprint.json")):
             try:
-                blueprint = _load(record)
+                blueprint = load_blueprint(record)
             except (OSError, ValueError) as error:
                 logger.warning("%s is not usable and left out: %s", record, error)
             else:
@@ -343,7 +170,7 @@ class ContentRoot:
         Raises:
             OSError, ValueError: It is not a usable blueprint.
         """
-        other = _load(record)
+        other = load_blueprint(record)
         if other.digest != digest:
             return None
         home = self.root / IMPORTS / other.stem
@@ -357,7 +184,7 @@ class ContentRoot:
                 copy = Path(temporary_folder) / "snapshot"
                 shutil.copytree(other.folder, copy)
                 os.replace(copy, folder)
-        return self._register(home, folder, _record(other))
+        return self._register(home, folder, to_record(other))
 
     def remove_blueprint(self, stem: str) -> None:
         """Forget a blueprint and delete its folder.
@@ -441,7 +268,7 @@ class ContentRoot:
             is_new = not folder.exists()
             if is_new:
                 os.replace(snapshot, folder)
-        record = _Record(
+        record = BlueprintRecord(
             stem=stem,
             source=source,
             source_digest=source_digest,
@@ -470,14 +297,12 @@ class ContentRoot:
                 return build_snapshot(file, snapshot, self.limits)[0]
             except (ValueError, mujoco.FatalError) as error:
                 raise Refusal("import_failed", f"MuJoCo rejects {file}: {one_line(error)}") from None
-        from urlab_client.server.assets.sandbox import build_confined  # noqa: PLC0415 - it imports this module
-
         return build_confined(file, snapshot, roots, self.limits)
 
-    def _register(self, home: Path, folder: Path, record: _Record) -> Blueprint:
+    def _register(self, home: Path, folder: Path, record: BlueprintRecord) -> Blueprint:
         known = self._blueprints.get(record.stem)
         write_atomic(home / "blueprint.json", msgspec.json.format(msgspec.json.encode(record)))
-        blueprint = _blueprint(folder, record)
+        blueprint = from_record(folder, record)
         self._blueprints[record.stem] = blueprint
         # A play session under way may still read the model before this one; older ones serve nobody.
         keep = {folder, known.folder if known is not None else folder}
@@ -485,55 +310,6 @@ class ContentRoot:
             if stale.is_dir() and stale not in keep and not stale.name.startswith("."):
                 shutil.rmtree(stale, ignore_errors=True)
         return blueprint
-
-
-def _load(record: Path) -> Blueprint:
-    decoded = _RECORD.decode(record.read_bytes())
-    if not decoded.stem or decoded.stem != sanitized(decoded.stem) or not _DIGEST.fullmatch(decoded.digest):
-        raise ValueError(f"'{decoded.stem}' and '{decoded.digest}' cannot be the names of folders")
-    folder = record.parent / decoded.digest
-    if not (folder / "model.xml").is_file():
-        raise ValueError(f"its snapshot {folder} is gone")
-    return _blueprint(folder, decoded)
-
-
-def _blueprint(folder: Path, record: _Record) -> Blueprint:
-    return Blueprint(
-        stem=record.stem,
-        folder=folder,
-        source=record.source,
-        source_digest=record.source_digest,
-        imported_at=record.imported_at,
-        digest=record.digest,
-        model_name=record.model_name,
-        joints=record.joints,
-        actuators=record.actuators,
-        actuator_types=MappingProxyType(record.actuator_types),
-        sensors=record.sensors,
-        cameras=record.cameras,
-        n_bytes=record.n_bytes,
-        n_data_bytes=record.n_data_bytes,
-        n_sensor_values=record.n_sensor_values,
-    )
-
-
-def _record(blueprint: Blueprint) -> _Record:
-    return _Record(
-        stem=blueprint.stem,
-        source=blueprint.source,
-        source_digest=blueprint.source_digest,
-        imported_at=blueprint.imported_at,
-        digest=blueprint.digest,
-        model_name=blueprint.model_name,
-        joints=blueprint.joints,
-        actuators=blueprint.actuators,
-        actuator_types=dict(blueprint.actuator_types),
-        sensors=blueprint.sensors,
-        cameras=blueprint.cameras,
-        n_bytes=blueprint.n_bytes,
-        n_data_bytes=blueprint.n_data_bytes,
-        n_sensor_values=blueprint.n_sensor_values,
-    )
 
 
 def _warn_if_stale(known: Blueprint, source: str, text: bytes) -> None:

@@ -20,10 +20,12 @@ from urlab_client.protocol.base import Quat, Vec3
 from urlab_client.protocol.controller_text import ControllerText
 from urlab_client.protocol.rotation import IDENTITY, normalized
 from urlab_client.server.assets.actors import ORIGIN, UNIT_SCALE, Actor, ActorKind, ConversionSettings, Light, Mesh
+from urlab_client.server.assets.blueprint import Blueprint, sanitized
 from urlab_client.server.assets.bundled_robots import BUNDLED_PREFIX
-from urlab_client.server.assets.content import Blueprint, ContentRoot, sanitized, write_atomic
+from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.assets.decomposition import advice, is_available
 from urlab_client.server.refusal import Refusal
+from urlab_client.server.system.atomic_write import write_atomic
 
 __all__ = ["LevelError", "read_level", "write_level"]
 

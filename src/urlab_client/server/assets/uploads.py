@@ -28,7 +28,7 @@ from urlab_client.protocol.messages.uploads import (
     UploadModelChunk,
     UploadModelManifest,
 )
-from urlab_client.server.assets.content import WINDOWS_DEVICES
+from urlab_client.server.assets.package_names import WINDOWS_DEVICES
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.system.temporary_folder import sweep, working_in
 

@@ -9,7 +9,6 @@ Positions are metres and rotations quaternions (x, y, z, w), both in MuJoCo's wo
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -28,17 +27,17 @@ from urlab_client.server.assets.actors import (
     Mesh,
     scene_problem,
 )
-from urlab_client.server.assets.content import PARENT_CLASS, Blueprint, ContentRoot, level_package, sanitized
+from urlab_client.server.assets.blueprint import PARENT_CLASS, Blueprint, sanitized
+from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.assets.decomposition import advice, is_available
 from urlab_client.server.assets.level import LevelError, read_level, write_level
-from urlab_client.server.compile.scene import CompileFailed, actor_bounds
+from urlab_client.server.assets.package_names import level_package
+from urlab_client.server.compile.bounds import actor_bounds
+from urlab_client.server.compile.failure import CompileFailed
 from urlab_client.server.editor import checks
 from urlab_client.server.refusal import Refusal
 
 __all__ = ["Actor", "ActorKind", "ActorNames", "ConversionSettings", "EditorWorld", "Light", "Mesh", "Placed"]
-
-logger = logging.getLogger("urlab_client.server")
-
 ActorNames = Literal["model", "plugin"]
 
 UNTITLED: Final = "/Temp/Untitled_1"

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from urlab_client.protocol.messages.cameras import (
     CameraStreaming,
-    CameraSwitch,
+    CameraTransports,
     SetCameraStreaming,
     SetCameraStreamingOk,
 )
@@ -41,7 +41,7 @@ def set_camera_streaming(server: ServerCore, request: SetCameraStreaming) -> Set
     return SetCameraStreamingOk(cameras=streaming)
 
 
-def _places(wanted: bool | CameraSwitch) -> tuple[bool, bool]:
+def _places(wanted: bool | CameraTransports) -> tuple[bool, bool]:
     if isinstance(wanted, bool):
         return wanted, wanted
     if wanted.zmq is None and wanted.shm is None:

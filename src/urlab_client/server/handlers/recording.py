@@ -29,7 +29,6 @@ from urlab_client.protocol.messages.recording import (
     ReplayStop,
     ReplayStopOk,
 )
-from urlab_client.server.assets.content import write_atomic
 from urlab_client.server.core import ServerCore
 from urlab_client.server.physics.controllers import float32
 from urlab_client.server.physics.play import Running
@@ -38,6 +37,7 @@ from urlab_client.server.physics.replay import Player, ReplaySessions, replay_fo
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.dispatch import handles
 from urlab_client.server.rpc.requests import need
+from urlab_client.server.system.atomic_write import write_atomic
 
 UNLIMITED_S: Final = 3.4028234663852886e38
 """The largest float32."""

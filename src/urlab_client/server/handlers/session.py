@@ -32,7 +32,7 @@ from urlab_client.protocol.messages.session import (
     Step,
     StepOk,
 )
-from urlab_client.server.compile.scene import EntityIndex
+from urlab_client.server.compile.scene_index import EntityIndex
 from urlab_client.server.core import ServerCore
 from urlab_client.server.handlers.control import check_owner
 from urlab_client.server.physics.controllers import ArticulationControl, float32

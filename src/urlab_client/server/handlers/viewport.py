@@ -25,7 +25,8 @@ from urlab_client.protocol.messages.viewport import (
 )
 from urlab_client.protocol.rotation import xyzw
 from urlab_client.server.assets.actors import Actor
-from urlab_client.server.compile.scene import CompileFailed, actor_bounds
+from urlab_client.server.compile.bounds import actor_bounds
+from urlab_client.server.compile.failure import CompileFailed
 from urlab_client.server.core import ServerCore
 from urlab_client.server.editor.viewport import DEFAULT_OFFSET, Track, ViewMode, ViewportCamera, rotator
 from urlab_client.server.physics.controllers import float32

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from urlab_client._mujoco import control_counts
 from urlab_client.protocol.controller_text import ControllerText
 from urlab_client.protocol.enums import ControllerKind
-from urlab_client.server.compile.scene import ArticulationIndex
+from urlab_client.server.compile.scene_index import ArticulationIndex
 
 __all__ = [
     "Actuated",

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from urlab_client.protocol.enums import ObservationLevel
 from urlab_client.protocol.messages.session import ArticulationState, BodyPose, Clock, EntityState, TwistState
-from urlab_client.server.compile.scene import CompiledScene, EntityIndex
+from urlab_client.server.compile.scene import CompiledScene
+from urlab_client.server.compile.scene_index import EntityIndex
 from urlab_client.server.physics.channels import SCENE, UserChannels
 from urlab_client.server.physics.controllers import ArticulationControl
 

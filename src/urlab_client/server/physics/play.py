@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import Final
 
 from urlab_client.protocol.enums import PIEState
-from urlab_client.server.compile.scene import CompiledScene, CompileFailed
+from urlab_client.server.compile.failure import CompileFailed
+from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.limits import Limits
 from urlab_client.server.physics.channels import UserChannels
 from urlab_client.server.physics.claims import ControlClaims

@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import logging
-import os
 import socket
 from collections.abc import Callable
 from typing import ClassVar, Final
@@ -104,12 +103,6 @@ def tcp(host: str) -> str:
     return f"tcp://[{host}]" if ":" in host else f"tcp://{host}"
 
 
-def _bind_error(code: int | None, host: str, port: int, option: str) -> OSError:
-    if code == errno.EADDRINUSE:
-        return PortInUse(host, port, option)
-    return OSError(code, f"cannot bind {tcp(host)}:{port}: {os.strerror(code or 0)}")
-
-
 def bind_tcp(socket: zmq.Socket[bytes], host: str, port: int, option: str) -> int:
     """Bind a ZeroMQ socket and return its port.
 
@@ -127,7 +120,9 @@ def bind_tcp(socket: zmq.Socket[bytes], host: str, port: int, option: str) -> in
     try:
         socket.bind(f"{tcp(host)}:{port}")
     except zmq.ZMQError as error:
-        raise _bind_error(error.errno, host, port, option) from error
+        if error.errno == zmq.Errno.EADDRINUSE:  # which on Windows is another number than Python's
+            raise PortInUse(host, port, option) from error
+        raise OSError(error.errno, f"cannot bind {tcp(host)}:{port}: {error.strerror}") from error
     return int(socket.get_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
 
 

@@ -11,6 +11,12 @@ from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.namespaces import runtime as aio
 from urlab_client.aio.namespaces._base import Vector
 from urlab_client.protocol.enums import StepMode
+from urlab_client.protocol.messages.cameras import (
+    CameraDelay,
+    CameraDelayInForce,
+    CameraStreaming,
+    CameraTransports,
+)
 from urlab_client.protocol.messages.session import ForwardOk
 from urlab_client.protocol.types import ContactsResult, SimOptions
 from urlab_client.sync.namespaces._ops import RuntimeOps
@@ -112,6 +118,52 @@ class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
             UnknownOp: The server has no such channels.
         """
         return self._portal.call(self._aio.set_user_channels, arts, scene=scene, timeout=timeout)
+
+    def set_camera_streaming(
+        self, cameras: Mapping[str, bool | CameraTransports], *, timeout: Timeout = DEFAULT
+    ) -> dict[str, CameraStreaming]:
+        """Switch the streams of cameras on or off, for all clients alike, until play ends.
+
+        Iterating over `frames()` does so by itself, for as long as somebody iterates. What is set here goes before
+        that: a camera switched on here stays on when its streams end and when the client is closed. One switched off
+        here brings its open streams nothing more, until another stream of it is opened.
+
+        Args:
+            cameras: Camera, by its name or as `<articulation>/<camera>`, to on or off, or to the transports it is to
+                use. Of those, what is not mentioned is switched off, unless nothing is mentioned.
+            timeout: Seconds to wait; None waits without limit.
+
+        Returns:
+            Where the cameras stream now, by the names given; without those that the server does not have any more.
+
+        Raises:
+            KeyError: Unknown camera, or one that several articulations have; nothing was sent.
+            UnknownOp: A camera is to be switched off by a server whose cameras always stream; nothing was sent.
+            GameThreadTimeout: The editor is busy; it may still do it later.
+        """
+        return self._portal.call(self._aio.set_camera_streaming, cameras, timeout=timeout)
+
+    def set_camera_delay(
+        self, cameras: Mapping[str, float | CameraDelay], *, timeout: Timeout = DEFAULT
+    ) -> dict[str, CameraDelayInForce]:
+        """Let cameras show what they saw some time ago, as slow ones do, for all clients alike, until play ends.
+
+        Streams and `latest` pictures are late by it; `sync` pictures of a step are not.
+
+        Args:
+            cameras: Camera, by its name or as `<articulation>/<camera>`, to seconds, or to a latency with jitter.
+            timeout: Seconds to wait; None waits without limit.
+
+        Returns:
+            The latencies now, by the names given; without cameras that the server does not have any more.
+
+        Raises:
+            KeyError: Unknown camera, or one that several articulations have; nothing was sent.
+            ValueError: A latency is negative, NaN or infinite, or goes by an unknown clock; nothing was sent.
+            UnknownOp: The server has no such latency.
+            GameThreadTimeout: The editor is busy; it may still do it later.
+        """
+        return self._portal.call(self._aio.set_camera_delay, cameras, timeout=timeout)
 
     def set_mode(self, mode: StepMode | str, *, timeout: Timeout = DEFAULT) -> StepMode:
         """Switch the step mode and return the one in force. Any mode but live un-pauses physics.

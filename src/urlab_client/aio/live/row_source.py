@@ -1,0 +1,117 @@
+"""The binary rows of the state socket."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+
+from urlab_client.aio.live.source import SocketSource
+from urlab_client.aio.live.state_source import StateSource
+from urlab_client.aio.transport.subscriber import Subscription, Subscriptions
+from urlab_client.protocol.errors import ProtocolError
+from urlab_client.protocol.layouts import BytesLike
+from urlab_client.protocol.messages.streams import (
+    RowSample,
+)
+from urlab_client.protocol.rows import decode_row
+from urlab_client.protocol.topics import StreamTopic, TopicKind, articulation_filter, scene_filter
+
+__all__ = ["RowSource"]
+
+_OF_COMPONENT = frozenset({TopicKind.JOINT, TopicKind.BASE_STATE, TopicKind.SENSOR})
+_OF_ARTICULATION = _OF_COMPONENT | {TopicKind.TWIST, TopicKind.ACTIONS}
+_OF_SCENE = frozenset({TopicKind.XPOS, TopicKind.XQUAT, TopicKind.QPOS, TopicKind.QVEL})
+_WITH_ID = frozenset({TopicKind.JOINT, TopicKind.SENSOR})
+
+
+class RowSource(SocketSource):
+    """The binary rows of the state socket.
+
+    Args:
+        subscriptions: The client's.
+        endpoint: Tells where the state socket is.
+        articulations: Keys of the articulations whose rows are wanted.
+        kinds: Kinds of rows; empty for all that the other arguments allow.
+        components: Component names of joints, free joints and sensors; empty for all.
+        entities: Whether `kinds` left empty includes the scene rows.
+
+    Attributes:
+        articulations: As given.
+
+    Raises:
+        ValueError: A kind is not one of rows, a name cannot stand in a topic, or nothing is left to receive.
+    """
+
+    name = "row_stream"
+    unreachable = StateSource.unreachable
+    silent = (
+        "Rows come in live mode only: client.runtime.set_mode('live'); paused they repeat. Component names are the "
+        "engine's, not always the compiled ones."
+    )
+
+    def __init__(
+        self,
+        subscriptions: Subscriptions,
+        endpoint: Callable[[], str],
+        articulations: Collection[str],
+        kinds: Collection[str | TopicKind] = (),
+        components: Collection[str] = (),
+        *,
+        entities: bool = False,
+    ) -> None:
+        super().__init__(subscriptions)
+        self._endpoint = endpoint
+        self.articulations = frozenset(articulations)
+        self._components = frozenset(components)
+        self._kinds = frozenset(TopicKind(kind) for kind in kinds)
+        if not self._kinds:
+            self._kinds = _OF_COMPONENT if components else _OF_ARTICULATION
+            self._kinds |= _OF_SCENE if entities and not components else frozenset()
+        no_rows = self._kinds - _OF_ARTICULATION - _OF_SCENE
+        if no_rows:
+            raise ValueError(f"there are no rows of kind {', '.join(sorted(no_rows))}")
+        self._filters = tuple(sorted(self._narrow()))
+        if not self._filters:
+            raise ValueError("row_stream: there is no articulation to receive rows of; has discover() found any?")
+
+    def _narrow(self) -> set[bytes]:
+        filters = {scene_filter()} if self._kinds & _OF_SCENE else set[bytes]()
+        for key in self.articulations:
+            if not self._components and self._kinds >= _OF_ARTICULATION:
+                filters.add(articulation_filter(key))
+                continue
+            for kind in self._kinds & _OF_ARTICULATION:
+                if self._components and kind in _OF_COMPONENT:
+                    filters |= {StreamTopic(kind, key, component).encode() for component in self._components}
+                else:
+                    filters.add(articulation_filter(key, kind))
+        return filters
+
+    def subscription(self) -> Subscription:
+        """See the base class."""
+        return Subscription(self._endpoint(), self._filters, self._accepts)
+
+    def _accepts(self, topic: bytes) -> bool:
+        try:
+            found = StreamTopic.parse(topic)
+        except ProtocolError:
+            return False  # a kind of topic that a newer server has
+        return self.has(found)
+
+    def has(self, found: StreamTopic) -> bool:
+        """Whether rows of a topic are among those that are wanted."""
+        if found.kind not in self._kinds:
+            return False
+        if found.kind in _OF_SCENE:
+            return True
+        named = found.kind not in _OF_COMPONENT or not self._components or found.name in self._components
+        return named and found.owner in self.articulations
+
+    def wants(self, topic: bytes, payload: BytesLike) -> bool:
+        """Leave out components that are not in the compiled model: their rows carry a negative id and zeros."""
+        return not (len(payload) >= 4 and payload[3] & 0x80 and StreamTopic.parse(topic).kind in _WITH_ID)
+
+    def decode(self, topic: bytes, payload: BytesLike) -> RowSample:
+        """Read a row. Raises `ProtocolError`."""
+        found = StreamTopic.parse(topic)
+        row = decode_row(found, payload)
+        return RowSample(kind=found.kind, owner=found.owner, component=found.name, row=row)

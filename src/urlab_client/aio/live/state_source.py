@@ -1,0 +1,160 @@
+"""The snapshots of the simulation: from the state socket, the state region, or the client's own steps."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+
+from urlab_client.aio.live.source import SharedMemorySource, SocketSource
+from urlab_client.aio.transport.regions import Place, Regions
+from urlab_client.aio.transport.subscriber import MessageHandler, Subscription, Subscriptions
+from urlab_client.protocol import doorbell
+from urlab_client.protocol.layouts import BytesLike
+from urlab_client.protocol.messages.session import StateReply
+from urlab_client.protocol.messages.streams import (
+    StateSnapshot,
+)
+from urlab_client.protocol.shm import STATE_FILE
+from urlab_client.protocol.topics import STATE_FULL
+
+__all__ = ["OwnSteps", "SharedStateSource", "StateSource"]
+
+
+_ONLY_OWN = (
+    "This server publishes state in live mode only: client.runtime.set_mode('live'). In the other modes it comes with "
+    "this client's own steps."
+)
+
+
+class OwnSteps:
+    """Hands the states in replies to those who receive snapshots, where the server publishes in live mode only."""
+
+    def __init__(self) -> None:
+        self._handlers: dict[MessageHandler, None] = {}
+
+    def __bool__(self) -> bool:
+        return bool(self._handlers)
+
+    def attach(self, handler: MessageHandler) -> None:
+        """Begin to feed `handler`, from the event loop."""
+        self._handlers[handler] = None
+
+    def detach(self, handler: MessageHandler) -> None:
+        """Stop feeding `handler`. Idempotent."""
+        self._handlers.pop(handler, None)
+
+    def publish(self, reply: StateReply) -> None:
+        """Hand a state over."""
+        payload = StateSnapshot.of(reply).encode()
+        for handler in tuple(self._handlers):
+            handler.on_message(STATE_FULL, payload)
+            handler.on_drained()
+
+
+class StateSource(SocketSource):
+    """The snapshots of the state socket.
+
+    Args:
+        subscriptions: The client's.
+        endpoint: Tells where the state socket is.
+        own: What brings the states of the client's own steps, where the server publishes none of them.
+        only_own: Tells whether nothing else comes, as things stand.
+
+    Attributes:
+        subscriptions: As given.
+        endpoint: As given.
+    """
+
+    name = "state_stream"
+    unreachable = "The port is open only while play runs: client.sim.start(). Is it the server's state port?"
+    silent = (
+        "While play runs a snapshot comes at least every 100 ms, in every mode and paused, too: is this the server's "
+        "state port?"
+    )
+
+    def __init__(
+        self,
+        subscriptions: Subscriptions,
+        endpoint: Callable[[], str],
+        own: OwnSteps | None = None,
+        *,
+        only_own: Callable[[], bool] = lambda: False,
+    ) -> None:
+        super().__init__(subscriptions)
+        self.subscriptions = subscriptions
+        self.endpoint = endpoint
+        self._own = OwnSteps() if own is None else own
+        self._only_own = only_own
+
+    def attach(self, handler: MessageHandler) -> None:
+        """Begin to feed `handler`, from the event loop."""
+        super().attach(handler)
+        self._own.attach(handler)
+
+    def detach(self, handler: MessageHandler) -> None:
+        """Stop feeding `handler`. Idempotent."""
+        super().detach(handler)
+        self._own.detach(handler)
+
+    def subscription(self) -> Subscription:
+        """See the base class."""
+        return Subscription(self.endpoint(), (STATE_FULL,), STATE_FULL.__eq__)
+
+    def first_after(self, handler: MessageHandler) -> float:
+        """Return how long the first snapshot may be in coming: where only steps bring any, for ever."""
+        return math.inf if self._only_own() else super().first_after(handler)
+
+    def silence(self, handler: MessageHandler, seconds: float) -> tuple[str, str]:
+        """See the base class."""
+        problem, advice = super().silence(handler, seconds)
+        return problem, _ONLY_OWN if self._only_own() else advice
+
+    def decode(self, topic: bytes, payload: BytesLike) -> StateSnapshot:
+        """Read a snapshot. Raises `ProtocolError`."""
+        return StateSnapshot.decode(payload, topic.decode())
+
+
+class SharedStateSource(SharedMemorySource, StateSource):
+    """The snapshots of the state region, or of the state socket.
+
+    Args:
+        regions: The client's.
+        subscriptions: The client's.
+        endpoint: Tells where the state socket is.
+    """
+
+    def __init__(
+        self,
+        regions: Regions,
+        subscriptions: Subscriptions,
+        endpoint: Callable[[], str],
+        own: OwnSteps | None = None,
+        *,
+        only_own: Callable[[], bool] = lambda: False,
+    ) -> None:
+        super().__init__(subscriptions, endpoint, own, only_own=only_own)
+        self.regions = regions
+        # The socket may be one ahead of the region. Two are never equal: each tells when it was built.
+        self._came = deque[BytesLike](maxlen=2)
+
+    def attach(self, handler: MessageHandler) -> None:
+        """See the base classes."""
+        super().attach(handler)
+        self._own.attach(handler)
+
+    def detach(self, handler: MessageHandler) -> None:
+        """See the base classes."""
+        super().detach(handler)
+        self._own.detach(handler)
+
+    def place(self) -> Place:
+        """See the base class."""
+        return Place(STATE_FILE, STATE_FULL, doorbell.STATE)
+
+    def wants(self, topic: bytes, payload: BytesLike) -> bool:
+        """Leave out what came already: where the region takes over from the socket, both bring it."""
+        if payload in self._came:
+            return False
+        self._came.append(payload)
+        return True

@@ -1,0 +1,77 @@
+"""The actors of a level, put together to one spec."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import mujoco
+
+from urlab_client._mujoco import merge_assets
+from urlab_client.protocol.rotation import wxyz
+from urlab_client.server.assets.actors import Actor
+from urlab_client.server.assets.blueprint import Blueprint
+from urlab_client.server.compile.mjcf_options import copy_options, ignored_options
+from urlab_client.server.compile.static_meshes import add_light, add_static_mesh
+
+__all__ = ["compose"]
+
+
+def compose(
+    actors: Sequence[Actor],
+    articulations: Sequence[tuple[Actor, Blueprint]],
+    warnings: list[str],
+    *,
+    honour_mjcf_options: bool,
+) -> tuple[mujoco.MjSpec, list[tuple[str, str | None]]]:
+    """Return the spec of the whole scene, and the body and free joint of each converted mesh."""
+    spec = mujoco.MjSpec()
+    spec.modelname = "urlab"
+    spec.compiler.degree = False
+    spec.copy_during_attach = True
+    if honour_mjcf_options and articulations:
+        copy_options(articulations[0][1].spec.option, spec.option)
+    warnings.extend(ignored_options(spec, articulations, honoured=honour_mjcf_options))
+    children = {blueprint.folder: _attachable(blueprint, spec) for _, blueprint in articulations}
+    bodies: list[tuple[str, str | None]] = []
+    for actor in actors:
+        if actor.blueprint is not None:
+            frame = spec.worldbody.add_frame(pos=actor.location, quat=wxyz(actor.rotation))
+            spec.attach(children[actor.blueprint.folder], frame=frame, prefix=actor.prefix)
+        elif actor.light is not None:
+            add_light(spec, actor)
+        elif actor.mesh is not None:
+            converted = add_static_mesh(spec, actor, actor.mesh)
+            if converted is not None:
+                bodies.append(converted)
+    _restore_world_references(spec, {f"{actor.prefix}world" for actor, _ in articulations})
+    merge_assets(spec, children)
+    return spec, bodies
+
+
+def _restore_world_references(spec: mujoco.MjSpec, prefixed: set[str]) -> None:
+    """Undo the prefix that attaching gives the world's name where lights and cameras aim at it."""
+    for element in (*spec.lights, *spec.cameras):
+        if element.targetbody in prefixed:
+            element.targetbody = "world"
+
+
+def _attachable(blueprint: Blueprint, parent: mujoco.MjSpec) -> mujoco.MjSpec:
+    """Return a copy of the blueprint's spec that agrees with `parent` in whatever attaching would drop.
+
+    Where they disagree MuJoCo keeps the parent's value as we want, but prints a warning for each attachment.
+    """
+    child = blueprint.spec.copy()
+    copy_options(parent.option, child.option)
+    child.visual.map.znear = parent.visual.map.znear
+    child.visual.map.zfar = parent.visual.map.zfar
+    child.visual.global_.realtime = parent.visual.global_.realtime
+    for size in _SIZES:
+        setattr(child, size, getattr(parent, size))
+    return child
+
+
+_SIZES: Final = (  # what `<size>` sets
+    *("memory", "njmax", "nconmax", "nuserdata", "nkey"),
+    *(f"nuser_{kind}" for kind in ("body", "jnt", "geom", "site", "cam", "tendon", "actuator", "sensor")),
+)

@@ -1,0 +1,215 @@
+"""Tables that say which articulation or prop an element of the compiled model belongs to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Final
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from urlab_client._mujoco import (
+    control_counts,
+    control_starts,
+    force_counts,
+    force_starts,
+)
+from urlab_client.protocol.controller_text import CUSTOM_TEXT, ControllerText
+from urlab_client.server.assets.actors import Actor
+from urlab_client.server.assets.blueprint import Blueprint
+from urlab_client.server.compile.failure import CompileFailed
+
+__all__ = ["ArticulationIndex", "EntityIndex", "SceneCamera", "index_articulation", "index_entity"]
+
+Ints = NDArray[np.int32]
+DEFAULT_CAMERA_SIZE: Final = (640, 480)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneCamera:
+    """A camera of an articulation.
+
+    Attributes:
+        name: Short name.
+        id: Camera id in the model.
+        mode: What its pixels mean: `real`, `depth`, `semantic` or `instance`.
+        resolution: Width and height, pixels.
+        fovy: Vertical field of view, degrees.
+    """
+
+    name: str
+    id: int
+    mode: str = "real"
+    resolution: tuple[int, int] = DEFAULT_CAMERA_SIZE
+    fovy: float = 45.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ArticulationIndex:
+    """Where an articulation's elements are in the model. Ids ascend; names are short and parallel to the ids.
+
+    Attributes:
+        key: Actor name.
+        prefix: `key` and an underscore: what its compiled names begin with.
+        actor_id: Stable id given by the client; may be empty.
+        model_name: The MJCF's `model` attribute, or its file stem.
+        root_body: Lowest body id; 0, the world, if the MJCF has nothing but world geoms.
+        bodies: Body ids.
+        joints: Joint ids.
+        actuators: Actuator ids.
+        sensors: Sensor ids.
+        body_names: Names of the bodies.
+        joint_names: Names of the joints.
+        actuator_names: Names of the actuators.
+        sensor_names: Names of the sensors.
+        qpos_adr: Index into `mjData.qpos` of every coordinate, in joint order.
+        qvel_adr: Index into `mjData.qvel` of every velocity, in joint order.
+        ctrl_adr: Index into `mjData.ctrl` of every control, in actuator order; an actuator may have several.
+        act_adr: For every control the index into `mjData.act` of its actuator's first activation; -1 if stateless.
+        force_adr: Index into `mjData.actuator_force` of every output, in actuator order; an actuator may have several.
+        actuator_types: Actuator name to MJCF element; `motor` for `<general>`.
+        cameras: The cameras.
+        controller: The controller that the level or the MJCF gives it; None for none.
+        original_names: Kind to (name in the model, name in the MJCF), where the two differ. They never do here.
+    """
+
+    key: str
+    prefix: str
+    actor_id: str
+    model_name: str = ""
+    root_body: int
+    bodies: Ints
+    joints: Ints
+    actuators: Ints
+    sensors: Ints
+    body_names: tuple[str, ...]
+    joint_names: tuple[str, ...]
+    actuator_names: tuple[str, ...]
+    sensor_names: tuple[str, ...]
+    qpos_adr: Ints
+    qvel_adr: Ints
+    ctrl_adr: Ints
+    act_adr: Ints
+    force_adr: Ints
+    actuator_types: Mapping[str, str]
+    cameras: tuple[SceneCamera, ...]
+    controller: ControllerText | None = None
+    original_names: Mapping[str, Mapping[str, str]] = field(
+        default_factory=lambda: {kind: {} for kind in ("actuators", "joints", "sensors", "bodies")}
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class EntityIndex:
+    """A body that belongs to no articulation.
+
+    Attributes:
+        name: Compiled body name.
+        body: Body id.
+        free_joint: Name of its free joint, or None if it is fixed or driven.
+        free_joint_id: Id of that joint; -1 without one.
+        qpos_adr: Index of its 7 coordinates in `mjData.qpos`; -1 without a free joint.
+        qvel_adr: Index of its 6 velocities in `mjData.qvel`; -1 without a free joint.
+    """
+
+    name: str
+    body: int
+    free_joint: str | None = None
+    free_joint_id: int = -1
+    qpos_adr: int = -1
+    qvel_adr: int = -1
+
+
+def index_articulation(
+    model: mujoco.MjModel, actor: Actor, blueprint: Blueprint, camera_size: tuple[int, int] | None
+) -> ArticulationIndex:
+    """Find an articulation's elements by their exact compiled names, which no other prefix can be mistaken for."""
+
+    def find(kind: int, names: Iterable[str]) -> tuple[Ints, tuple[str, ...]]:
+        ids = {name: mujoco.mj_name2id(model, kind, f"{actor.prefix}{name}") for name in names}
+        # Bodies that compilation fused away are in the spec, but not in the model.
+        found = sorted((index, name) for name, index in ids.items() if index >= 0)
+        return np.array([index for index, _ in found], dtype=np.int32), tuple(name for _, name in found)
+
+    objects = mujoco.mjtObj
+    bodies, body_names = find(objects.mjOBJ_BODY, (body.name for body in blueprint.spec.bodies[1:]))
+    joints, joint_names = find(objects.mjOBJ_JOINT, blueprint.joints)
+    actuators, actuator_names = find(objects.mjOBJ_ACTUATOR, blueprint.actuators)
+    sensors, sensor_names = find(objects.mjOBJ_SENSOR, blueprint.sensors)
+    cameras, camera_names = find(objects.mjOBJ_CAMERA, blueprint.cameras)
+    positions, velocities = _joint_widths(model, joints)
+    controls = control_counts(model)[actuators]
+    return ArticulationIndex(
+        key=actor.name,
+        prefix=actor.prefix,
+        actor_id=actor.actor_id,
+        model_name=blueprint.model_name or blueprint.stem,
+        root_body=int(bodies[0]) if bodies.size else 0,
+        bodies=bodies,
+        joints=joints,
+        actuators=actuators,
+        sensors=sensors,
+        body_names=body_names,
+        joint_names=joint_names,
+        actuator_names=actuator_names,
+        sensor_names=sensor_names,
+        qpos_adr=_spans(model.jnt_qposadr[joints], positions),
+        qvel_adr=_spans(model.jnt_dofadr[joints], velocities),
+        ctrl_adr=_spans(control_starts(model)[actuators], controls),
+        act_adr=np.repeat(model.actuator_actadr[actuators], controls).astype(np.int32),
+        force_adr=_spans(force_starts(model)[actuators], force_counts(model)[actuators]),
+        actuator_types=MappingProxyType({name: blueprint.actuator_types[name] for name in actuator_names}),
+        cameras=tuple(
+            _camera(model, int(index), name, camera_size) for index, name in zip(cameras, camera_names, strict=True)
+        ),
+        controller=_controller(actor, blueprint),
+    )
+
+
+def _controller(actor: Actor, blueprint: Blueprint) -> ControllerText | None:
+    """Return the controller that the level gives an articulation, or else its MJCF."""
+    authored = [text.data for text in blueprint.spec.texts if text.name == CUSTOM_TEXT]
+    text = actor.controller or next(iter(authored), "")
+    try:
+        return ControllerText.parse(text) if text else None
+    except ValueError as error:
+        raise CompileFailed(f"{blueprint.stem}: custom text '{CUSTOM_TEXT}': {error}") from None
+
+
+def _joint_widths(model: mujoco.MjModel, joints: Ints) -> tuple[Ints, Ints]:
+    """Return how many coordinates and velocities each joint has."""
+    kinds = model.jnt_type[joints]
+    free, ball = kinds == int(mujoco.mjtJoint.mjJNT_FREE), kinds == int(mujoco.mjtJoint.mjJNT_BALL)
+    return np.select([free, ball], [7, 4], 1).astype(np.int32), np.select([free, ball], [6, 3], 1).astype(np.int32)
+
+
+def _spans(starts: Ints, lengths: Ints) -> Ints:
+    """Return the concatenation of the ranges start, start + 1, … of the given lengths."""
+    spans = [np.arange(start, start + length, dtype=np.int32) for start, length in zip(starts, lengths, strict=True)]
+    return np.concatenate(spans) if spans else np.empty(0, dtype=np.int32)
+
+
+def _camera(model: mujoco.MjModel, index: int, name: str, size: tuple[int, int] | None) -> SceneCamera:
+    width, height = (int(pixels) for pixels in model.cam_resolution[index])
+    if width * height <= 1:  # MuJoCo's 1x1 says that the MJCF gives none
+        width, height = size or DEFAULT_CAMERA_SIZE
+    return SceneCamera(name=name, id=index, resolution=(width, height), fovy=float(model.cam_fovy[index]))
+
+
+def index_entity(model: mujoco.MjModel, body: str, joint: str | None) -> EntityIndex:
+    """Find the body of a converted mesh, and its free joint, by their compiled names."""
+    index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, body)
+    if joint is None:
+        return EntityIndex(name=body, body=index)
+    joint_id = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, joint)
+    return EntityIndex(
+        name=body,
+        body=index,
+        free_joint=joint,
+        free_joint_id=joint_id,
+        qpos_adr=int(model.jnt_qposadr[joint_id]),
+        qvel_adr=int(model.jnt_dofadr[joint_id]),
+    )

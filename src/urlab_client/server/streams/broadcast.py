@@ -1,0 +1,271 @@
+"""What a play session publishes: its ticks, copied on the physics thread and made messages of on another."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import logging
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any, Final, TypeAlias
+
+import mujoco
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from urlab_client.protocol.codec import encode_reply
+from urlab_client.protocol.control_messages import CameraEndpoint, ControlPayload, JointGains, gains_by_parameter
+from urlab_client.protocol.enums import ObservationLevel, StepMode
+from urlab_client.protocol.messages.session import ArticulationState, Clock, EntityState
+from urlab_client.protocol.topics import STATE_FULL, TopicKind
+from urlab_client.server.compile.scene import CompiledScene
+from urlab_client.server.physics.controllers import ArticulationControl, Twist
+from urlab_client.server.physics.observe import Observer, sim_clock, wall_clock
+from urlab_client.server.physics.play import Running
+from urlab_client.server.refusal import Refusal
+from urlab_client.server.streams.state_rows import PublishedRow, published_rows, topic_frame
+from urlab_client.server.streams.streamed_commands import Actuators, StreamedCommand
+from urlab_client.server.transport.shared_memory import SharedMemoryServer
+
+__all__ = ["Broadcast", "Tick", "next_info"]
+
+logger = logging.getLogger("urlab_client.server")
+
+Floats: TypeAlias = NDArray[np.float64]
+
+LOCK_S: Final = 0.02
+"""Longest wait for the physics lock in one go; what it was wanted for is tried again."""
+
+INFO_EVERY: Final = 50
+INFO_START_TICKS: Final = 2500
+INFO_LATER_EVERY: Final = 500
+"""The info messages go out every 50 live ticks up to tick 2500, then every 500."""
+
+_LIVE: Final = frozenset({StepMode.LIVE, StepMode.AUTO})
+
+
+class StateFull(Struct, tag_field="op", tag="state_full", kw_only=True, omit_defaults=True):
+    """The map of a `state/full` message, every field of it but the last always present."""
+
+    time: float
+    step: int
+    sim_time: Clock
+    wall_time: Clock
+    per_articulation: dict[str, ArticulationState]
+    entities: dict[str, EntityState]
+    user: dict[str, Any] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """One tick as the physics thread left it.
+
+    Attributes:
+        live: Number of the tick among the live ones seen, from 1; 0 outside live mode.
+        time: `mjData.time`, seconds.
+        step: Step counter.
+        wall_time: When the copies were made.
+        arrays: Copies of what `Broadcast.sources` lists; empty when nobody wants them.
+        twists: Commanded twist and action keys of each articulation; likewise.
+        full: Whether the snapshot is wanted.
+    """
+
+    live: int
+    time: float
+    step: int
+    wall_time: Clock
+    arrays: list[Floats]
+    twists: list[tuple[float, float, float, int]]
+    full: bool
+
+
+class Broadcast:
+    """One play session on the air: takes ticks from its physics and makes messages of them.
+
+    Attributes:
+        running: The simulation.
+        full_wanted: Whether the snapshot is subscribed to.
+    """
+
+    def __init__(
+        self,
+        running: Running,
+        hand_over: Callable[[Broadcast, Tick], None],
+        memory: SharedMemoryServer | None,
+    ) -> None:
+        """Prepare the messages of a scene; `want` decides which are made.
+
+        Args:
+            running: The simulation.
+            hand_over: Takes a tick to the thread that sends; called under the engine's lock.
+            memory: Where snapshots go besides, whenever it wants them.
+        """
+        self.running = running
+        self._hand_over = hand_over
+        self._memory = memory
+        self._engine = running.engine
+        self._dialect = running.engine.dialect
+        scene = running.scene
+        # The encoders read a mirror of the data that only the sending thread touches.
+        self._mirror = mujoco.MjData(scene.model)
+        self._controls = list(running.engine.articulations.controls.values())
+        mirrored = {key: _with_own_twist(control) for key, control in running.engine.articulations.controls.items()}
+        self._twists = [control.twist for control in mirrored.values()]
+        self._observer = Observer(dataclasses.replace(scene, data=self._mirror), mirrored, running.channels)
+        self._sources = _arrays(scene, scene.data)
+        self._targets = _arrays(scene, self._mirror)
+        self._rows = (
+            list(published_rows(scene, self._mirror, mirrored.values())) if self._dialect.rows_published else []
+        )
+        self._actuators = Actuators(scene.model, self._controls)
+        self._wanted_rows: list[PublishedRow] = []
+        self.full_wanted = False
+        self._info_wanted = False
+        self._live_ticks = 0
+        self._info_due = next_info(0)
+
+    # On the thread that sends.
+
+    def want(self, state: Iterable[bytes], info: Iterable[bytes]) -> None:
+        """Take over what is subscribed to on the two sockets; listen to physics only if that is anything."""
+        prefixes = tuple(state)
+        self._wanted_rows = [row for row in self._rows if row.topic.startswith(prefixes)] if prefixes else []
+        self.full_wanted = STATE_FULL.startswith(prefixes) if prefixes else False
+        self._info_wanted = any(True for _ in info)
+        hooks = self._engine.on_tick
+        if not (self._wanted_rows or self.full_wanted or self._info_wanted or self._memory is not None):
+            self.leave()
+        elif self._capture not in hooks:
+            hooks.append(self._capture)
+
+    def leave(self) -> None:
+        """Stop listening to physics. Safe to call twice."""
+        if self._capture in self._engine.on_tick:
+            self._engine.on_tick.remove(self._capture)
+
+    def state_messages(self, tick: Tick) -> Iterator[tuple[bytes, bytes]]:
+        """Yield topic and payload of what a tick brings on the state socket, the snapshot last."""
+        if not tick.arrays:
+            return
+        for target, values in zip(self._targets, tick.arrays, strict=True):
+            target[:] = values
+        for twist, values in zip(self._twists, tick.twists, strict=True):
+            twist.vx, twist.vy, twist.yaw_rate, twist.actions = values
+        if tick.live:
+            for row in self._wanted_rows:
+                payload = row.encode()
+                if payload is not None:
+                    yield row.topic, payload
+        if tick.full:
+            yield STATE_FULL, self._state_full(tick)
+
+    def _state_full(self, tick: Tick) -> bytes:
+        snapshot = StateFull(
+            time=tick.time,
+            step=tick.step,
+            sim_time=sim_clock(tick.time),
+            wall_time=tick.wall_time,
+            per_articulation=self._observer.articulations(ObservationLevel.STANDARD),
+            entities=self._observer.entities(),
+            user=self._observer.scene_channels() or None,
+        )
+        return encode_reply(self._dialect.shaped(snapshot))
+
+    def info_messages(
+        self, tick: Tick, cameras: Callable[[CompiledScene], Iterable[CameraEndpoint]]
+    ) -> Iterator[bytes]:
+        """Yield the frames due on the info socket."""
+        if not (self._info_wanted and tick.live >= self._info_due):
+            return
+        self._info_due = next_info(tick.live)
+        endpoints = tuple(cameras(self.running.scene))
+        for control in self._controls:
+            yield self._actuators.info(control, endpoints).encode()
+
+    def command_topics(self) -> Iterator[bytes]:
+        """Yield the topics that the articulations listen to."""
+        for control in self._controls:
+            for kind in (TopicKind.CONTROL, TopicKind.SET_GAINS):
+                topic = topic_frame(kind, control.index.key)
+                if topic is not None:
+                    yield topic
+
+    def obey(self, commands: deque[StreamedCommand]) -> bool:
+        """Carry out and remove commands, which outside live mode have no effect.
+
+        Returns:
+            False when physics is busy: the commands are still there.
+        """
+        engine = self._engine
+        if engine.mode not in _LIVE:  # then physics may legally keep the lock for hours
+            commands.clear()
+            return True
+        if not engine.lock.inner.acquire(timeout=LOCK_S):
+            return False
+        try:
+            while commands:
+                command = commands.popleft()
+                if engine.mode not in _LIVE:
+                    continue
+                if isinstance(command, ControlPayload):
+                    self._actuators.stage(command)
+                else:
+                    self._set_gains(*command)
+        finally:
+            engine.lock.inner.release()
+        return True
+
+    def _set_gains(self, key: str, gains: dict[str, JointGains]) -> None:
+        try:
+            with self._engine.commanding() as articulations:
+                articulations.configure_controller(key, gains_by_parameter(gains))
+        except Refusal as refusal:
+            logger.debug("gains streamed to '%s' have no effect: %s", key, refusal.message)
+
+    # On the physics thread, under the engine's lock.
+
+    def _capture(self) -> None:
+        engine = self._engine
+        live = engine.mode in _LIVE
+        self._live_ticks += live
+        full = self.full_wanted or (self._memory is not None and self._memory.wants_state())
+        full = full and (live or self._dialect.steps_published)
+        shown = full or (live and bool(self._wanted_rows))
+        if not shown and not (live and self._info_wanted and self._live_ticks >= self._info_due):
+            return
+        self._hand_over(
+            self,
+            Tick(
+                live=self._live_ticks if live else 0,
+                time=engine.time,
+                step=engine.step_count,
+                wall_time=wall_clock(),
+                arrays=[array.copy() for array in self._sources] if shown else [],
+                twists=[_values(control.twist) for control in self._controls] if shown else [],
+                full=full,
+            ),
+        )
+
+
+def _with_own_twist(control: ArticulationControl) -> ArticulationControl:
+    mirrored = copy.copy(control)
+    mirrored.twist = Twist()
+    return mirrored
+
+
+def _values(twist: Twist) -> tuple[float, float, float, int]:
+    return twist.vx, twist.vy, twist.yaw_rate, twist.actions
+
+
+def _arrays(scene: CompiledScene, data: mujoco.MjData) -> list[Floats]:
+    """Return views of everything the messages show, never an empty list."""
+    arrays = [data.qpos, data.qvel, data.qacc, data.ctrl, data.act, data.sensordata]
+    return [*arrays, data.xpos, data.xquat] if scene.entities else arrays
+
+
+def next_info(tick: int) -> int:
+    """Return the first live tick after `tick` that brings the info messages."""
+    every = INFO_EVERY if tick < INFO_START_TICKS else INFO_LATER_EVERY
+    return (tick // every + 1) * every

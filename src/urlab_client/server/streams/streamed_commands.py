@@ -1,0 +1,77 @@
+"""Commands that arrive on the control socket, and the actuators they are for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Final, TypeAlias
+
+import mujoco
+import numpy as np
+
+from urlab_client._mujoco import actuator_count, control_counts, control_starts
+from urlab_client.protocol.control_messages import (
+    ActuatorInfo,
+    CameraEndpoint,
+    ControlPayload,
+    JointGains,
+    decode_gains,
+)
+from urlab_client.server.physics.controllers import ArticulationControl
+
+__all__ = ["Actuators", "StreamedCommand", "read_commands"]
+NO_LIMIT: Final = 100.0
+"""What stands for the control range of an actuator that has none."""
+
+
+class Actuators:
+    """The actuators of all articulations by their ids in the model."""
+
+    def __init__(self, model: mujoco.MjModel, controls: Iterable[ArticulationControl]) -> None:
+        self._model = model
+        self._set_points = [control.set_points for control in controls]
+        self._owner = np.full(actuator_count(model), -1, dtype=np.intp)
+        self._place = np.zeros(actuator_count(model), dtype=np.intp)
+        for number, control in enumerate(controls):
+            actuators = control.index.actuators
+            widths = control_counts(model)[actuators]
+            self._owner[actuators] = number
+            self._place[actuators] = np.cumsum(widths) - widths
+
+    def stage(self, command: ControlPayload) -> None:
+        """Store set-points; unknown ids are ignored, an actuator of several inputs gets its first."""
+        known = (command.actuator_ids >= 0) & (command.actuator_ids < len(self._owner))
+        ids, values = command.actuator_ids[known], command.values[known]
+        owners = self._owner[ids]
+        for number, set_points in enumerate(self._set_points):
+            mine = owners == number
+            set_points.network[self._place[ids[mine]]] = values[mine]
+
+    def info(self, control: ArticulationControl, cameras: tuple[CameraEndpoint, ...]) -> ActuatorInfo:
+        """Return what the info socket says about an articulation."""
+        model, index = self._model, control.index
+        first = control_starts(model)[index.actuators]
+        limited = model.actuator_ctrllimited[first].astype(bool)
+        ranges = model.actuator_ctrlrange[first].astype(np.float32).astype(np.float64)
+        return ActuatorInfo(
+            robot=index.key,
+            names=tuple(f"{index.prefix}{name}" for name in index.actuator_names),
+            ids=index.actuators,
+            mins=np.where(limited, ranges[:, 0], -NO_LIMIT),
+            maxs=np.where(limited, ranges[:, 1], NO_LIMIT),
+            cameras=cameras,
+        )
+
+
+StreamedCommand: TypeAlias = ControlPayload | tuple[str, dict[str, JointGains]]
+
+
+def read_commands(frames: list[bytes]) -> Iterator[StreamedCommand]:
+    """Read a message of the control socket; a frame without a partner is ignored.
+
+    Raises:
+        ProtocolError: A payload is malformed.
+    """
+    for topic, payload in zip(frames[::2], frames[1::2], strict=False):
+        owner, is_gains, _ = topic.partition(b"/set_gains")
+        where = topic.decode(errors="replace")
+        yield (owner.decode(), decode_gains(payload, where)) if is_gains else ControlPayload.decode(payload, where)

@@ -1,0 +1,154 @@
+"""The simulated server's beta over a raw socket: owners of robots and the driver lease, statement by statement."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from beta_bench import ME, OTHER, Bench, Clock
+
+from urlab_client.server.lease import DriverLease
+
+# Claims.
+
+
+def test_nothing_is_claimed_at_first(playing: Bench) -> None:
+    """Beta statements 9, 10 and 11."""
+    before = playing.step()["time"]
+    assert playing.refused("step", **playing.drive()) == ("not_control_owner", "(unclaimed)")
+    assert playing.refused("step", per_articulation={"arm_a": {"ctrl": []}}) == ("not_control_owner", "(unclaimed)")
+    for harmless in ({}, {"arm_a": {}}, {"arm_a": {"control_mode": "raw"}}):
+        playing.step(per_articulation=harmless)
+    assert playing.step()["time"] == pytest.approx(before + 4 * 0.002, abs=0.02)
+
+
+@pytest.mark.parametrize("name", ["arm_a", "arm a", "ARM_A", None])
+def test_a_robot_is_claimed_by_any_of_its_names(playing: Bench, name: str | None) -> None:
+    """Beta statements 12 and 13."""
+    reply = playing.claim(name or playing.a)
+    assert reply == {"op": "claim_control_ok", "articulation": playing.a, "owner": ME, "ttl_s": 0.0}
+
+
+def test_one_owner_at_a_time(playing: Bench) -> None:
+    """Beta statements 14 and 15."""
+    playing.claim()
+    assert playing.refused("claim_control", articulation="arm_a", control_owner=OTHER) == ("control_claimed", ME)
+    playing.step(**playing.drive())
+    assert playing.claim(owner=OTHER, force=True)["owner"] == OTHER
+    assert playing.refused("step", **playing.drive()) == ("not_control_owner", OTHER)
+    assert playing.claim(owner=OTHER, ttl_s=5)["ttl_s"] == 5
+
+
+def test_a_claim_with_a_limit_ends_in_silence(playing: Bench) -> None:
+    """Beta statement 16."""
+    clock = Clock()
+    playing.core.play.running().claims._clock = clock
+    playing.claim(ttl_s=0.5)
+    for _ in range(10):
+        clock.now += 0.2
+        playing.step(**playing.drive())
+    clock.now += 0.7
+    playing.step()
+    assert playing.refused("step", **playing.drive()) == ("not_control_owner", "(unclaimed)")
+    playing.claim(owner=OTHER)
+    clock.now += 1e9
+    assert playing.refused("step", **playing.drive()) == ("not_control_owner", OTHER), "without a limit it stays"
+
+
+def test_all_or_nothing_of_a_step(playing: Bench) -> None:
+    """Beta statements 17 and 18."""
+    playing.claim()
+    playing.step(**playing.drive(0.25))
+    both = {"arm_a": {"ctrl": [0.75]}, playing.b: {"ctrl": [0.75]}}
+    assert playing.refused("step", per_articulation=both, control_owner=ME) == ("not_control_owner", "(unclaimed)")
+    assert playing.step()["arts"]["arm_a"]["ctrl"] == [0.25]
+    assert playing.refused("step", per_articulation={"nobody": {"ctrl": [1]}}) == ("not_control_owner", "(unclaimed)")
+    playing.step(per_articulation={"nobody": {"control_mode": "raw"}})
+
+
+def test_releasing(playing: Bench) -> None:
+    """Beta statement 19."""
+    playing.claim()
+    released = playing.wire.ask("release_control", articulation="arm a", control_owner=ME)
+    assert released["articulation"] == playing.a
+    again = playing.refused("release_control", articulation="arm_a", control_owner=ME)
+    assert again == ("not_control_owner", "(unclaimed)")
+    assert playing.refused("release_control", articulation="nobody")[0] == "unknown_articulation"
+    assert playing.refused("release_control")[0] == "missing_field"
+
+
+def test_the_other_writes_that_need_an_owner(playing: Bench) -> None:
+    """Beta statements 20, 21 and 89."""
+    twist = {"articulation": "arm_a", "linear": [0.1, 0, 0]}
+    assert playing.refused("set_twist", **twist)[0] == "not_control_owner"
+    assert playing.refused("set_twist", articulation="nobody")[0] == "unknown_articulation"
+    qpos = {"target": "arm_a", "target_by": "actor_name", "qpos": [0.0]}
+    assert playing.refused("set_qpos", **qpos)[0] == "not_control_owner"
+    assert playing.refused("set_qpos", target="nobody", qpos=[0])[0] == "unknown_articulation"
+    assert playing.refused("set_control_source", source="moon", articulation="arm_a")[0] == "bad_value"
+    assert playing.refused("set_control_source", source="ui", articulation="arm_a")[0] == "not_control_owner"
+    playing.wire.ask("set_control_source", source="zmq")
+    playing.claim()
+    playing.wire.ask("set_twist", **twist, control_owner=ME)
+    assert playing.refused("set_qpos", **qpos, control_owner=ME)[0] == "dim_mismatch"
+    assert playing.refused("set_control_source", source="zmq", control_owner=OTHER) == ("not_control_owner", ME)
+    playing.wire.ask("set_control_source", source="zmq", control_owner=ME)
+
+
+def test_what_needs_no_owner(playing: Bench) -> None:
+    """Beta statement 22."""
+    playing.wire.ask("reset")
+    playing.wire.ask("forward")
+    playing.wire.ask("set_user_channels", scene={"door": True})
+    playing.wire.ask("set_mode", mode="puppet")
+    playing.step(qpos=[0.0] * 16, time=0.5)
+
+
+def test_a_claim_ends_with_play_and_belongs_to_its_name(playing: Bench) -> None:
+    """Beta statements 23 and 24."""
+    playing.claim()
+    gated = {"per_articulation": {"arm_a": {"ctrl": [0.25]}}}
+    assert playing.refused("step", **gated) == ("not_control_owner", ME)
+    playing.play()
+    assert playing.refused("step", **playing.drive()) == ("not_control_owner", "(unclaimed)")
+    playing.wire.ask("claim_control", articulation="arm_a")
+    playing.step(**gated)
+
+
+# Leases.
+
+
+def test_the_driver_lease(bench: Bench) -> None:
+    """Beta statements 26, 27, 28 and 93."""
+    bench.wire.ask("stop_pie")
+    lease = bench.wire.ask("acquire_lease", owner="pool-3")
+    assert lease["ttl_s"] == 60
+    assert re.fullmatch(r"[0-9A-F]{8}(-[0-9A-F]{4}){3}-[0-9A-F]{12}", lease["lease_id"])
+    busy = bench.raw("acquire_lease", owner="pool-3")
+    assert (busy["code"], busy["lease_id"]) == ("busy", lease["lease_id"])
+    bench.play()
+    assert bench.wire.hello()["instance"]["busy"] is True
+    bench.step()
+    assert bench.refused("release_lease", lease_id="x")[0] == "bad_request"
+    bench.wire.ask("release_lease", lease_id=lease["lease_id"])
+    assert bench.wire.hello()["instance"]["busy"] is False
+    assert bench.refused("release_lease", lease_id=lease["lease_id"])[0] == "bad_request"
+    bench.wire.ask("acquire_lease", ttl_s=0)
+    bench.wire.ask("acquire_lease", ttl_s=0)
+
+
+def test_a_lease_ends_in_silence(playing: Bench) -> None:
+    """Beta statement 29. Every request but a few is a sign of life, whoever sends it and whatever comes of it."""
+    clock = Clock()
+    playing.core.lease = DriverLease(clock)
+    playing.wire.ask("acquire_lease", ttl_s=10)
+    for sign in ({"op": "step"}, {"op": "forward", "session_id": "gone"}, {"op": "nonsense"}):
+        clock.now += 9
+        playing.wire.raw({"session_id": playing.wire.session_id, **sign})
+    clock.now += 9
+    assert playing.refused("acquire_lease")[0] == "busy"
+    clock.now += 2
+    playing.wire.raw({"op": "meta"})
+    playing.wire.hello()
+    playing.wire.ask("pie_status")
+    playing.wire.ask("acquire_lease", ttl_s=0)

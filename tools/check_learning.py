@@ -1,0 +1,215 @@
+"""Drives the environments with the learning libraries that users bring: Stable-Baselines3, AsyncVectorEnv, RLlib.
+
+    pip install stable-baselines3 'ray[rllib]'
+    python tools/check_learning.py            # or the names of some checks
+    python tools/check_learning.py lerobot --lerobot-python ENVIRONMENT/bin/python
+
+The libraries are too large for the suite. The suite asserts what they need without them; this says whether they agree.
+It prints a line for each check and exits with 1 when one failed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections.abc import Callable
+from functools import partial
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+import urlab_client.integrations.gym  # registers the environments  # noqa: F401
+from urlab_client.integrations.record import read_run, record
+from urlab_client.integrations.record.export import write_lerobot
+
+__all__ = ["main"]
+
+ARM = "urlab/Arm-v0"
+
+
+def sb3_check_env() -> str:
+    """Stable-Baselines3's own checker finds nothing to refuse."""
+    check_env: Any = import_module("stable_baselines3.common.env_checker").check_env
+    cases: list[dict[str, Any]] = [{}, {"space_mode": "dict"}, {"space_mode": "dict", "cameras": ["arm/wrist"]}]
+    for options in cases:
+        env: Any = gymnasium.make(ARM, **options)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # advice: normalised spaces, flat ones
+            if options:
+                env = gymnasium.wrappers.FlattenObservation(env)
+            check_env(env, skip_render_check=True)
+        env.close()
+    return "flat, dict and camera observations"
+
+
+def sb3_ppo() -> str:
+    """`PPO("MlpPolicy", "urlab/Arm-v0")` learns for a moment, is saved, loaded and predicts the same."""
+    ppo: Any = import_module("stable_baselines3").PPO
+    model = ppo("MlpPolicy", ARM, n_steps=128, batch_size=64, n_epochs=2, seed=1, device="cpu")
+    model.learn(256)
+    observation = model.get_env().reset()
+    action, _ = model.predict(observation, deterministic=True)
+    model.get_env().close()
+    if action.shape != (1, 7):
+        raise AssertionError(action.shape)
+    return "256 steps"
+
+
+def gym_async() -> str:
+    """`AsyncVectorEnv` runs two environments in processes of its own, and each equals a single one."""
+    envs = gymnasium.make_vec(ARM, num_envs=2, vectorization_mode="async")
+    single = gymnasium.make(ARM)
+    rng = np.random.default_rng(0)
+    observations, infos = envs.reset(seed=3)
+    alone, _ = single.reset(seed=4)
+    for _ in range(5):
+        action = rng.uniform(-0.5, 0.5, envs.action_space.shape).astype(np.float32)
+        observations, *_, infos = envs.step(action)
+        alone, *_ = single.step(action[1])
+    if not np.array_equal(observations[1], alone):
+        raise AssertionError("environment 1 differs from a single one with its seed")
+    envs.close()
+    single.close()
+    return f"two processes, sim_time {infos['sim_time'].tolist()}"
+
+
+def rllib() -> str:
+    """RLlib's PPO samples with one remote runner and makes an update."""
+    ray: Any = import_module("ray")
+    config: Any = import_module("ray.rllib.algorithms.ppo").PPOConfig
+    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False)
+
+    def make(_: Any) -> gymnasium.Env[Any, Any]:
+        import_module("urlab_client.integrations.gym")  # in the runner's process, too
+        return gymnasium.make(ARM)
+
+    try:
+        import_module("ray.tune.registry").register_env("arm", make)
+        algorithm = (
+            config()
+            .environment("arm")
+            .env_runners(num_env_runners=1, rollout_fragment_length=200)
+            .training(train_batch_size_per_learner=200, minibatch_size=64, num_epochs=1)
+            .build_algo()
+        )
+        result = algorithm.train()
+        algorithm.stop()
+    finally:
+        ray.shutdown()
+    steps = result["env_runners"]["num_env_steps_sampled_lifetime"]
+    if steps < 200:
+        raise AssertionError(f"{steps} steps sampled")
+    return f"{steps:.0f} steps by a remote runner, mean return {result['env_runners']['episode_return_mean']:.0f}"
+
+
+def lerobot(python: str) -> str:
+    """LeRobot reads back what was driven: each observation with the action taken at it, and its picture."""
+    rng = np.random.default_rng(1)
+    driven: list[tuple[int, Any, Any, Any]] = []
+    with tempfile.TemporaryDirectory() as temporary:
+        work = Path(temporary)
+        env = gymnasium.make(
+            ARM, space_mode="dict", observations=["qpos", "sensors"], cameras=["arm/overview"], n_substeps=10
+        )
+        client = env.unwrapped.client
+        with record(client, work / "run.mcap", cameras=["arm/overview"], camera_hz=50, image_format="png"):
+            for episode, steps in enumerate((30, 20)):
+                seen, _ = env.reset(seed=episode)
+                for _ in range(steps):
+                    action = {"arm": rng.uniform(-0.3, 0.3, 7).astype(np.float32)}
+                    driven.append((episode, seen["arm"]["qpos"], action["arm"], seen["cameras"]["arm/overview"]))
+                    seen, *_ = env.step(action)
+        env.close()
+        run = read_run(work / "run.mcap")
+        for video in (True, False):
+            folder = work / ("video" if video else "images")
+            written = write_lerobot(run, folder, python=python, task="wave", video=video)
+            if written != len(driven):
+                raise AssertionError(f"{written} frames of {len(driven)} actions")
+            subprocess.run([python, "-c", READ_BACK, str(folder), str(work / "back.npz")], check=True)  # noqa: S603
+            with np.load(work / "back.npz") as back:
+                about = json.loads(str(back["about"]))
+                if about["fps"] != 50 or about["robot_type"] != "arm" or set(about["tasks"]) != {"wave"}:
+                    raise AssertionError(about)
+                for name, column in (("episode", 0), ("state", 1), ("action", 2)):
+                    if not np.array_equal(back[name], np.array([row[column] for row in driven], back[name].dtype)):
+                        raise AssertionError(f"{name} differs from what was driven")
+                pictures = np.array([row[3][..., :3] for row in driven])
+                error = np.abs(back["pictures"].astype(int) - pictures).mean(axis=(1, 2, 3))
+                if error.max() > (4.0 if video else 0.0):
+                    raise AssertionError(f"pictures differ by {error.max():.1f} of 255")
+    return f"{len(driven)} frames of 2 episodes equal what was driven, with LeRobot {about['version']}"
+
+
+READ_BACK = """
+import json, sys
+import numpy as np
+from lerobot import __version__
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+data = LeRobotDataset("local/x", root=sys.argv[1])
+rows = [data[i] for i in range(len(data))]
+np.savez(
+    sys.argv[2],
+    episode=np.array([int(row["episode_index"]) for row in rows]),
+    state=np.array([row["observation.state"].numpy() for row in rows]),
+    action=np.array([row["action"].numpy() for row in rows]),
+    pictures=np.array(
+        [
+            np.rint(row["observation.images.arm.overview"].numpy() * 255).transpose(1, 2, 0).astype(np.uint8)
+            for row in rows
+        ]
+    ),
+    about=json.dumps(
+        {
+            "fps": data.fps,
+            "robot_type": data.meta.robot_type,
+            "tasks": [row["task"] for row in rows],
+            "version": __version__,
+        }
+    ),
+)
+"""
+
+CHECKS: dict[str, tuple[str, Callable[[], str]]] = {
+    "sb3-check-env": ("stable-baselines3", sb3_check_env),
+    "sb3-ppo": ("stable-baselines3", sb3_ppo),
+    "gym-async": ("gymnasium", gym_async),
+    "rllib": ("ray", rllib),
+}
+
+
+def main() -> int:
+    """Run the checks; return the exit status."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("checks", nargs="*", choices=[[], "lerobot", *CHECKS], help="all but lerobot by default")
+    parser.add_argument("--lerobot-python", metavar="PATH", help="an interpreter that has LeRobot 0.6")
+    arguments = parser.parse_args()
+    if "lerobot" in arguments.checks:
+        if arguments.lerobot_python is None:
+            parser.error("lerobot needs --lerobot-python")
+        CHECKS["lerobot"] = ("urlab-client", partial(lerobot, arguments.lerobot_python))
+    failed = 0
+    for name in arguments.checks or list(CHECKS):
+        package, check = CHECKS[name]
+        started = time.perf_counter()
+        try:
+            said = check()
+        except Exception:  # noqa: BLE001  # whatever a library makes of it is what is to be seen
+            traceback.print_exc()
+            said, failed = "FAILED", failed + 1
+        print(f"{name:14} {package} {version(package):10} {time.perf_counter() - started:5.1f} s  {said}")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
