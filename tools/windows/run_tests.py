@@ -24,6 +24,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULT = re.compile(r"(tests/\S.*?)(?: (PASSED|FAILED|ERROR|SKIPPED)\b.*| \++ Timeout \++)?")
+STAYING = "import ctypes, time; ctypes.windll.user32.GetDesktopWindow(); time.sleep(1e6)"
 TEST_S = 200
 FILE_S = 1200
 
@@ -116,7 +117,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Run tests on Windows' Python under Wine.")
     parser.add_argument("interpreter", type=Path)
     parser.add_argument("python")
-    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--logs", type=Path, metavar="FOLDER", help="keep the output there")
     parser.add_argument("paths", nargs="+", metavar="PATH")
     arguments = parser.parse_args()
@@ -165,14 +166,14 @@ def prefix(folder: Path, number: int) -> Path:
         shutil.copytree(original, path, symlinks=True)
     environment = {**os.environ, "WINEPREFIX": str(path), "WINEDEBUG": "-all"}
     subprocess.run(["nice", "-n", "5", "wineserver", "-p"], env=environment, check=False)  # noqa: S607
-    # Wine's services start with the first program and keep its output open; a test run's would not end.
-    subprocess.run(
-        ["wine", "cmd", "/c", "exit"],  # noqa: S607
+    # Wine's services, and the desktop with the first window, start with the first program that asks for them and keep
+    # its output open; a test's would not end. So this one comes first, and stays.
+    subprocess.Popen(  # noqa: S603
+        ["wine", str(folder / "py" / "python.exe"), "-c", STAYING],  # noqa: S607
         env=environment,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
-        check=False,
     )
     return path
 

@@ -40,6 +40,7 @@ from urlab_client.aio.transport.curve import client_keys, is_local
 from urlab_client.aio.transport.server_regions import SharedMemoryRegions
 from urlab_client.aio.transport.shm import ShmTransport
 from urlab_client.protocol.base import Reply, Request
+from urlab_client.protocol.client_types import ClientConfig, Diagnosis, Resync
 from urlab_client.protocol.enums import CameraTiming, ObservationLevel, StepMode, Transport
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.runtime import SetMode
@@ -47,7 +48,6 @@ from urlab_client.protocol.messages.session import Hello, MetaOk, OpInfo, Reset,
 from urlab_client.protocol.messages.session import Meta as MetaRequest
 from urlab_client.protocol.messages.streams import ClientEvent, RowSample, StateSnapshot, StreamPolicy
 from urlab_client.protocol.topics import TopicKind
-from urlab_client.protocol.types import ClientConfig, Diagnosis, Resync
 
 __all__ = ["SESSION_LEVEL", "SessionLevel", "URLabClient"]
 

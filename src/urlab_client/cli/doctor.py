@@ -21,9 +21,9 @@ from urlab_client.cli._arguments import (
     seconds,
 )
 from urlab_client.cli._mujoco import import_mujoco
+from urlab_client.protocol.client_types import Diagnosis
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import URLabError
-from urlab_client.protocol.types import Diagnosis
 
 __all__ = ["add_parser", "run"]
 

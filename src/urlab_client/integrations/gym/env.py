@@ -136,7 +136,8 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         Raises:
             URLabError: The server cannot be reached, or has no articulation.
         """
-        client = URLabClient(with_model_options(address), **{"step_mode": "direct", **client_options})
+        wanted: dict[str, Any] = {"step_mode": "direct", **client_options}
+        client = URLabClient(with_model_options(address), **wanted)
         try:
             client.discover()
             return cls(client, owns_client=True, **options)
