@@ -147,6 +147,13 @@ def test_an_address_that_is_none_is_one_line_that_says_so(
     assert err.startswith(f"urlab {name}: 'gopher://lab' is not a valid address; write tcp://HOST")
 
 
+def test_a_terminal_without_the_characters_of_a_file_name_shows_their_numbers(tmp_path: Path) -> None:
+    done = urlab("keys", "new", "ключ", cwd=tmp_path, environment={"PYTHONIOENCODING": "cp1252"})
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith(r"\u043a\u043b\u044e\u0447.key")
+    assert (tmp_path / "ключ.key").is_file()
+
+
 def test_the_package_runs_as_the_command(tmp_path: Path) -> None:
     assert refusal(urlab("serve", cwd=tmp_path)).startswith("urlab serve: ")
 

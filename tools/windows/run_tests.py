@@ -99,7 +99,7 @@ def run_rest(outcome: Outcome, interpreter: Path, prefix: Path, log: Path) -> tu
                 text=True,
                 errors="replace",
             ) as process,
-            log.open("a", encoding="utf-8") as lines,
+            log.open("a", buffering=1, encoding="utf-8") as lines,
         ):
             assert process.stdout is not None  # noqa: S101
             met = 0

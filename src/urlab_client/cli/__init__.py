@@ -51,6 +51,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Arguments without the program's name; default those of this process.
     """
     argv = sys.argv[1:] if argv is None else argv
+    if (reconfigure := getattr(sys.stdout, "reconfigure", None)) is not None:
+        reconfigure(errors="backslashreplace")  # not every terminal has the characters of every file's name
     if not argv:
         print(_parser().format_help(), end="")
         return 0
