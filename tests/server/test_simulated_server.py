@@ -411,7 +411,7 @@ def test_edited_models_are_read_again(tmp_path: Path, connect: Connect) -> None:
         ("nothing.xml", "does not exist"),
         ("broken.xml", "MuJoCo rejects"),
         ("nothing.json", "nothing.json"),
-        ("robot", "neither a file nor a bundled model"),
+        ("robot", "neither a file nor a bundled robot"),
     ],
 )
 def test_models_that_cannot_be_used(models: Path, name: str, text: str) -> None:
