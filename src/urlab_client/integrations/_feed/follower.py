@@ -20,6 +20,7 @@ from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import ClientClosed, StreamOverflow, URLabError
 from urlab_client.protocol.messages.session import HelloOk, ResetOk, StateReply, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
+from urlab_client.protocol.names import did_you_mean
 
 __all__ = ["Follower"]
 
@@ -95,6 +96,11 @@ class Follower:
         if unknown:
             raise KeyError(unknown)
         return self._current()
+
+    @property
+    def cameras(self) -> list[str]:
+        """Names of the cameras whose pictures are wanted and that the scene has; empty before `check`."""
+        return [] if self._scene is None else [camera.name for camera in self._scene.cameras.values()]
 
     def start(
         self,
@@ -193,7 +199,10 @@ class Follower:
             else [n for n in self._wanted_cameras if not self._state.objects.camera(n)]
         )
         there = ", ".join(self._every_camera()) or "none"
-        return f"no camera {', '.join(map(repr, missing))}; there are: {there}" if missing else ""
+        if not missing:
+            return ""
+        suggested = did_you_mean(missing[0], self._every_camera()).strip()
+        return f"no camera {', '.join(map(repr, missing))}; {f'{suggested} ' if suggested else ''}there are: {there}"
 
     def _views(self) -> list[tuple[str, URLabCameraView]]:
         every = self._every_camera()

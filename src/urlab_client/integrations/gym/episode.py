@@ -15,6 +15,7 @@ from urlab_client.integrations.gym.starts import ResetNoise, noise_of
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.enums import CameraMode, ObservationLevel, StepMode
 from urlab_client.protocol.errors import URLabError
+from urlab_client.protocol.messages.session import StepOk
 from urlab_client.protocol.pixels import Pixels
 
 __all__ = ["EnvEpisode", "first_camera"]
@@ -93,6 +94,7 @@ class EnvEpisode:
         self._model = model
         fields = fields_of(observations)
         self.mapping = SpaceMapping(model, list(client.articulations), fields, space_mode)
+        self._sensors = {key: [*self.mapping.layout(key).sensors] for key in self.mapping.keys}
         minimal = set(fields) <= set(LEVELS["minimal"])
         self.observation_space = self._with_cameras(cameras)
         self._observed_cameras = tuple(cameras)
@@ -124,11 +126,11 @@ class EnvEpisode:
         """
         for key, values in self.mapping.set_points(action).items():
             self.client.articulations[key].ctrl_array[:] = values
-        await self.client.step(
+        reply = await self.client.step(
             self._n_substeps, include_cameras=dict.fromkeys(self._cameras, "sync") or False, observations=self._level
         )
         self._take_frames()
-        return self._observe()
+        return self._observe(reply)
 
     def _noisy_positions(self, rng: np.random.Generator) -> dict[str, dict[str, float]]:
         """Return the present joint positions with noise on them."""
@@ -168,8 +170,18 @@ class EnvEpisode:
                 )
             self.frames[name] = frame
 
-    def _observe(self) -> Observation:
-        observation = self.mapping.observe(self._read)
+    def _observe(self, reply: StepOk | None = None) -> Observation:
+        """Return the present observation; what a step has just brought is taken from its reply."""
+        states = {} if reply is None else reply.per_articulation
+
+        def read(key: str, field: Field) -> Floats:
+            state = states.get(key)
+            value: Any = None if state is None else getattr(state, field)
+            if value is None:
+                return self._read(key, field)
+            return np.array([n for name in self._sensors[key] for n in value[name]]) if field == "sensors" else value
+
+        observation = self.mapping.observe(read)
         if self._observed_cameras:
             observation["cameras"] = {name: self._shown(name) for name in self._observed_cameras}
         return observation
@@ -205,7 +217,7 @@ class EnvEpisode:
                 return articulation.act_array
             case "sensors":
                 readings = articulation.get_sensors()
-                found = [np.atleast_1d(readings[name]) for name in self.mapping.layout(key).sensors]
+                found = [np.atleast_1d(readings[name]) for name in self._sensors[key]]
                 return np.concatenate(found) if found else np.zeros(0)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import warnings
 from collections.abc import Callable, Sequence
@@ -20,6 +21,8 @@ from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
 
 __all__ = ["AsyncRecorder", "Recorder", "record"]
+
+log = logging.getLogger("urlab_client.record")
 
 _MIB = 1 << 20
 _LIVE_ITEMS = 10_000
@@ -65,6 +68,12 @@ class AsyncRecorder:
         """Whether writing has failed; leaving the block raises the reason."""
         return self._writer is not None and self._writer.error is not None
 
+    @property
+    def without_pictures(self) -> list[str]:
+        """Cameras to record that have no picture in the file up to now."""
+        there = frozenset[str]() if self._writer is None else self._writer.cameras
+        return [name for name in self._follower.cameras if name not in there]
+
     async def __aenter__(self) -> Self:
         if self._writer is not None:
             raise URLabError("A recorder records once.", hint="Call record() again.")
@@ -91,7 +100,13 @@ class AsyncRecorder:
                 raise  # else it has been logged, and what ends the block matters more
             return
         stats = writer.stats
-        if stats.dropped_states or stats.dropped_frames:
+        if missing := self.without_pictures:
+            log.warning(
+                "%s: no picture of %s came. A server without OpenGL sends none; its own log says so.",
+                self._path,
+                ", ".join(missing),
+            )
+        elif stats.dropped_states or stats.dropped_frames:
             lost = f"{stats.dropped_states} states and {stats.dropped_frames} pictures"
             warnings.warn(f"{self._path}: {lost} were lost, see /recording/gaps in it.", stacklevel=2)
 
@@ -119,6 +134,11 @@ class Recorder(BlockingTwin[AsyncRecorder]):
     def failed(self) -> bool:
         """Whether writing has failed; leaving the block raises the reason."""
         return self._aio.failed
+
+    @property
+    def without_pictures(self) -> list[str]:
+        """Cameras to record that have no picture in the file up to now."""
+        return self._aio.without_pictures
 
 
 @overload

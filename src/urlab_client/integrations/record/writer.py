@@ -151,6 +151,11 @@ class WriterThread:
             file_bytes=file.written if file else 0,
         )
 
+    @property
+    def cameras(self) -> frozenset[str]:
+        """Names of the cameras that have a picture in the file."""
+        return frozenset(self._sink.cameras) if self._sink else frozenset()
+
     def put(self, item: State | CameraPicture) -> None:
         """Queue an item, or drop it: pictures give way at half the queue's size, so that states find room.
 
@@ -288,6 +293,7 @@ class _Sink:
     options: WriterOptions
     states: int = 0
     frames: int = 0
+    cameras: set[str] = field(default_factory=set[str])
     _clock: SampleClock = field(default_factory=SampleClock)
     _schemas: dict[type[Struct], int] = field(default_factory=dict[type[Struct], int])
     _topics: dict[tuple[str, str], _Topic] = field(default_factory=dict[tuple[str, str], _Topic])
@@ -393,6 +399,7 @@ class _Sink:
         self._add(topic, picture_message(item, stamp, quality), now, item.wall_ns, metadata)
         self._add(f"{topic}/calibration", calibration(camera, stamp), now, item.wall_ns, {})
         self.frames += 1
+        self.cameras.add(camera.name)
 
     def _use(self, scene: SceneMessages) -> None:
         self._scene = scene
