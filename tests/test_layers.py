@@ -81,6 +81,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "aio": (
         "event_loop",
         "deadline",
+        "session_level",
         "mutex",
         "stream_buffer",
         "transport",
