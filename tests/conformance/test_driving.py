@@ -247,9 +247,7 @@ async def test_observation_levels(connect: Any, serve: Any) -> None:
         reply = await client.step()
         assert reply.per_articulation[robot.prefix].sensors is None, "one step's level must not outlive it"
         reply = await client.step(observations="standard")
-        assert reply.per_articulation[robot.prefix].sensors is not None, (
-            "the default is the session's level, not its own"
-        )
+        assert reply.per_articulation[robot.prefix].sensors is not None, "a level that is named is not the default"
         with pytest.raises(ValueError, match="everything"):
             await client.step(observations="everything")
 

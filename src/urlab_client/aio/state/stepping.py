@@ -167,8 +167,8 @@ def _pictures(state: SimState, cameras: Cameras, n_steps: int) -> StepPictures |
         return None
     asked: bool | dict[str, str | None]
     asked = cameras if isinstance(cameras, bool) else {name: str(CameraTiming(how)) for name, how in cameras.items()}
-    for observer in state.observers:
-        asked = observer.wanted_pictures(asked, n_steps)
+    if state.observers:
+        asked = state.objects.with_cameras(asked, state.observed_cameras(n_steps))
     return StepPictures(state, asked) or None
 
 
