@@ -115,9 +115,13 @@ def acting_kind(model: mujoco.MjModel, actuator: int) -> str:
     import mujoco  # noqa: PLC0415
 
     element = model.actuator(actuator)
-    kinds = mujoco.mjtDyn, mujoco.mjtGain, mujoco.mjtBias, mujoco.mjtTrn
-    values = (getattr(model, f"actuator_{name}")[actuator] for name in ("dyntype", "gaintype", "biastype", "trntype"))
-    return _kind_by_parameters(*(kind(int(value)) for kind, value in zip(kinds, values, strict=True)), element)
+    return _kind_by_parameters(
+        mujoco.mjtDyn(int(model.actuator_dyntype[actuator])),
+        mujoco.mjtGain(int(model.actuator_gaintype[actuator])),
+        mujoco.mjtBias(int(model.actuator_biastype[actuator])),
+        mujoco.mjtTrn(int(model.actuator_trntype[actuator])),
+        element,
+    )
 
 
 def servo_damping(model: mujoco.MjModel, actuator: int) -> float:

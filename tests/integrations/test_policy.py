@@ -14,6 +14,7 @@ import pytest
 from waiting import until
 
 from urlab_client import URLabClient, URLabError, aio
+from urlab_client._installation import install_command
 from urlab_client.integrations import policy as policies
 from urlab_client.integrations.policy import (
     Policy,
@@ -151,7 +152,7 @@ def test_files_that_are_not_there_are_named(tmp_path: Path) -> None:
 def test_the_extra_is_named_when_it_is_missing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "it.toml").write_text(WALK)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ImportError, match=re.escape("pip install 'urlab-client[onnx]'")):
+    with pytest.raises(ImportError, match=re.escape(install_command("onnx"))):
         policies.load(tmp_path / "it.onnx")
 
 

@@ -16,6 +16,7 @@ class ClientObserver:
 
     Its methods are called on the client's event loop, which a blocking client runs in the calling thread or in one of
     its own. So they must be quick and must not call the client's ops; what they raise is logged and changes nothing.
+    `ready` alone may take its time.
     """
 
     def on_handshake(self) -> None:
@@ -28,6 +29,12 @@ class ClientObserver:
             state: The reply to a `step()` (`StepOk`, with its pictures in `cameras`), to a `reset()` (`ResetOk`) or to
                 a `forward()`, or in live mode the newest snapshot. Its arrays go on to the caller of the op, who may
                 write to them: copy what is kept.
+        """
+
+    async def ready(self) -> None:
+        """Return when there is room for a further state: a step in `direct` or `puppet` mode waits for that.
+
+        It must end by itself; cancelling the step cancels it, and what it raises, the step raises.
         """
 
     def step_cameras(self, n_steps: int) -> Mapping[str, str | CameraTiming]:

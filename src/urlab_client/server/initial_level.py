@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from urlab_client.protocol.errors import URLabError
-from urlab_client.server.assets.bundled_robots import bundled_models
+from urlab_client.server.assets.bundled_robots import bundled_models, unknown_model
 from urlab_client.server.editor.world import EditorWorld
 
 __all__ = ["ModelError", "is_level", "populate"]
@@ -46,7 +46,7 @@ def _place(world: EditorWorld, model: str, sources: dict[str, str], edge: float 
     """
     bundled = bundled_models()
     if not Path(model).suffix and not Path(model).is_file() and model not in bundled:
-        raise ModelError(f"{model} is neither a file nor a bundled model; those are {', '.join(bundled)}")
+        raise ModelError(unknown_model(model))
     path = model if model in bundled and not Path(model).is_file() else str(Path(model).absolute())
     # What whoever runs the server names is meant as it is now, whatever an earlier run imported.
     blueprint, _ = world.blueprints.import_xml(path, force_reimport=path not in sources.values(), trusted=True)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from urlab_client.protocol.base import Vec3
 from urlab_client.server.assets.actors import UNIT_SCALE, Actor, ConversionSettings
-from urlab_client.server.assets.decomposition import ADVICE, is_available
+from urlab_client.server.assets.decomposition import advice, is_available
 from urlab_client.server.editor import checks
 from urlab_client.server.editor.level_actors import LevelActors
 from urlab_client.server.refusal import Refusal
@@ -50,7 +50,7 @@ class QuickConvert:
         if actor.mesh is None:
             raise Refusal(code, f"'{actor.name}' is a {actor.class_name} without a mesh of its own")
         if complex_mesh and not is_available():
-            raise Refusal(code, ADVICE)
+            raise Refusal(code, advice())
         if actor.mesh.shape == "plane" and not static:
             raise Refusal(code, f"'{actor.name}' is a plane, which cannot move: pass static")
         checks.refuse_infinite((coacd_threshold, *friction), "coacd_threshold and friction", code)
