@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.launch import SCHEME, with_model_options
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn
-from urlab_client.integrations.gym.episode import EnvEpisode
+from urlab_client.integrations.gym.episode import EnvEpisode, client_defaults
 from urlab_client.integrations.gym.spaces import Observation, SpaceMode
 from urlab_client.integrations.gym.vectorized import Indices, Vectorized
 from urlab_client.protocol.errors import URLabError
@@ -136,7 +136,7 @@ class URLabVectorEnv(Vectorized):
             "reset_noise": reset_noise,
         }
         self._step_timeout = step_timeout
-        client_options = {"step_mode": "direct", **client_options}
+        client_options = client_defaults(client_options)
         self._sessions = [_Session(address, client_options, episode_options) for address in addresses]
         self._portal = Portal()
         try:
