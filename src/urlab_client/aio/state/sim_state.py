@@ -71,6 +71,10 @@ class StateObserver(Protocol):
         """Return the pictures that the next step is to bring: what its caller asked for, and more."""
         ...
 
+    async def ready(self) -> None:
+        """Return when a further state may come: a step in `direct` or `puppet` mode waits for that. Must end."""
+        ...
+
 
 class SimState:
     """Everything that `discover()` and the replies after it say.

@@ -20,7 +20,7 @@ from urlab_client.integrations.gym.env import RewardFn, TerminationFn
 from urlab_client.integrations.gym.episode import client_defaults, compiled_prefixes, fields_of
 from urlab_client.integrations.gym.spaces import Field, Observation, SpaceMapping, SpaceMode
 from urlab_client.integrations.gym.threaded_batch import ThreadedBatch
-from urlab_client.integrations.gym.vectorized import Floats, Indices, Vectorized
+from urlab_client.integrations.gym.vectorized import Floats, Found, Indices, Vectorized
 from urlab_client.protocol.enums import ControllerKind
 from urlab_client.protocol.errors import UnknownKeyframe, URLabError
 from urlab_client.server.physics.controllers import Controller, ControllerConfig, PassthroughController, PDController
@@ -107,7 +107,14 @@ class URLabBatchEnv(Vectorized):
         }
         self._step_count = np.zeros(num_envs, dtype=np.int64)
 
-    def _reset_some(self, indices: Indices, keyframe: str | None) -> tuple[Observation, Mapping[int, Exception]]:
+    def _reset_and_step(self, fresh: Indices, acting: Indices, actions: Any) -> tuple[Found, Found]:
+        nothing: Found = (None, {})
+        return (
+            self._reset_some(fresh, self._keyframe) if len(fresh) else nothing,
+            self._step_some(acting, actions) if len(acting) else nothing,
+        )
+
+    def _reset_some(self, indices: Indices, keyframe: str | None) -> Found:
         self._batch.reset(indices, -1 if keyframe is None else self._keyframe_id(keyframe))
         if self._noise:
             qpos = self._arrays["qpos"]
@@ -119,7 +126,7 @@ class URLabBatchEnv(Vectorized):
         self._step_count[indices] = 0
         return self._observe(indices), {}
 
-    def _step_some(self, indices: Indices, actions: Any) -> tuple[Observation, Mapping[int, Exception]]:
+    def _step_some(self, indices: Indices, actions: Any) -> Found:
         ctrl = self._arrays["ctrl"]
         targets: dict[str, NDArray[np.float32]] = {}
         for key, values in self.mapping.set_points(actions).items():
