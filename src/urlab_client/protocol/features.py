@@ -136,6 +136,11 @@ class Features(Struct, frozen=True, kw_only=True):
         return not self._beta_state
 
     @property
+    def exact_controls(self) -> bool:
+        """Set-points and what controllers make of them are not rounded to single precision."""
+        return self._beta_state
+
+    @property
     def idles_in_puppet(self) -> bool:
         """Physics takes steps of its own between the pushes of puppet mode, unless it is paused."""
         return self._beta_state

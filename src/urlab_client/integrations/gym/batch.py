@@ -16,12 +16,13 @@ from urlab_client._mujoco import batch_class
 from urlab_client.aio.model.layout import ArticulationLayout
 from urlab_client.aio.model.mirror import model_names
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn
-from urlab_client.integrations.gym.episode import fields_of
+from urlab_client.integrations.gym.episode import compiled_prefixes, fields_of
 from urlab_client.integrations.gym.spaces import Field, Observation, SpaceMapping, SpaceMode
 from urlab_client.integrations.gym.threaded_batch import ThreadedBatch
 from urlab_client.integrations.gym.vectorized import Floats, Indices, Vectorized
 from urlab_client.protocol.enums import ControllerKind
 from urlab_client.protocol.errors import UnknownKeyframe, URLabError
+from urlab_client.protocol.names import compiled_names
 from urlab_client.server.physics.controllers import Controller, ControllerConfig, PassthroughController, PDController
 from urlab_client.sync.client import URLabClient
 
@@ -77,8 +78,8 @@ class URLabBatchEnv(Vectorized):
         """
         if num_envs < 1 or n_substeps < 1 or reset_noise < 0:
             raise ValueError("num_envs and n_substeps are at least 1, and reset_noise is 0 or more")
-        model, keys, controllers = _fetch(address, {"step_mode": "direct", **client_options})
-        mapping = SpaceMapping(model, keys, fields_of(observations), space_mode)
+        model, prefixes, controllers, exact = _fetch(address, {"step_mode": "direct", **client_options})
+        mapping = SpaceMapping(model, prefixes, fields_of(observations), space_mode)
         super().__init__(
             num_envs=num_envs,
             mapping=mapping,
@@ -94,6 +95,8 @@ class URLabBatchEnv(Vectorized):
         self._batch = (batch_class() or ThreadedBatch)(model, num_envs, n_threads)
         # Bound before the first call: a derived field is computed only where somebody looks at it.
         self._arrays = {name: self._batch.bind(name) for name in ("qpos", "qvel", "ctrl", "act", "sensordata", "time")}
+        self._prefixes = prefixes
+        self._target_type = np.float64 if exact else np.float32
         self._keyframes = {name: i for i, name in enumerate(model_names(model, "key"))}
         self._noisy = {
             key: model.jnt_qposadr[[mapping.layout(key).joints[name] for name in mapping.joint_names(key, model)]]
@@ -119,13 +122,13 @@ class URLabBatchEnv(Vectorized):
 
     def _step_some(self, indices: Indices, actions: Any) -> tuple[Observation, Mapping[int, Exception]]:
         ctrl = self._arrays["ctrl"]
-        targets: dict[str, NDArray[np.float32]] = {}
+        targets: dict[str, NDArray[Any]] = {}
         for key, values in self.mapping.set_points(actions).items():
             controller = self._controllers.get(key)
             if controller is None or not controller.active:
                 ctrl[np.ix_(indices, self.mapping.layout(key).ctrl_adr)] = values[indices]
             else:
-                targets[key] = values[indices].astype(np.float32)
+                targets[key] = values[indices].astype(self._target_type)
         if targets:
             for _ in range(self._n_substeps):
                 self._control(indices, targets)
@@ -135,7 +138,7 @@ class URLabBatchEnv(Vectorized):
         self._step_count[indices] += self._n_substeps
         return self._observe(indices), {}
 
-    def _control(self, indices: Indices, targets: Mapping[str, NDArray[np.float32]]) -> None:
+    def _control(self, indices: Indices, targets: Mapping[str, NDArray[Any]]) -> None:
         """Let the controllers turn their targets into controls, for the state as it is."""
         ctrl, qpos, qvel = (self._arrays[name][indices] for name in ("ctrl", "qpos", "qvel"))
         for key, values in targets.items():
@@ -167,7 +170,8 @@ class URLabBatchEnv(Vectorized):
                 return self._arrays["sensordata"][:, sensors]
 
     def _keyframe_id(self, name: str) -> int:
-        found = [full for full in self._keyframes if full in {name, *(f"{key}_{name}" for key in self.mapping.keys)}]
+        wanted = {name, *compiled_names(name, self._prefixes)}
+        found = [full for full in self._keyframes if full in wanted]
         if len(found) != 1:
             raise UnknownKeyframe(
                 "unknown_keyframe", f"{name!r} does not name exactly one of {', '.join(self._keyframes) or 'none'}"
@@ -177,8 +181,10 @@ class URLabBatchEnv(Vectorized):
 
 def _fetch(
     address: str, client_options: Mapping[str, Any]
-) -> tuple[mujoco.MjModel, list[str], dict[str, tuple[str, dict[str, Any]]]]:
-    """Return a scene's model, its articulations, and the kind and parameters of those that have a controller."""
+) -> tuple[mujoco.MjModel, dict[str, str], dict[str, tuple[str, dict[str, Any]]], bool]:
+    """Return a scene's model, its articulations with the prefixes of their names in it, the kind and parameters of
+    those controllers that there are, and whether those take set-points as they are.
+    """
     with URLabClient(address, **client_options) as client:
         client.discover()
         model = client.model
@@ -186,7 +192,8 @@ def _fetch(
             raise URLabError(f"There is no articulation at {address}.", hint="Start play first.")
         attached = {key: articulation.controller for key, articulation in client.articulations.items()}
         controllers = {key: (str(found.kind), dict(found.params)) for key, found in attached.items() if found}
-        return model, list(client.articulations), controllers
+        prefixes = compiled_prefixes(client.articulations)
+        return model, prefixes, controllers, client.server.features.exact_controls
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
 import numpy as np
 from gymnasium import spaces
@@ -90,7 +90,7 @@ class EnvEpisode:
         self.frames: dict[str, Pixels] = {}
         self._model = model
         fields = fields_of(observations)
-        self.mapping = SpaceMapping(model, list(client.articulations), fields, space_mode)
+        self.mapping = SpaceMapping(model, compiled_prefixes(client.articulations), fields, space_mode)
         minimal = set(fields) <= set(LEVELS["minimal"])
         self.observation_space = self._with_cameras(cameras)
         self._observed_cameras = tuple(cameras)
@@ -195,6 +195,16 @@ class EnvEpisode:
                 readings = articulation.get_sensors()
                 found = [np.atleast_1d(readings[name]) for name in self.mapping.layout(key).sensors]
                 return np.concatenate(found) if found else np.zeros(0)
+
+
+class _Compiled(Protocol):
+    @property
+    def compiled_prefix(self) -> str: ...
+
+
+def compiled_prefixes(articulations: Mapping[str, _Compiled]) -> dict[str, str]:
+    """Return what the names of each articulation's elements begin with in the model, by its key."""
+    return {key: articulation.compiled_prefix for key, articulation in articulations.items()}
 
 
 def client_camera(client: URLabClient, name: str) -> URLabCameraView:

@@ -55,9 +55,15 @@ class SpaceMapping:
     """
 
     def __init__(
-        self, model: mujoco.MjModel, keys: Sequence[str], fields: Sequence[Field], mode: SpaceMode = "flat"
+        self, model: mujoco.MjModel, prefixes: Mapping[str, str], fields: Sequence[Field], mode: SpaceMode = "flat"
     ) -> None:
-        """Map the articulations `keys` of a compiled scene.
+        """Map articulations of a compiled scene.
+
+        Args:
+            model: The scene.
+            prefixes: Keys of the articulations, and what the names of their elements in the model begin with.
+            fields: What to observe.
+            mode: `flat` or `dict`.
 
         Raises:
             ValueError: An unknown field or mode, or nothing to observe.
@@ -67,11 +73,11 @@ class SpaceMapping:
             raise ValueError(f"observations must be one or more of {', '.join(FIELDS)}, not {list(fields)!r}")
         if mode not in get_args(SpaceMode):
             raise ValueError(f"space_mode must be 'flat' or 'dict', not {mode!r}")
-        self.keys = tuple(keys)
+        self.keys = tuple(prefixes)
         self.fields = tuple(fields)
         self.mode: SpaceMode = mode
-        layouts = articulation_layouts(model, list(keys))
-        self._parts = {key: _part(model, layouts[key]) for key in keys}
+        layouts = articulation_layouts(model, prefixes)
+        self._parts = {key: _part(model, layout) for key, layout in layouts.items()}
         self._where = self._slices()
         self.action_space = self._make_action_space()
         self.observation_space = self._make_observation_space()
