@@ -33,6 +33,7 @@ ALLOWED: dict[str, frozenset[str]] = {
         {
             "_children",
             "_confined",
+            "_installation",
             "_landlock",
             "_mjcf_files",
             "_mujoco",
@@ -54,9 +55,9 @@ ALLOWED: dict[str, frozenset[str]] = {
     "_uninterrupted": frozenset(),
     "_windows": frozenset(),
     "": frozenset({"_installation", "sync", "enums", "protocol"}),
-    "integrations": frozenset({"", "_mujoco", "aio", "enums", "keys", "protocol", "server", "sync"}),
-    "cluster": frozenset({"integrations", "protocol", "sync"}),
-    "web": frozenset({"aio", "protocol"}),
+    "integrations": frozenset({"", "_installation", "_mujoco", "aio", "enums", "keys", "protocol", "server", "sync"}),
+    "cluster": frozenset({"_installation", "integrations", "protocol", "sync"}),
+    "web": frozenset({"_installation", "aio", "protocol"}),
     "cli": frozenset(
         {
             "",
@@ -121,6 +122,8 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "handlers",
         "faults",
         "snapshot",
+        "initial_level",
+        "open_server",
         "simulated",
         "",
     ),

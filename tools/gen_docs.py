@@ -136,10 +136,10 @@ def error_rows(codes: dict[str, type[Any]], ops: Iterable[Op], envelope: Iterabl
 
 def own_errors(base: type[Any]) -> Iterator[list[str]]:
     """Yield the errors of the protocol that stand for no wire code, depth first."""
-    from urlab_client.protocol.errors import RPC_ERRORS, URLabError
+    from urlab_client.protocol.errors import RPC_ERRORS, URLabError, URLabRPCError
 
     for cls in base.__subclasses__():
-        if cls.__module__ != base.__module__:
+        if cls.__module__ not in (URLabError.__module__, URLabRPCError.__module__):
             continue
         if cls not in RPC_ERRORS.values():
             also = next((b for b in cls.__mro__ if b.__module__ == "builtins" and not issubclass(URLabError, b)), None)

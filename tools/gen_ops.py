@@ -19,7 +19,7 @@ import generated
 
 SRC = generated.REPOSITORY / "src"
 MESSAGES = SRC / "urlab_client" / "protocol" / "messages"
-TYPES = SRC / "urlab_client" / "protocol" / "types.py"
+TYPES = ("scene_types", "types")
 OUTPUT = SRC / "urlab_client" / "aio" / "namespaces" / "_ops.py"
 
 HEADER = '''\
@@ -176,13 +176,17 @@ def render() -> dict[Path, str]:
         groups.setdefault(op.ns, []).append(method(op, source))
         used.setdefault(module, set()).add(op.request.__name__)
     body = "\n".join(groups_text(groups))
-    types = sorted(name for name in Source(TYPES).classes if re.search(rf"\b{name}\b", body))
+    mentioned = set(re.findall(r"\b[A-Z]\w+\b", body))
+    types = {
+        module: sorted(mentioned.intersection(Source(SRC / "urlab_client" / "protocol" / f"{module}.py").classes))
+        for module in TYPES
+    }
     imports = [
         "from __future__ import annotations\n",
         "from urlab_client.aio.deadline import DEFAULT, Timeout",
         "from urlab_client.aio.namespaces._base import Namespace, Vector, as_quat, as_vec3, fill, target_by",
         *(f"from {module} import {', '.join(sorted(names))}" for module, names in sorted(used.items())),
-        f"from urlab_client.protocol.types import {', '.join(types)}",
+        *(f"from urlab_client.protocol.{module} import {', '.join(names)}" for module, names in types.items()),
     ]
     return generated.tidied({OUTPUT: "\n".join([HEADER, *imports, "", body])}, SRC, "urlab_client")
 

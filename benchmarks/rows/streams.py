@@ -21,7 +21,7 @@ from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.live.publishers import Publishers
 from urlab_client.protocol.messages.session import CameraInfo
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.protocol.rows import STATE_FULL, camera_filter
+from urlab_client.protocol.topics import STATE_FULL, camera_filter
 
 __all__ = ["ROWS"]
 

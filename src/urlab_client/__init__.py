@@ -8,6 +8,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from urlab_client.protocol.client_types import ClientConfig, Diagnosis, Finding, Resync, ServerInfo, Verdict
     from urlab_client.protocol.enums import (
         ActuatorType,
         CameraMode,
@@ -127,17 +128,22 @@ if TYPE_CHECKING:
         StreamStats,
     )
     from urlab_client.protocol.names import UnknownName
-    from urlab_client.protocol.types import (
+    from urlab_client.protocol.scene_types import (
         ActorBounds,
         ActorHierarchyNode,
         ActorInfo,
         BlueprintInfo,
+        SceneActor,
+        SceneSnapshot,
+        URLabAsset,
+        URLabBlueprint,
+        URLabLightHandle,
+        URLabSpawnHandle,
+    )
+    from urlab_client.protocol.types import (
         CameraPose,
-        ClientConfig,
         Contact,
         ContactsResult,
-        Diagnosis,
-        Finding,
         JobStatus,
         KeyframeInfo,
         MocapPose,
@@ -147,17 +153,8 @@ if TYPE_CHECKING:
         RecordingSummary,
         ReplaySession,
         ReplayStatus,
-        Resync,
-        SceneActor,
-        SceneSnapshot,
-        ServerInfo,
         SimOptions,
         UploadProgress,
-        URLabAsset,
-        URLabBlueprint,
-        URLabLightHandle,
-        URLabSpawnHandle,
-        Verdict,
     )
     from urlab_client.sync import (
         DEFAULT,
@@ -181,6 +178,8 @@ _HOMES = (
     "urlab_client.protocol.enums",
     "urlab_client.protocol.errors",
     "urlab_client.protocol.names",
+    "urlab_client.protocol.client_types",
+    "urlab_client.protocol.scene_types",
     "urlab_client.protocol.types",
     "urlab_client.protocol.messages.cameras",
     "urlab_client.protocol.messages.streams",

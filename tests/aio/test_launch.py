@@ -16,7 +16,7 @@ from waiting import DEADLINE_S, eventually, pass_time, until
 import urlab_client
 from urlab_client import ClientClosed, OutcomeUnknown, ServerUnreachable
 from urlab_client.aio import URLabClient
-from urlab_client.aio.launch import serve_arguments
+from urlab_client.aio.launch import serve_arguments, start_seconds, with_model_options
 
 
 def children() -> set[int]:
@@ -71,6 +71,43 @@ async def test_options_of_serve_go_into_the_address(tmp_path: Path) -> None:
         await client.discover()
         await client.step()
         assert client.sim_time == 0.01
+
+
+@pytest.mark.parametrize("text", ["soon", "0", "nan", "inf"])
+def test_how_long_a_start_may_take_is_a_number_of_seconds(text: str) -> None:
+    assert start_seconds("sim://arm?start-timeout=2.5&model=ball") == 2.5
+    assert serve_arguments("sim://arm?start-timeout=2.5&model=ball") == ["arm", "ball"]
+    with pytest.raises(ValueError, match="start-timeout must be a number of seconds above 0"):
+        URLabClient(f"sim://arm?start-timeout={text}")
+
+
+async def test_options_of_a_model_that_have_no_effect_are_told(tmp_path: Path) -> None:
+    """Simulation behaviour 1.4: the plugin ignores a model's options, and so does what stands for it, unless told."""
+    model = tmp_path / "slow.xml"
+    body = '<body><freejoint/><geom size=".1"/></body>'
+    model.write_text(f'<mujoco model="slow"><option timestep="0.02"/><worldbody>{body}</worldbody></mujoco>')
+    async with URLabClient(f"sim://{model}", step_mode="direct") as client:
+        with pytest.warns(UserWarning, match=r"slow: timestep 0\.02\).*\?mjcf-options"):
+            await client.discover()
+        assert client.model is not None
+        assert client.model.opt.timestep == 0.002
+        told = [finding.text for finding in (await client.explain()).findings if finding.subject == "physics"]
+    assert told[0].startswith("A step takes 0.002 s; integrator implicitfast")
+    assert "slow: timestep 0.02" in told[1]
+
+
+@pytest.mark.parametrize(
+    ("address", "asked"),
+    [
+        ("sim://arm", "sim://arm?mjcf-options"),
+        ("sim://arm?model=ball", "sim://arm?model=ball&mjcf-options"),
+        ("sim://arm?no-mjcf-options", "sim://arm?no-mjcf-options"),
+        ("sim://arm?mjcf-options&model=ball", "sim://arm?mjcf-options&model=ball"),
+        ("tcp://localhost", "tcp://localhost"),
+    ],
+)
+def test_environments_ask_for_the_options_of_the_model(address: str, asked: str) -> None:
+    assert with_model_options(address) == asked
 
 
 async def test_a_model_that_is_not_there() -> None:

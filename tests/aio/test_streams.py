@@ -45,7 +45,8 @@ from urlab_client.protocol.messages.streams import (
     ServerReconnected,
     StateSnapshot,
 )
-from urlab_client.protocol.rows import BaseStateRow, JointRow, SensorRow, TopicKind
+from urlab_client.protocol.rows import BaseStateRow, JointRow, SensorRow
+from urlab_client.protocol.topics import TopicKind
 
 sys.path.append(str(Path(__file__).parents[1] / "protocol"))
 import vectors

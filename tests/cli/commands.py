@@ -46,7 +46,7 @@ def refusal(done: subprocess.CompletedProcess[str]) -> str:
 @contextlib.contextmanager
 def signals_kept() -> Generator[None]:
     """Put back what `urlab serve` does to the process that it owns."""
-    numbers = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+    numbers = [number for number in signal.Signals if number.name in {"SIGINT", "SIGTERM", "SIGHUP"}]
     before = [signal.getsignal(number) for number in numbers]
     try:
         yield
@@ -79,8 +79,11 @@ class Server:
         return f"{self.ready['address']}:{self.ready['step_port']}"
 
     def end(self, number: signal.Signals | None) -> tuple[int, str, str]:
-        """Send a signal, or close standard input; return exit code and what came after the first line."""
-        if number is None:
+        """Send a signal, or close standard input; return exit code and what came after the first line.
+
+        On Windows, where no signal can be sent to another process, input is closed in any case.
+        """
+        if number is None or sys.platform == "win32":
             assert self.process.stdin is not None
             self.process.stdin.close()
             self.process.stdin = None
@@ -114,7 +117,7 @@ def child(*command: str | Path, cwd: Path) -> Generator[subprocess.Popen[str]]:
 @contextlib.contextmanager
 def served(*arguments: str | Path, cwd: Path, json: bool = True) -> Generator[Server]:
     """Run `urlab serve` on free ports until the block ends."""
-    options = [*FREE_PORTS, "--json"] if json else FREE_PORTS
+    options = [*FREE_PORTS, *(["--json"] if json else []), *(["--until-eof"] if sys.platform == "win32" else [])]
     with child("-m", "urlab_client", "serve", *options, *arguments, cwd=cwd) as process:
         assert process.stdout is not None
         assert process.stderr is not None

@@ -17,7 +17,7 @@ from urlab_client.protocol.enums import CameraMode, StepMode
 
 READY_KEYS = [
     "event", "address", "step_port", "state_port", "ctrl_port", "info_port", "camera_port", "shm_dir", "saved_dir",
-    "pid", "open_to", "server_key",
+    "pid", "scene_warnings", "open_to", "server_key",
 ]  # fmt: skip
 
 
@@ -185,7 +185,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
 
 def test_a_missing_model(capsys: pytest.CaptureFixture[str]) -> None:
     line = refused(capsys, "robbot.xml")
-    assert line.startswith("urlab serve: robbot.xml: no such file")
+    assert line.startswith("urlab serve: robbot.xml is neither a file nor a bundled robot")
     assert "quadruped" in line
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from urlab_client.enums import ControlMode, OutOfRange
-from urlab_client.protocol.types import Verdict
+from urlab_client.protocol.client_types import Verdict
 from urlab_client.server import ControllerConfig, SimulatedServer
 
 BOT = """

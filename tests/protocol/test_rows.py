@@ -12,22 +12,25 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from urlab_client.protocol import rows
-from urlab_client.protocol.enums import CameraMode
-from urlab_client.protocol.errors import ProtocolError
-from urlab_client.protocol.rows import (
-    ActionsRow,
+from urlab_client.protocol.control_messages import (
     ActuatorInfo,
-    BaseStateRow,
     CameraEndpoint,
     ControlPayload,
     JointGains,
-    JointRow,
-    SceneRow,
-    SensorRow,
+    decode_gains,
+    encode_gains,
+)
+from urlab_client.protocol.enums import CameraMode
+from urlab_client.protocol.errors import ProtocolError
+from urlab_client.protocol.pixels import decode_camera, encode_camera
+from urlab_client.protocol.rows import ActionsRow, BaseStateRow, JointRow, SceneRow, SensorRow, TwistRow, decode_row
+from urlab_client.protocol.topics import (
     StreamTopic,
     TopicKind,
-    TwistRow,
+    articulation_filter,
+    camera_filter,
+    resolve_endpoint,
+    scene_filter,
 )
 
 OF_COMPONENT = [TopicKind.JOINT, TopicKind.BASE_STATE, TopicKind.SENSOR, TopicKind.CAMERA]
@@ -138,7 +141,7 @@ class TestTopics:
 class TestFilters:
     @given(keys, keys, st.sampled_from([None, *OF_COMPONENT, *OF_ARTICULATION]))
     def test_an_articulation_never_brings_in_another(self, key: str, other: str, kind: TopicKind | None) -> None:
-        chosen = rows.articulation_filter(key, kind)
+        chosen = articulation_filter(key, kind)
         for topic in (
             *(StreamTopic(of, other, "knee") for of in OF_COMPONENT),
             *(StreamTopic(of, other) for of in OF_ARTICULATION),
@@ -147,14 +150,14 @@ class TestFilters:
             assert topic.encode().startswith(chosen) == wanted
 
     def test_scene(self) -> None:
-        assert StreamTopic(TopicKind.XPOS, "box").encode().startswith(rows.scene_filter())
-        assert StreamTopic(TopicKind.XPOS, "box").encode().startswith(rows.scene_filter("box"))
-        assert not StreamTopic(TopicKind.XPOS, "box2").encode().startswith(rows.scene_filter("box"))
+        assert StreamTopic(TopicKind.XPOS, "box").encode().startswith(scene_filter())
+        assert StreamTopic(TopicKind.XPOS, "box").encode().startswith(scene_filter("box"))
+        assert not StreamTopic(TopicKind.XPOS, "box2").encode().startswith(scene_filter("box"))
 
     def test_camera(self) -> None:
         # As the handshake gives it, without the trailing space, and as published, with it.
         for zmq_topic in ("arm0/camera/wrist", "arm0/camera/wrist "):
-            chosen = rows.camera_filter(zmq_topic)
+            chosen = camera_filter(zmq_topic)
             assert chosen == StreamTopic(TopicKind.CAMERA, "arm0", "wrist").encode()
             assert not StreamTopic(TopicKind.CAMERA, "arm0", "wrist2").encode().startswith(chosen)
 
@@ -164,23 +167,23 @@ class TestFilters:
     )
     def test_refused(self, key: str, kind: TopicKind | None) -> None:
         with pytest.raises(ValueError, match=r"topic|empty"):
-            rows.articulation_filter(key, kind)
+            articulation_filter(key, kind)
 
 
 class TestEndpoints:
     @pytest.mark.parametrize("bound", ["0.0.0.0", "*", "::", "[::]", ""])
     def test_unspecified_hosts_become_the_servers(self, bound: str) -> None:
-        assert rows.resolve_endpoint(f"tcp://{bound}:5560", "sim.lab") == "tcp://sim.lab:5560"
+        assert resolve_endpoint(f"tcp://{bound}:5560", "sim.lab") == "tcp://sim.lab:5560"
 
     @pytest.mark.parametrize("host", ["fe80::1", "[fe80::1]"])
     def test_ipv6_host_is_bracketed(self, host: str) -> None:
-        assert rows.resolve_endpoint("tcp://0.0.0.0:5558", host) == "tcp://[fe80::1]:5558"
+        assert resolve_endpoint("tcp://0.0.0.0:5558", host) == "tcp://[fe80::1]:5558"
 
     @pytest.mark.parametrize(
         "endpoint", ["tcp://10.0.0.7:5558", "tcp://[fe80::2]:5558", "ipc:///tmp/cam", "inproc://cam"]
     )
     def test_others_stay(self, endpoint: str) -> None:
-        assert rows.resolve_endpoint(endpoint, "sim.lab") == endpoint
+        assert resolve_endpoint(endpoint, "sim.lab") == endpoint
 
     @pytest.mark.parametrize(
         "endpoint",
@@ -188,11 +191,11 @@ class TestEndpoints:
     )
     def test_unusable(self, endpoint: str) -> None:
         with pytest.raises(ProtocolError, match="expected tcp://HOST:PORT"):
-            rows.resolve_endpoint(endpoint, "sim.lab")
+            resolve_endpoint(endpoint, "sim.lab")
 
     def test_the_host_itself_must_be_an_address(self) -> None:
         with pytest.raises(ValueError, match="not an address to connect to"):
-            rows.resolve_endpoint("tcp://0.0.0.0:5558", "0.0.0.0")
+            resolve_endpoint("tcp://0.0.0.0:5558", "0.0.0.0")
 
 
 class TestStateRows:
@@ -267,7 +270,7 @@ class TestStateRows:
             (StreamTopic(TopicKind.QPOS, "box"), SceneRow(TopicKind.QPOS, np.ones(7))),
         ):
             buffer = bytearray(row.encode())
-            decoded = rows.decode_row(topic, buffer)
+            decoded = decode_row(topic, buffer)
             buffer[:] = bytes(len(buffer))
             values = decoded.position if isinstance(decoded, BaseStateRow) else decoded.values
             assert values.any()
@@ -291,7 +294,7 @@ class TestStateRows:
     )
     def test_wrong_size(self, topic: bytes, size: int, expected: str) -> None:
         with pytest.raises(ProtocolError, match=expected) as caught:
-            rows.decode_row(StreamTopic.parse(topic), bytes(size))
+            decode_row(StreamTopic.parse(topic), bytes(size))
         assert repr(topic.decode()) in str(caught.value)
 
     @pytest.mark.parametrize(("dim", "problem"), [(-1, "dim is -1"), (2, "expected 16"), (2**31 - 1, "expected 85899")])
@@ -301,7 +304,7 @@ class TestStateRows:
 
     def test_a_topic_without_row(self) -> None:
         with pytest.raises(ProtocolError, match="'g1/camera/head ': a camera topic carries none"):
-            rows.decode_row(StreamTopic.parse(b"g1/camera/head "), b"")
+            decode_row(StreamTopic.parse(b"g1/camera/head "), b"")
 
     def test_encode_refuses_wrong_shapes(self) -> None:
         with pytest.raises(ValueError, match=r"quat_xyzw has shape \(3,\), expected \(4,\)"):
@@ -365,23 +368,23 @@ class TestGains:
 
     @given(st.dictionaries(st.text(), st.builds(JointGains, kp=gain, kv=gain, torque_limit=gain)))
     def test_round_trip_in_ascii(self, gains: dict[str, JointGains]) -> None:
-        payload = rows.encode_gains(gains)
+        payload = encode_gains(gains)
         assert payload.isascii()
-        assert rows.decode_gains(payload) == gains
+        assert decode_gains(payload) == gains
 
     def test_unknown_parameters_are_ignored(self) -> None:
-        assert rows.decode_gains(b'{"knee":{"kp":1,"ki":2}}') == {"knee": JointGains(kp=1.0)}
+        assert decode_gains(b'{"knee":{"kp":1,"ki":2}}') == {"knee": JointGains(kp=1.0)}
 
     @pytest.mark.parametrize(
         "payload", [b"", b"[]", b'{"knee":3}', b'{"knee":{"kp":"1"}}', b'{"\xff":{}}', b'{"a":{"x":' + b"[" * 100_000]
     )
     def test_refused(self, payload: bytes) -> None:
         with pytest.raises(ProtocolError, match="set_gains payload on 'g1'"):
-            rows.decode_gains(payload, "g1")
+            decode_gains(payload, "g1")
 
     def test_a_gain_that_json_cannot_carry(self) -> None:
         with pytest.raises(ValueError, match="JSON"):
-            rows.encode_gains({"knee": JointGains(kp=math.inf)})
+            encode_gains({"knee": JointGains(kp=math.inf)})
 
 
 class TestInfo:
@@ -446,8 +449,8 @@ class TestCamera:
         width, height = size
         pixels = data.draw(hnp.arrays(np.uint8, (height, width, 4)))
         out = np.empty_like(pixels) if reuse else None
-        payload = rows.encode_camera(pixels, mode)
-        decoded = rows.decode_camera(payload, mode, width, height, out=out).pixels
+        payload = encode_camera(pixels, mode)
+        decoded = decode_camera(payload, mode, width, height, out=out).pixels
         expected = pixels.copy()
         if mode == "real":
             expected[..., 3] = 255
@@ -461,28 +464,28 @@ class TestCamera:
         width, height = size
         centimetres = data.draw(hnp.arrays(np.float32, (height, width), elements=float32))
         out = np.empty_like(centimetres) if reuse else None
-        metres = rows.decode_camera(centimetres.tobytes(), CameraMode.DEPTH, width, height, out=out).pixels
+        metres = decode_camera(centimetres.tobytes(), CameraMode.DEPTH, width, height, out=out).pixels
         assert metres.dtype == np.float32
         np.testing.assert_array_equal(metres, centimetres / np.float32(100))
         assert out is None or metres is out
 
     def test_depth_sent(self) -> None:
         metres = np.array([[0.5, 2.25], [np.inf, 3e38]], np.float32)
-        assert np.frombuffer(rows.encode_camera(metres, "depth"), "<f4").tolist() == [50, 225, math.inf, math.inf]
+        assert np.frombuffer(encode_camera(metres, "depth"), "<f4").tolist() == [50, 225, math.inf, math.inf]
 
     def test_depth_with_signalling_nan(self) -> None:
-        frame = rows.decode_camera(b"\x01\x00\xa0\x7f", "depth", 1, 1)
+        frame = decode_camera(b"\x01\x00\xa0\x7f", "depth", 1, 1)
         assert np.isnan(frame.pixels).all()
 
     def test_rgb_from_a_renderer(self) -> None:
         rgb = np.array([[[1, 2, 3], [4, 5, 6]]], np.uint8)
-        assert rows.encode_camera(rgb, CameraMode.REAL) == bytes([3, 2, 1, 255, 6, 5, 4, 255])
-        assert rows.encode_camera(rgb[:, ::-1], CameraMode.REAL) == bytes([6, 5, 4, 255, 3, 2, 1, 255])
+        assert encode_camera(rgb, CameraMode.REAL) == bytes([3, 2, 1, 255, 6, 5, 4, 255])
+        assert encode_camera(rgb[:, ::-1], CameraMode.REAL) == bytes([6, 5, 4, 255, 3, 2, 1, 255])
 
     @pytest.mark.parametrize("mode", ["real", "semantic", "depth"])
     def test_pixels_are_the_callers_own(self, mode: str) -> None:
         buffer = bytearray(b"\x40" * 16)
-        pixels = rows.decode_camera(buffer, mode, 2, 2).pixels
+        pixels = decode_camera(buffer, mode, 2, 2).pixels
         before = pixels.copy()
         buffer[:] = bytes(16)
         assert same(pixels, before)
@@ -491,34 +494,34 @@ class TestCamera:
     @pytest.mark.parametrize("mode", ["real", "semantic", "depth"])
     def test_slot_at_an_odd_address(self, mode: str) -> None:
         payload = bytes(range(64, 80))
-        decoded = rows.decode_camera(memoryview(b"?" + payload)[1:], mode, 2, 2).pixels
-        assert same(decoded, rows.decode_camera(payload, mode, 2, 2).pixels)
+        decoded = decode_camera(memoryview(b"?" + payload)[1:], mode, 2, 2).pixels
+        assert same(decoded, decode_camera(payload, mode, 2, 2).pixels)
 
     @pytest.mark.parametrize("size", [0, 15, 17, 24, 47, 49, 64])
     def test_wrong_size_is_never_reshaped(self, size: int) -> None:
         with pytest.raises(ProtocolError, match=rf"'arm/camera/wrist ': {size} bytes, expected 16 \(2x2 pixels"):
-            rows.decode_camera(bytes(size), "real", 2, 2, where=StreamTopic(TopicKind.CAMERA, "arm", "wrist"))
+            decode_camera(bytes(size), "real", 2, 2, where=StreamTopic(TopicKind.CAMERA, "arm", "wrist"))
 
     def test_header_says_when(self) -> None:
-        frame = rows.decode_camera(header(2, 2, 2) + bytes(16), "semantic", 2, 2)
+        frame = decode_camera(header(2, 2, 2) + bytes(16), "semantic", 2, 2)
         assert (frame.frame_id, frame.sim_time, frame.capture_time) == (7, 1.5, 99.25)
-        frame = rows.decode_camera(header(1, 2, 2) + bytes(16), "semantic", 2, 2)
+        frame = decode_camera(header(1, 2, 2) + bytes(16), "semantic", 2, 2)
         assert (frame.frame_id, frame.sim_time, frame.capture_time) == (7, 1.5, None)
 
     def test_pixels_cannot_imitate_a_header(self) -> None:
         payload = header(1, 2, 2).ljust(2 * 8 * 4, b"\xee")
-        frame = rows.decode_camera(payload, "semantic", 8, 2)
+        frame = decode_camera(payload, "semantic", 8, 2)
         assert frame.frame_id is None
         assert frame.pixels.tobytes() == payload
 
     @pytest.mark.parametrize("payload", [header(1, 2, 2, magic=1), header(3, 2, 2)[:32], header(2, 2, 2)[:32]])
     def test_a_length_alone_makes_no_header(self, payload: bytes) -> None:
         with pytest.raises(ProtocolError, match="48 bytes, expected 16"):
-            rows.decode_camera(payload + bytes(16), "real", 2, 2)
+            decode_camera(payload + bytes(16), "real", 2, 2)
 
     def test_header_of_another_resolution(self) -> None:
         with pytest.raises(ProtocolError, match="header says 4x1 pixels, the handshake 2x2"):
-            rows.decode_camera(header(1, 4, 1) + bytes(16), "real", 2, 2)
+            decode_camera(header(1, 4, 1) + bytes(16), "real", 2, 2)
 
     @pytest.mark.parametrize(
         "out",
@@ -530,7 +533,7 @@ class TestCamera:
     )
     def test_out_must_fit(self, out: np.ndarray) -> None:
         with pytest.raises(ValueError, match=r"expected C-contiguous uint8 \(2, 2, 4\)"):
-            rows.decode_camera(bytes(16), "real", 2, 2, out=out)
+            decode_camera(bytes(16), "real", 2, 2, out=out)
 
     @pytest.mark.parametrize(
         ("pixels", "mode", "problem"),
@@ -544,7 +547,7 @@ class TestCamera:
     )
     def test_encode_refuses(self, pixels: np.ndarray, mode: str, problem: str) -> None:
         with pytest.raises(ValueError, match=problem):
-            rows.encode_camera(pixels, mode)
+            encode_camera(pixels, mode)
 
 
 decoders = {
@@ -554,9 +557,9 @@ decoders = {
     "twist": TwistRow.decode,
     "actions": ActionsRow.decode,
     "control": ControlPayload.decode,
-    "gains": rows.decode_gains,
+    "gains": decode_gains,
     "info": ActuatorInfo.decode,
-    "camera": lambda payload: rows.decode_camera(payload, "real", 2, 2),
+    "camera": lambda payload: decode_camera(payload, "real", 2, 2),
 }
 
 

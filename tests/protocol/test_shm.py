@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from urlab_client.protocol import shm
 from urlab_client.protocol.errors import ProtocolError
-from urlab_client.protocol.rows import decode_camera
+from urlab_client.protocol.pixels import decode_camera
 from urlab_client.protocol.shm import Region, no_fence
 
 STRIDE = 24

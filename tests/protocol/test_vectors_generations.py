@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import vectors
 
-from urlab_client.protocol import rows, shm
+from urlab_client.protocol import pixels, shm, topics
 from urlab_client.protocol.base import Op, Reply
 from urlab_client.protocol.codec import (
     check_request,
@@ -215,7 +215,7 @@ def test_snapshots(name: str) -> None:
 
 def test_a_published_snapshot_and_its_region() -> None:
     topic, payload = vectors.load("msg_state_full", "beta").frames
-    assert topic == rows.STATE_FULL
+    assert topic == topics.STATE_FULL
     assert StateSnapshot.decode(payload).per_articulation.keys() == {"arm_a"}
     region = vectors.load("shm_region_state_full", "beta")
     found = shm.attach(bytearray(region.data), fence=shm.no_fence).read_latest()
@@ -231,12 +231,12 @@ def test_picture_headers(name: str) -> None:
     said = vector.decoded
     if vector.expect == "reject":
         with pytest.raises(ProtocolError):
-            rows.decode_camera(vector.data, CameraMode(said["mode"]), said["width"], said["height"])
+            pixels.decode_camera(vector.data, CameraMode(said["mode"]), said["width"], said["height"])
         return
-    frame = rows.decode_camera(vector.data, CameraMode(said["mode"]), said["width"], said["height"])
+    frame = pixels.decode_camera(vector.data, CameraMode(said["mode"]), said["width"], said["height"])
     bare = bytes.fromhex(said["pixels_hex"])
     assert np.array_equal(
-        frame.pixels, rows.decode_camera(bare, CameraMode(said["mode"]), said["width"], said["height"]).pixels
+        frame.pixels, pixels.decode_camera(bare, CameraMode(said["mode"]), said["width"], said["height"]).pixels
     )
     assert (frame.frame_id, frame.sim_time, frame.capture_time) == (
         said["frame_id"],
@@ -250,7 +250,7 @@ def test_a_published_picture(generation: str, name: str) -> None:
     vector = vectors.load(name, generation)
     topic, payload = vector.frames
     assert topic.decode() == vector.decoded["topic"]
-    assert rows.decode_camera(payload, CameraMode.REAL, 2, 2).frame_id == 4242
+    assert pixels.decode_camera(payload, CameraMode.REAL, 2, 2).frame_id == 4242
 
 
 # What the answers say about the server.

@@ -13,9 +13,18 @@ import pytest
 import vectors
 
 from urlab_client.protocol import rows, shm
+from urlab_client.protocol.control_messages import (
+    ActuatorInfo,
+    ControlPayload,
+    JointGains,
+    decode_gains,
+    encode_gains,
+    gains_by_parameter,
+)
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.errors import ProtocolError
-from urlab_client.protocol.rows import StreamTopic, TopicKind
+from urlab_client.protocol.pixels import decode_camera, encode_camera
+from urlab_client.protocol.topics import StreamTopic, TopicKind
 
 # What the codec, not these layouts, is responsible for.
 CODEC_FAMILIES = ("rpc_", "msgpack_", "msg_state_full")
@@ -62,8 +71,8 @@ SENSOR = Golden(
     TopicKind.SENSOR,
 )
 CONTROL = Golden(
-    rows.ControlPayload.decode,
-    rows.ControlPayload.encode,
+    ControlPayload.decode,
+    ControlPayload.encode,
     lambda payload: {
         "n": payload.values.size,
         "entries": [
@@ -74,18 +83,18 @@ CONTROL = Golden(
     TopicKind.CONTROL,
 )
 REAL = Golden(
-    lambda data: rows.decode_camera(data, CameraMode.REAL, 2, 2).pixels,
-    lambda pixels: rows.encode_camera(pixels, CameraMode.REAL),
+    lambda data: decode_camera(data, CameraMode.REAL, 2, 2).pixels,
+    lambda pixels: encode_camera(pixels, CameraMode.REAL),
     lambda pixels: {"width": 2, "height": 2, "dtype": "bgra8", "rows_top_down_rgba": pixels.tolist()},
 )
 DEPTH = Golden(
-    lambda data: rows.decode_camera(data, CameraMode.DEPTH, 2, 2).pixels,
-    lambda pixels: rows.encode_camera(pixels, CameraMode.DEPTH),
+    lambda data: decode_camera(data, CameraMode.DEPTH, 2, 2).pixels,
+    lambda pixels: encode_camera(pixels, CameraMode.DEPTH),
     lambda pixels: {
         "width": 2,
         "height": 2,
         "dtype": "float32",
-        "rows_top_down_cm": np.frombuffer(rows.encode_camera(pixels, "depth"), "<f4").reshape(2, 2).tolist(),
+        "rows_top_down_cm": np.frombuffer(encode_camera(pixels, "depth"), "<f4").reshape(2, 2).tolist(),
         "rows_top_down_m": pixels.tolist(),
     },
 )
@@ -188,19 +197,24 @@ def test_set_gains() -> None:
     topic, payload = vector.frames
     assert StreamTopic.parse(topic) == StreamTopic(TopicKind.SET_GAINS, "g1")
     assert StreamTopic.parse(topic).encode() == topic
-    gains = rows.decode_gains(payload)
-    assert rows.gains_by_parameter(gains) == vector.decoded["reshaped"]
+    gains = decode_gains(payload)
+    assert gains_by_parameter(gains) == vector.decoded["reshaped"]
     assert (
-        rows.encode_gains({"left_knee": rows.JointGains(kp=320.0, kv=6.5), "waist": rows.JointGains(torque_limit=35)})
+        encode_gains(
+            {
+                "left_knee": JointGains(kp=320.0, kv=6.5),
+                "waist": JointGains(torque_limit=35),
+            }
+        )
         == payload
     )
-    assert rows.decode_gains(rows.encode_gains(gains)) == gains
+    assert decode_gains(encode_gains(gains)) == gains
 
 
 def test_info() -> None:
     vector = vectors.load("msg_info")
     (frame,) = vector.frames
-    info = rows.ActuatorInfo.decode(frame)
+    info = ActuatorInfo.decode(frame)
     assert json.loads(info.encode()) == vector.decoded
     assert info.ids.tolist() == vector.decoded["ids"]
     assert [(camera.name, camera.endpoint) for camera in info.cameras] == [("head", "tcp://0.0.0.0:5558")]
@@ -209,11 +223,11 @@ def test_info() -> None:
 @pytest.mark.parametrize("name", ["camera_peer_header_v1", "camera_peer_header_v2"])
 def test_camera_with_header(name: str) -> None:
     vector = vectors.load(name)
-    frame = rows.decode_camera(vector.data, CameraMode.REAL, vector.decoded["width"], vector.decoded["height"])
+    frame = decode_camera(vector.data, CameraMode.REAL, vector.decoded["width"], vector.decoded["height"])
     assert frame.frame_id == vector.decoded["frame_id"]
     assert frame.sim_time == vector.decoded["sim_time"]
     assert frame.capture_time == vector.decoded.get("capture_unix_time")
-    assert rows.encode_camera(frame.pixels, CameraMode.REAL).hex() == vector.decoded["pixels_hex"]
+    assert encode_camera(frame.pixels, CameraMode.REAL).hex() == vector.decoded["pixels_hex"]
 
 
 def assert_header(header: shm.Header, decoded: dict[str, Any]) -> None:
@@ -267,7 +281,7 @@ def test_shm_region(name: str) -> None:
         assert msgspec.msgpack.decode(publication.payload) == vector.decoded["latest"]
     else:
         assert len(publication.payload) == vector.decoded["size"]
-        pixels = rows.decode_camera(publication.payload, CameraMode.REAL, 2, 2).pixels
+        pixels = decode_camera(publication.payload, CameraMode.REAL, 2, 2).pixels
         assert pixels.tolist() == vector.decoded["rows_top_down_rgba"]
         assert header.stride == shm.camera_stride(2, 2)
 

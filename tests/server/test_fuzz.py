@@ -22,19 +22,13 @@ from wire import Wire, pack
 
 from urlab_client import ProtocolError, URLabRPCError
 from urlab_client.protocol.codec import decode_reply
+from urlab_client.protocol.control_messages import ActuatorInfo, ControlPayload, decode_gains
 from urlab_client.protocol.dialects import ALPHA
 from urlab_client.protocol.errors import RPC_ERRORS
 from urlab_client.protocol.messages.session import HelloOk, StepOk
 from urlab_client.protocol.registry import OPS
-from urlab_client.protocol.rows import (
-    STATE_FULL,
-    ActuatorInfo,
-    ControlPayload,
-    StreamTopic,
-    TopicKind,
-    decode_gains,
-    decode_row,
-)
+from urlab_client.protocol.rows import decode_row
+from urlab_client.protocol.topics import STATE_FULL, StreamTopic, TopicKind
 from urlab_client.server import Limits, SimulatedServer
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.requests import Incoming, RequestReader

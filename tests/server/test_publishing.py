@@ -17,19 +17,10 @@ import zmq
 from waiting import eventually
 from wire import Wire, check_numbers, float32, server_threads, write_level
 
+from urlab_client.protocol.control_messages import ControlPayload, encode_gains
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.protocol.rows import (
-    ActionsRow,
-    BaseStateRow,
-    ControlPayload,
-    JointRow,
-    SceneRow,
-    SensorRow,
-    StreamTopic,
-    TwistRow,
-    decode_row,
-    encode_gains,
-)
+from urlab_client.protocol.rows import ActionsRow, BaseStateRow, JointRow, SceneRow, SensorRow, TwistRow, decode_row
+from urlab_client.protocol.topics import StreamTopic
 from urlab_client.server import SimulatedServer
 from urlab_client.server.physics.controllers import ControllerConfig
 from urlab_client.server.physics.engine import Engine

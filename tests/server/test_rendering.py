@@ -14,8 +14,10 @@ import pytest
 from wire import Wire
 
 from urlab_client.server import SimulatedServer
-from urlab_client.server.render import camera_renderer
-from urlab_client.server.render.camera_renderer import NO_HIT_CM, find_backend, tint
+from urlab_client.server.render import camera_renderer, drawing, opengl
+from urlab_client.server.render.drawing import NO_HIT_CM
+from urlab_client.server.render.opengl import find_backend
+from urlab_client.server.render.tints import tint
 
 # Looks along +x at a wall 2 m away, whose upper half is red and whose lower half is blue.
 WALL = """
@@ -267,9 +269,9 @@ def test_without_opengl_frames_are_left_out(
 def test_a_machine_without_opengl_is_told_what_to_install(
     play: Play, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(camera_renderer.sys, "platform", "linux")
-    monkeypatch.setattr(camera_renderer, "_PROBE", "raise SystemExit('no {name} today')")
-    monkeypatch.setattr(camera_renderer, "_find", camera_renderer._find.__wrapped__)
+    monkeypatch.setattr(opengl.sys, "platform", "linux")
+    monkeypatch.setattr(opengl, "_PROBE", "raise SystemExit('no {name} today')")
+    monkeypatch.setattr(opengl, "_find", opengl._find.__wrapped__)
     wire = play("drop")
     with caplog.at_level(logging.WARNING, logger="urlab_client.server"):
         assert "cameras" not in wire.ask("step", include_cameras={"above": "sync"})
@@ -280,8 +282,8 @@ def test_a_machine_without_opengl_is_told_what_to_install(
 
 
 def test_a_driver_that_kills_its_process_kills_no_server(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(camera_renderer, "_PROBE", "import os; os.abort()  # {name}")
-    assert "ended with code" in str(camera_renderer._probe("egl"))
+    monkeypatch.setattr(opengl, "_PROBE", "import os; os.abort()  # {name}")
+    assert "ended with code" in str(opengl._probe("egl"))
 
 
 def fail(*arguments: object) -> None:
@@ -292,7 +294,7 @@ def test_a_frame_that_cannot_be_drawn_is_left_out_alone(play: Play, monkeypatch:
     wire = play("drop")
     for _ in range(camera_renderer.MAX_FAILED):
         with monkeypatch.context() as patch:
-            patch.setattr(camera_renderer._Stage, "draw", fail)
+            patch.setattr(drawing.Stage, "draw", fail)
             assert "cameras" not in wire.ask("step", include_cameras={"above": "sync"})
         assert "cameras" in wire.ask("step", include_cameras={"above": "sync"})
 
@@ -302,7 +304,7 @@ def test_drawing_that_fails_again_and_again_is_given_up(
 ) -> None:
     wire = play("drop")
     with monkeypatch.context() as patch, caplog.at_level(logging.ERROR, logger="urlab_client.server"):
-        patch.setattr(camera_renderer._Stage, "draw", fail)
+        patch.setattr(drawing.Stage, "draw", fail)
         for _ in range(camera_renderer.MAX_FAILED + 1):
             assert "cameras" not in wire.ask("step", include_cameras={"above": "sync"})
     assert caplog.text.count("drawing failed") == 1

@@ -155,7 +155,7 @@ def test_nothing_is_left(server: SimulatedServer, original: dict[str, Any], act:
 
 
 def test_in_place_where_nothing_was_authored(server: SimulatedServer, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("urlab_client.server.simulated.CLOSE_S", 60.0)  # a busy machine is not a server that hangs
+    monkeypatch.setattr("urlab_client.server.open_server.CLOSE_S", 60.0)  # a busy machine is not a server that hangs
     port, folder = server.step_port, server.saved_dir
     with Wire(server) as wire:
         wire.hello()

@@ -20,7 +20,7 @@ from wire import Wire
 from urlab_client import ImportFailed, URLabTimeoutError
 from urlab_client._landlock import is_available
 from urlab_client.aio import URLabClient
-from urlab_client.server import Limits, ModelError, SimulatedServer, simulated
+from urlab_client.server import Limits, ModelError, SimulatedServer, open_server
 from urlab_client.server.assets import sandbox
 
 Serve = Callable[..., Wire]
@@ -330,7 +330,7 @@ def test_a_confined_process_opens_nothing_else(tmp_path: Path) -> None:
 def test_a_server_says_when_the_kernel_does_not_help(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(simulated, "is_available", lambda: False)
+    monkeypatch.setattr(open_server, "is_available", lambda: False)
     with caplog.at_level("INFO"), SimulatedServer():
         pass
     assert [(record.levelname, "no Landlock" in record.message) for record in caplog.records][:1] == [("INFO", True)]

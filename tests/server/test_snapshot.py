@@ -12,7 +12,7 @@ from wire import Wire
 
 from urlab_client.server import RenderingUnavailable, SimulatedServer
 from urlab_client.server.editor.markers import Drawings
-from urlab_client.server.render import camera_renderer
+from urlab_client.server.render import drawing, opengl
 from urlab_client.server.render.viewport_picture import SELECTED
 
 # A grey cube that collides, on a stick that does not, and a ball that falls away.
@@ -310,9 +310,9 @@ def test_no_opengl_is_a_clear_error(stage: Stage, monkeypatch: pytest.MonkeyPatc
 
 
 def test_broken_opengl_names_the_package(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(camera_renderer.sys, "platform", "linux")
-    monkeypatch.setattr(camera_renderer, "_PROBE", "import os; os.abort()  # {name}")
-    monkeypatch.setattr(camera_renderer, "_find", camera_renderer._find.__wrapped__)
+    monkeypatch.setattr(opengl.sys, "platform", "linux")
+    monkeypatch.setattr(opengl, "_PROBE", "import os; os.abort()  # {name}")
+    monkeypatch.setattr(opengl, "_find", opengl._find.__wrapped__)
     with pytest.raises(RenderingUnavailable, match=r"apt install libegl1.*ended with code"):
         stage.server.snapshot(SIZE)
 
@@ -321,7 +321,7 @@ def test_drawing_that_fails_is_an_error(stage: Stage, monkeypatch: pytest.Monkey
     def fail(*arguments: object) -> None:
         raise RuntimeError("the driver is gone")
 
-    monkeypatch.setattr(camera_renderer._Stage, "paint", fail)
+    monkeypatch.setattr(drawing.Stage, "paint", fail)
     for _ in range(2):
         with pytest.raises(RenderingUnavailable, match="log"):
             stage.server.snapshot(SIZE)

@@ -13,7 +13,7 @@ from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS, Stream
 from urlab_client.protocol.enums import CameraMode, known
 from urlab_client.protocol.messages.session import CameraInfo
 from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
-from urlab_client.protocol.rows import Pixels
+from urlab_client.protocol.pixels import Pixels
 
 __all__ = ["SharedFrame", "URLabCameraView"]
 

@@ -40,14 +40,14 @@ from urlab_client.aio.transport.curve import client_keys, is_local
 from urlab_client.aio.transport.server_regions import SharedMemoryRegions
 from urlab_client.aio.transport.shm import ShmTransport
 from urlab_client.protocol.base import Reply, Request
+from urlab_client.protocol.client_types import ClientConfig, Diagnosis, Resync
 from urlab_client.protocol.enums import CameraTiming, ObservationLevel, StepMode, Transport
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.protocol.messages.session import Hello, MetaOk, OpInfo, Reset, ResetOk, Step, StepOk
 from urlab_client.protocol.messages.session import Meta as MetaRequest
 from urlab_client.protocol.messages.streams import ClientEvent, RowSample, StateSnapshot, StreamPolicy
-from urlab_client.protocol.rows import TopicKind
-from urlab_client.protocol.types import ClientConfig, Diagnosis, Resync
+from urlab_client.protocol.topics import TopicKind
 
 __all__ = ["SESSION_LEVEL", "SessionLevel", "URLabClient"]
 
@@ -164,6 +164,7 @@ class URLabClient(ClientState):
             self._state_port,
             default_timeout=rcv_timeout_ms / 1000,
             live=lambda: self._state.mode is StepMode.LIVE,
+            features=lambda: session.features,
             keys=keys,
             memory=memory,
         )
@@ -360,7 +361,9 @@ class URLabClient(ClientState):
         """Stream the snapshots that the server publishes while play runs.
 
         One per physics tick in live mode, paused or not; one per step, else ten per second, in `direct`; ten per
-        second in `puppet`. Works beside everything else the client does, and costs the server nothing.
+        second in `puppet`. Works beside everything else the client does, and costs the server nothing. A server that
+        publishes in live mode only, as the beta, is helped out in the other modes: there a snapshot comes with each of
+        this client's own steps.
 
         Args:
             policy: `latest`, or `all` within the buffer.
@@ -394,6 +397,10 @@ class URLabClient(ClientState):
     ) -> Stream[RowSample]:
         """Stream the small rows that the server publishes in live mode: one joint, sensor or free base each.
 
+        Where a server publishes whole snapshots alone, as the beta, rows are made of those: in live mode of what it
+        publishes, in the other modes of the replies to this client's own steps, with the readings of their level.
+        Accelerations are NaN then.
+
         Args:
             articulation: Key of the articulation; None for all there are, and the plain entities.
             kinds: `joint`, `base_state`, `sensor`, `twist`, `actions`; of entities `xpos`, `xquat`, `qpos`, `qvel`.
@@ -408,15 +415,23 @@ class URLabClient(ClientState):
         Raises:
             KeyError: Unknown articulation.
             ValueError: Unknown kind or policy, or an empty buffer.
-            URLabError: `discover()` was not called yet.
+            URLabError: `discover()` was not called yet. Or rows have to be made of snapshots, and without a local model
+                joints are not known.
         """
         if self._state.hello is None:
             raise URLabError(
                 "row_stream: which articulations there are is not known yet.", hint="Call discover() first."
             )
+        if not self._session.features.publishes_rows and self.articulations and self.model is None:
+            raise URLabError(
+                "row_stream: this server publishes no rows; only with a local model can they be made of snapshots.",
+                hint="Make the client with local_model=True, or use state_stream().",
+            )
         keys = list(self.articulations) if articulation is None else [self.articulations[articulation].prefix]
         return Stream(
-            self._publishers.rows(keys, kinds, components, entities=articulation is None),
+            self._publishers.rows(
+                keys, kinds, components, entities=articulation is None, robots=lambda: self.articulations
+            ),
             policy=policy,
             buffer=buffer,
             buffer_bytes=buffer_bytes,

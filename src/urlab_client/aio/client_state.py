@@ -10,9 +10,9 @@ from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.session import Session
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.transport.base import TransportStats
+from urlab_client.protocol.client_types import ClientConfig, ServerInfo
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.names import NameMap
-from urlab_client.protocol.types import ClientConfig, ServerInfo
 
 if TYPE_CHECKING:
     import mujoco
@@ -97,8 +97,13 @@ class ClientState:
 
     @property
     def data(self) -> mujoco.MjData | None:
-        """Local state that mirrors the server's after each reply, or None without a model."""
-        return self._state.mirror.data
+        """Local state that mirrors the server's after each reply, or None without a model.
+
+        Poses and velocities that follow from the state (`xpos`, `site_xpos`, `cvel`, …) are computed when this is read
+        after a reply, so read it again after each step; whoever does not read it pays nothing. Forces and contacts are
+        not computed: use `mujoco.mj_forward` on a copy, or `runtime.get_contacts()`.
+        """
+        return self._state.mirror.current_data()
 
     @property
     def model_is_approximate(self) -> bool:

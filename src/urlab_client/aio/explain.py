@@ -14,13 +14,14 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from urlab_client.aio.event_loop import running_loop
+from urlab_client.aio.launch import LaunchedTransport
 from urlab_client.aio.session import Session
 from urlab_client.aio.state.sim_state import SimState
+from urlab_client.protocol.client_types import ClientConfig, Diagnosis, Finding, Verdict
 from urlab_client.protocol.enums import ControlMode, PIEState, StepMode
 from urlab_client.protocol.errors import RPC_ERRORS, SessionTakenOver, URLabError
 from urlab_client.protocol.messages.session import Meta
 from urlab_client.protocol.messages.sim import PieStatus
-from urlab_client.protocol.types import ClientConfig, Diagnosis, Finding, Verdict
 
 __all__ = ["diagnose", "watched"]
 
@@ -78,6 +79,8 @@ async def _examine(config: ClientConfig, session: Session, state: SimState) -> A
     yield finding
     if not playing:
         return
+    for finding in _physics(session, state):
+        yield finding
     for finding in _modes(config, state):
         yield finding
     for finding in _articulations(state):
@@ -171,6 +174,20 @@ async def _play(session: Session, state: SimState) -> tuple[Finding, bool]:
         return Finding(Verdict.PROBLEM, "play", text + "Call runtime.set_mode() or discover()."), True
     how = "running" if runs else "waiting for step()"
     return Finding(Verdict.OK, "play", f"Play is ready, physics {how} at {second.sim_time or 0:g} s."), True
+
+
+def _physics(session: Session, state: SimState) -> Iterator[Finding]:
+    if state.mirror.model is not None:
+        import mujoco  # noqa: PLC0415
+
+        options = state.mirror.model.opt
+        integrator = mujoco.mjtIntegrator(options.integrator).name.removeprefix("mjINT_").lower()
+        gravity = ", ".join(f"{value:g}" for value in options.gravity)
+        text = f"A step takes {options.timestep:g} s; integrator {integrator}, gravity ({gravity}) m/s²."
+        yield Finding(Verdict.OK, "physics", text)
+    if isinstance(session.transport, LaunchedTransport):
+        for warning in session.transport.scene_warnings:
+            yield Finding(Verdict.NOTE, "physics", f"{warning[:1].upper()}{warning[1:]}.")
 
 
 def _modes(config: ClientConfig, state: SimState) -> Iterator[Finding]:

@@ -117,9 +117,9 @@ class Session:
         if op.needs is not Needs.EDITOR:
             return await self._on_line(request, op, limits)
         # One job at a time: the next op of the editor would wait for it anyway, and block the server meanwhile.
-        await self.acquire(self.editing, op, limits.deadline)
+        await self.acquire(self.editing, op, limits[0])
         try:
-            await self.acquire(self.line, op, limits.deadline)
+            await self.acquire(self.line, op, limits[0])
             try:
                 answer = await self.exchange(request, op, limits)
             finally:
@@ -132,14 +132,14 @@ class Session:
                 op_reply(request, op),
                 answer,
                 lambda question: self._on_line(question, status, limits),
-                deadline=limits.deadline,
+                deadline=limits[0],
                 on_progress=on_progress,
             )
         finally:
             self.editing.release()
 
     async def _on_line(self, request: Request[R], op: Op, limits: Limits) -> R:
-        await self.acquire(self.line, op, limits.deadline)
+        await self.acquire(self.line, op, limits[0])
         try:
             return at_once(op, await self.exchange(request, op, limits))
         finally:
@@ -197,8 +197,10 @@ class Session:
         Raises:
             URLabError: It is another one than before, or not asyncio's.
         """
-        self._loop = running_loop(self._loop)
-        return self._loop
+        bound = self._loop
+        if bound is None or asyncio._get_running_loop() is not bound:  # noqa: SLF001  # as in `running_loop`
+            bound = self._loop = running_loop(bound)
+        return bound
 
     def check_offered(self, op: Op) -> None:
         """Refuse an op that the server does not list.
@@ -206,7 +208,8 @@ class Session:
         Raises:
             UnknownOp: It does not; nothing was sent.
         """
-        if op.name not in _UNLISTED and not self.features.offers(op.name):
+        listed = self.features.ops
+        if listed is not None and op.name not in listed and op.name not in _UNLISTED:
             raise UnknownOp("unknown_op", "this server does not offer it. Nothing was sent.", op=op.name)
 
     def limits(self, op: Op, timeout: Timeout, since: float, takes: float | None = None) -> Limits:
@@ -221,12 +224,13 @@ class Session:
         default = self._default_timeout
         if timeout is not DEFAULT:
             deadline = None if timeout is None else since + timeout
-            return Limits(deadline, deadline)
+            return deadline, deadline
         if default is None:
-            return Limits(None, None)
+            return None, None
         # A slow op may take long to answer; whether a server is there at all shows much sooner.
-        seconds = op.timeout if takes is None else takes
-        return Limits(since + max(seconds or 0.0, default), since + default)
+        seconds = (op.timeout if takes is None else takes) or 0.0
+        connect_by = since + default
+        return (since + seconds if seconds > default else connect_by), connect_by
 
     def exchange(self, request: Request[R], op: Op, limits: Limits) -> Coroutine[Any, Any, R | OpStarted]:
         """Send a request and return its answer; for whoever holds the line."""
@@ -264,7 +268,7 @@ class Session:
         except SessionTakenOver as refusal:
             # A handshake of our own that was given up opens a session all the same. What it made the server refuse
             # was not executed, and is sent once more in that session.
-            if not again and await self._settled(limits.deadline) and self.session_id != stamped:
+            if not again and await self._settled(limits[0]) and self.session_id != stamped:
                 return await self._answer(request, op, limits, again=True)
             if not stamped:
                 raise NoSession("no session is open.", op=op.name) from None
@@ -285,10 +289,11 @@ class Session:
                 self.on_refusal(refusal)
             raise
         if isinstance(reply, StateReply):
-            self.features = self.features.with_reply(reply)
-        if isinstance(reply, HelloOk):
+            if (reply.arts is not None) is not self.features.arts:
+                self.features = self.features.with_reply(reply)
+        elif isinstance(reply, HelloOk):
             self._open(reply)
-        elif not self.confirmed:
+        if not self.confirmed:
             self.confirmed = op.needs is not Needs.NOTHING and stamped == self.session_id
         return reply
 
@@ -331,9 +336,8 @@ class Session:
         while True:
             log.debug("%s: asking again, because the connection was lost", op.name)
             try:
-                return await self._transport.request(
-                    frame, op, deadline=limits.deadline, connect_by=limits.connect_by, late=late
-                )
+                deadline, connect_by = limits
+                return await self._transport.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
             except ConnectionLost as again:
                 lost = again
             except ServerUnreachable as unreachable:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -22,8 +23,8 @@ from urlab_client.protocol.errors import (
     URLabError,
     URLabTimeoutError,
 )
+from urlab_client.protocol.layouts import BytesLike
 from urlab_client.protocol.messages.streams import StreamItem, StreamPolicy, StreamStats
-from urlab_client.protocol.rows import BytesLike
 
 __all__ = ["BUFFER_BYTES", "BUFFER_ITEMS", "Stream"]
 
@@ -284,7 +285,7 @@ class _StreamChannel(MessageHandler, Generic[T]):
                     if timeout is DEFAULT and self._arrived is None and more > 0.0:
                         self._expired = False
                         seconds += more
-                        timer = loop.call_later(more, self._expire)
+                        timer = None if math.isinf(more) else loop.call_later(more, self._expire)
                         continue
                     problem, advice = self._source.silence(self, seconds)
                     raise URLabTimeoutError(f"{self._source.name}: {problem}", hint=advice)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Coroutine
 from types import TracebackType
-from typing import Any, NamedTuple, Protocol, Self, TypeVar
+from typing import Any, Protocol, Self, TypeAlias, TypeVar, cast
 
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.mutex import Mutex
@@ -21,11 +21,8 @@ R = TypeVar("R", bound=Reply)
 T = TypeVar("T")
 
 
-class Limits(NamedTuple):
-    """Loop times by which a request must have been answered, and a connection must stand; None waits."""
-
-    deadline: float | None
-    connect_by: float | None
+Limits: TypeAlias = tuple[float | None, float | None]
+"""Loop times by which a request must have been answered, and a connection must stand; None waits."""
 
 
 class TurnSession(Protocol):
@@ -54,12 +51,9 @@ class Turn:
 
     Within it a request is built, sent, accounted for and taken over. Requests that do not depend on the client's state
     may go in between only during `aside`.
-
-    Attributes:
-        sent: Whether the request of the latest `call` left, so that the server may have executed it.
     """
 
-    __slots__ = ("_asked", "_began", "_each", "_first", "_op", "_ready", "_session", "_timeout", "sent")
+    __slots__ = ("_asked", "_before", "_began", "_each", "_first", "_left", "_op", "_ready", "_session", "_timeout")
 
     def __init__(self, session: TurnSession, op: Op, timeout: Timeout, *, each: bool) -> None:
         self._session = session
@@ -70,7 +64,8 @@ class Turn:
         self._first = True
         self._ready = False
         self._began = session.bound_loop().time()
-        self.sent = False
+        self._before = 0  # requests that had been sent before the latest `call`
+        self._left = False
 
     def begin_at_once(self) -> bool:
         """Begin if nobody else has a turn and nothing is under way; return whether it was so."""
@@ -93,9 +88,9 @@ class Turn:
         session, op = self._session, self._op
         limits = self._asked or session.limits(op, self._timeout, self._began)
         self._asked = limits
-        await session.acquire(session.turns, op, limits.deadline)
+        await session.acquire(session.turns, op, limits[0])
         try:
-            await self._take_line(limits.deadline)
+            await self._take_line(limits[0])
         except BaseException:
             session.turns.release()
             raise
@@ -115,7 +110,12 @@ class Turn:
     ) -> None:
         self.end()
 
-    async def call(self, request: Request[R], *, takes: float | None = None) -> R:
+    @property
+    def sent(self) -> bool:
+        """Whether the request of the latest `call` left, so that the server may have executed it."""
+        return self._session.transport.stats.sent > self._before if self._ready else self._left
+
+    def call(self, request: Request[R], *, takes: float | None = None) -> Coroutine[Any, Any, R]:
         """Send a request, built since the last wait of this turn, and return its reply.
 
         Args:
@@ -126,25 +126,23 @@ class Turn:
             URLabError: As `Session.call`.
         """
         session, op = self._session, op_of(request)
+        self._before = session.transport.stats.sent
         session.check_offered(op)
         limits = self._asked
         if limits is None or op is not self._op or takes is not None:
             limits = self._limits(op, takes)
         self._asked = None
         self._first = False
-        stats = session.transport.stats
-        before = stats.sent
-        self.sent = False
-        try:
-            return at_once(op, await session.exchange(request, op, limits))
-        finally:
-            self.sent = stats.sent > before
+        answer = session.exchange(request, op, limits)
+        if op.needs is Needs.EDITOR:
+            return _at_once(op, answer)
+        return cast("Coroutine[Any, Any, R]", answer)  # only the editor's ops are ever answered with a job
 
     async def aside(self, work: Awaitable[T]) -> T:
         """Let requests that do not depend on the client's state pass while `work`, which sends nothing, is done."""
         self._give_line()
         result = await work
-        await self._take_line(self._limits(self._op).deadline)
+        await self._take_line(self._limits(self._op)[0])
         return result
 
     async def _take_line(self, deadline: float | None) -> None:
@@ -161,6 +159,7 @@ class Turn:
         self._ready = True
 
     def _give_line(self) -> None:
+        self._left = self.sent
         self._ready = False
         self._session.line.release()
         if self._op.needs is Needs.EDITOR:
@@ -171,6 +170,10 @@ class Turn:
         counted = self._first or (self._timeout is not DEFAULT and not self._each)
         since = self._began if counted else asyncio.get_running_loop().time()
         return self._session.limits(op, self._timeout, since, takes)
+
+
+async def _at_once(op: Op, answer: Awaitable[R | OpStarted]) -> R:
+    return at_once(op, await answer)
 
 
 def at_once(op: Op, answer: R | OpStarted) -> R:

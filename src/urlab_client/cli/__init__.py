@@ -1,4 +1,4 @@
-"""The `urlab` command: a simulated server, a look at who answers, a diagnosis, a demonstration.
+"""The `urlab` command: servers, diagnoses, demonstrations, recordings, views and policies at the terminal.
 
 Each command has a module of its own and imports what is heavy (MuJoCo, the server, the demo's libraries) when it
 runs. A failure that can be foreseen is one line on standard error and exit code 2.
@@ -7,6 +7,7 @@ runs. A failure that can be foreseen is one line on standard error and exit code
 from __future__ import annotations
 
 import argparse
+import errno
 import logging
 import os
 import signal
@@ -28,6 +29,7 @@ _COMMANDS = (
     "ping",
     "doctor",
     "demo",
+    "robots",
     "keys",
     "snapshot",
     "record",
@@ -49,6 +51,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Arguments without the program's name; default those of this process.
     """
     argv = sys.argv[1:] if argv is None else argv
+    if (reconfigure := getattr(sys.stdout, "reconfigure", None)) is not None:
+        reconfigure(errors="backslashreplace")  # not every terminal has the characters of every file's name
+    if not argv:
+        print(_parser().format_help(), end="")
+        return 0
     # Every `sim://` server is an `urlab serve`, which starts sooner without the modules of the other commands.
     parser = _parser(*(name for name in argv[:1] if name in _COMMANDS))
     arguments = parser.parse_args(argv)
@@ -60,15 +67,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         return run(arguments)
     except KeyboardInterrupt:
         return _INTERRUPTED
-    except BrokenPipeError:
-        # Whoever read the output has gone; what the interpreter would still flush at its end goes nowhere, too.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return _FAILED
     except (CommandError, MissingExtra, URLabError, OSError) as error:
+        if _is_broken_pipe(error):
+            # Whoever read the output has gone; what the interpreter would still flush at its end goes nowhere, too.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return _FAILED
         sys.stderr.write(f"{name}: {one_line(error)}\n")
         return _FAILED
     finally:
         logging.getLogger("urlab_client").removeHandler(handler)
+
+
+def _is_broken_pipe(error: Exception) -> bool:
+    """Whether nobody reads a pipe any more, of which Windows says that the argument is invalid."""
+    if os.name == "nt":
+        return isinstance(error, OSError) and error.errno in {errno.EPIPE, errno.EINVAL} and error.filename is None
+    return isinstance(error, BrokenPipeError)
 
 
 def _parser(*commands: str) -> Parser:
@@ -76,8 +90,13 @@ def _parser(*commands: str) -> Parser:
     parser = Parser(
         prog="urlab",
         description="Clients and a simulated server for URLab, the Unreal plugin that embeds MuJoCo.",
-        epilog="Exit codes: 0 success, 1 a diagnosis with problems, 2 wrong usage or a failure explained on standard "
-        "error, 130 Ctrl-C.",
+        epilog="Exit codes: 0 success, 1 a result with problems (each command's help says which), 2 wrong usage or a "
+        "failure explained on standard error, 130 Ctrl-C.",
+        examples=(
+            ("urlab demo", "see a robot move; needs no Unreal"),
+            ("urlab robots", "the robots that are included"),
+            ("urlab COMMAND --help", "options and examples of a command"),
+        ),
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="show program's version number and exit")
     subparsers = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND", required=True)

@@ -90,6 +90,14 @@ def add_parser(commands: Commands) -> None:
         help="run a simulated server",
         description="Run a simulated server that any URLab client can talk to. It ends with exit code 0 on SIGINT "
         "(Ctrl-C) and SIGTERM, and with 2 when it fails.",
+        examples=(
+            ("urlab serve quadruped --play", "a bundled robot at tcp://localhost, in a play session"),
+            (
+                "urlab serve robot.xml --play --unpaused --mjcf-options",
+                "your own model, simulated in real time with its own <option>",
+            ),
+            ("urlab serve arm ball --step-port 0 --json", "two models on any free port; one line of JSON names it"),
+        ),
     )
     parser.add_argument(
         "models",
@@ -194,8 +202,9 @@ def add_parser(commands: Commands) -> None:
     )
     physics.add_argument(
         "--mjcf-options",
-        action="store_true",
-        help="honour the <option> of each model; without it the plugin's defaults apply, with a warning",
+        action=argparse.BooleanOptionalAction,
+        default=False,
+        help="honour the <option> of the first model; without it the plugin's defaults apply, with a warning",
     )
     cameras = parser.add_argument_group("cameras")
     cameras.add_argument(
@@ -385,6 +394,7 @@ def _announce(server: SimulatedServer, arguments: ServeArguments) -> None:
         ready |= {f"{name}_port": number for name, number in ports.items()}
         shm_dir = None if server.shm_dir is None else str(server.shm_dir)
         ready |= {"shm_dir": shm_dir, "saved_dir": str(server.saved_dir), "pid": os.getpid()}
+        ready |= {"scene_warnings": server.scene_warnings}
         ready |= {"open_to": server.open_to, "server_key": server.client_options().get("server_key")}
         print(json.dumps(ready), flush=True)
         return
@@ -419,12 +429,12 @@ def _check_ports(arguments: ServeArguments) -> None:
 
 
 def _check_paths(arguments: ServeArguments) -> None:
-    from urlab_client.server.assets.bundled_robots import bundled_models  # noqa: PLC0415
+    from urlab_client.server.assets.bundled_robots import bundled_models, unknown_model  # noqa: PLC0415
 
     bundled = bundled_models()
     for model in arguments.models:
         if model not in bundled and not Path(model).is_file():
-            raise CommandError(f"{model}: no such file, and no bundled robot, which are {', '.join(bundled)}")
+            raise CommandError(unknown_model(model))
     for folder in arguments.model_root or ():
         if not folder.is_dir():
             raise CommandError(f"--model-root {folder}: no such folder")

@@ -14,7 +14,6 @@ import numpy as np
 from urlab_client.cluster.episodes import Episode, Job, Policy, seed_of
 from urlab_client.cluster.leases import Lease
 from urlab_client.integrations.gym.env import URLabEnv
-from urlab_client.sync.client import URLabClient
 
 __all__ = ["Worker", "run_episode"]
 
@@ -29,7 +28,7 @@ class Worker:
 
     def __init__(self, env_options: Mapping[str, Any], client_options: Mapping[str, Any], lease_timeout: float) -> None:
         self._env_options = env_options
-        self._client_options: dict[str, Any] = {"step_mode": "direct", **client_options}
+        self._client_options = client_options
         self._lease_timeout = lease_timeout
         self._address = ""
         self._env: URLabEnv | None = None
@@ -101,13 +100,7 @@ class Worker:
         if self._env is not None and self._address == address:
             return self._env
         self.close()
-        client = URLabClient(address, **self._client_options)
-        try:
-            client.discover()
-            self._env = URLabEnv(client, owns_client=True, **self._env_options)
-        except BaseException:
-            client.close()
-            raise
+        self._env = URLabEnv.connect(address, client_options=self._client_options, **self._env_options)
         self._address = address
         return self._env
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import base64
 import math
 import re
+import struct
 from _thread import allocate_lock
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
@@ -52,6 +53,8 @@ _COPY_SUFFIX = "_base64"  # a second copy of what is there as binary; see `Hello
 R = TypeVar("R", bound=Reply)
 Buffer = bytes | bytearray | memoryview
 
+_SHORT = 256  # values of a robot, not pixels
+
 # `_thread` and not `threading`: nothing here starts threads, but clients and servers call from several.
 _BUILDING = allocate_lock()
 _BUILD_S = 1.0
@@ -80,8 +83,24 @@ def op_of(request: Request[Any] | type[Request[Any]]) -> Op:
     return _OP_BY_REQUEST[request if isinstance(request, type) else type(request)]
 
 
+@cache
+def _packer(count: int) -> Callable[..., None]:
+    return struct.Struct(f"{count}d").pack_into
+
+
 def from_wire_array(kind: type, value: Any) -> Any:
     """Decoding hook: a list of numbers becomes a float64 array of shape (n,)."""
+    if type(value) is list:
+        numbers = cast("list[Any]", value)
+        if len(numbers) <= _SHORT:
+            # Twice as fast as what follows, and it takes only numbers: whatever else there is falls through.
+            packed = np.empty(len(numbers))
+            try:
+                _packer(len(numbers))(packed, 0, *numbers)
+            except (struct.error, OverflowError):
+                pass
+            else:
+                return packed
     try:
         array: np.ndarray[Any, np.dtype[np.float64]] = np.array(value, dtype=np.float64)
     except OverflowError as error:  # integers have no limit in JSON; msgspec expects ValueError

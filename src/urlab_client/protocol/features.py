@@ -7,6 +7,7 @@ Generations of the plugin took their features one by one, and version strings li
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import cached_property
 from typing import Literal
 
 from msgspec import Struct
@@ -18,7 +19,7 @@ from urlab_client.protocol.messages.session import HelloOk, StateReply
 __all__ = ["Features"]
 
 
-class Features(Struct, frozen=True, kw_only=True):
+class Features(Struct, frozen=True, kw_only=True, dict=True):
     """What a server can do.
 
     Attributes:
@@ -56,7 +57,7 @@ class Features(Struct, frozen=True, kw_only=True):
         """Return what is known after a claim in the name of `sent`."""
         return replace(self, reads_owner=reply.owner == sent)
 
-    # What the rest of the client asks.
+    # What the rest of the client asks, some of it for every step: worked out once.
 
     def offers(self, op: str) -> bool:
         """Whether the server lists an op; a server without a list may have any."""
@@ -65,87 +66,87 @@ class Features(Struct, frozen=True, kw_only=True):
     def _lists(self, op: str) -> bool:
         return self.ops is not None and op in self.ops
 
-    @property
+    @cached_property
     def claims(self) -> bool:
         """Robots have an owner, and others' writes are refused."""
         return self._lists("claim_control")
 
-    @property
+    @cached_property
     def jobs(self) -> bool:
         """Some editor ops answer `op_started`, and `op_status` delivers their replies."""
         return self._lists("op_status")
 
-    @property
+    @cached_property
     def remove_op(self) -> Literal["destroy_actor", "remove_actor"]:
         """What removing an actor is called."""
         return "remove_actor" if self._lists("remove_actor") else "destroy_actor"
 
-    @property
+    @cached_property
     def camera_switch(self) -> bool:
         """Cameras stream only after `set_camera_streaming`."""
         return self._lists("set_camera_streaming")
 
-    @property
+    @cached_property
     def camera_delay(self) -> bool:
         """Cameras can be given a latency."""
         return self._lists("set_camera_delay")
 
-    @property
+    @cached_property
     def uploads(self) -> bool:
         """Models can be brought over the wire."""
         return self._lists("upload_model_manifest")
 
-    @property
+    @cached_property
     def leases(self) -> bool:
         """Clients can tell each other who uses the server."""
         return self._lists("acquire_lease")
 
-    @property
+    @cached_property
     def user_channels(self) -> bool:
         """Levels can declare values of their own that clients write and read."""
         return self._lists("set_user_channels")
 
-    @property
+    @cached_property
     def renders_sync(self) -> bool:
         """`render: "sync"` makes a step wait for pictures of its own state."""
         return "render_sync" in self.capabilities
 
-    @property
+    @cached_property
     def _beta_state(self) -> bool:
         # The encoder that says `arts` is the one that publishes in live mode only, and no rows.
         return self.claims if self.arts is None else self.arts
 
-    @property
+    @cached_property
     def live_pictures_in_steps(self) -> bool:
         """A step in live mode may bring pictures, too, and applies all commands."""
         return self._beta_state
 
-    @property
+    @cached_property
     def publishes_steps(self) -> bool:
         """State is published outside live mode, too."""
         return not self._beta_state
 
-    @property
+    @cached_property
     def publishes_rows(self) -> bool:
         """Single joints, sensors and so on are published as rows."""
         return not self._beta_state
 
-    @property
+    @cached_property
     def level_sticks(self) -> bool:
         """The observation level of a step holds for later steps, too."""
         return not self._beta_state
 
-    @property
+    @cached_property
     def exact_controls(self) -> bool:
         """Set-points and what controllers make of them are not rounded to single precision."""
         return self._beta_state
 
-    @property
+    @cached_property
     def idles_in_puppet(self) -> bool:
         """Physics takes steps of its own between the pushes of puppet mode, unless it is paused."""
         return self._beta_state
 
-    @property
+    @cached_property
     def generation(self) -> str:
         """For people: `alpha`, `june`, `beta`, `3`, or empty before anything is known. Nothing depends on it."""
         if self.ops is None:

@@ -6,10 +6,11 @@ package imports MuJoCo.
 
 from urlab_client.server.assets.bundled_robots import bundled_models
 from urlab_client.server.faults import ActiveFault, Corrupt, Cut, Delay, Drop, Fault, Faults, Refuse
+from urlab_client.server.initial_level import ModelError
 from urlab_client.server.limits import Limits
 from urlab_client.server.physics.controllers import ControllerConfig
-from urlab_client.server.render.camera_renderer import RenderingUnavailable
-from urlab_client.server.simulated import ModelError, SimulatedServer
+from urlab_client.server.render.opengl import RenderingUnavailable
+from urlab_client.server.simulated import SimulatedServer
 from urlab_client.server.transport.curve_authentication import CurveServer, UnprotectedServer
 from urlab_client.server.transport.endpoint import PortInUse
 

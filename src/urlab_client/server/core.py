@@ -36,7 +36,8 @@ from urlab_client.server.physics.engine import Engine
 from urlab_client.server.physics.observe import Observer
 from urlab_client.server.physics.play import Play, Running
 from urlab_client.server.physics.replay import recordings, replay_folder
-from urlab_client.server.render.camera_renderer import CameraRenderer, RenderQuality
+from urlab_client.server.render.camera_renderer import CameraRenderer
+from urlab_client.server.render.drawing import RenderQuality
 from urlab_client.server.session import ServerSession
 from urlab_client.server.system.allocator import trim
 from urlab_client.server.system.health import Health

@@ -30,6 +30,7 @@ from collections.abc import Callable, Coroutine
 from typing import Any, Generic, TypeVar
 
 from urlab_client.protocol.errors import ClientClosed
+from urlab_client.sync._caller_loop import CallerLoop
 from urlab_client.sync._signals import DeferredSignals
 
 __all__ = ["GRACE", "CallerDrivenLoop", "Job", "client_closed"]
@@ -113,7 +114,7 @@ class CallerDrivenLoop:
 
     def __init__(self, at_stop: Callable[[], Coroutine[Any, Any, object]] | None) -> None:
         # Not new_event_loop(): the user's loop policy is about the user's loop, and pyzmq needs a selector on Windows.
-        self._loop = asyncio.SelectorEventLoop()
+        self._loop = CallerLoop()
         self._thread = threading.Thread(target=self._run, name="urlab-io", daemon=True)
         self._pid = os.getpid()
         self._at_stop = at_stop
@@ -282,7 +283,7 @@ class CallerDrivenLoop:
     def _run_loop(self) -> None:
         # A task that raises one of these breaks out of the loop. If it is a job, its caller gets it through that.
         try:
-            self._loop.run_forever()
+            self._loop.run_until_stopped()
         except (KeyboardInterrupt, SystemExit) as error:
             _log.debug("a task on the loop raised %r", error)
 
@@ -372,6 +373,11 @@ class CallerDrivenLoop:
                 self._turn.release()
                 self._await_turn()
                 self._thread_drives = True
+        # Between two runs of the loop: while it runs, Python 3.14 tells only of those tasks that this thread has made.
+        end = self._loop.create_task(self._end(asyncio.all_tasks(self._loop)))
+        end.add_done_callback(lambda _: self._loop.stop())
+        while not end.done():
+            self._run_loop()
         with self._lock:
             for job in tuple(self._jobs):
                 self._break_off(job)
@@ -399,7 +405,8 @@ class CallerDrivenLoop:
         await self._stop_requested.wait()
         if self._at_stop is not None:
             await _in_bounded_time(asyncio.ensure_future(self._at_stop()))
-        tasks = asyncio.all_tasks() - {asyncio.current_task()}
+
+    async def _end(self, tasks: set[asyncio.Task[Any]]) -> None:
         for task in tasks:
             task.cancel()
         await _in_bounded_time(*tasks)

@@ -15,7 +15,7 @@ from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraInfo
 from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
-from urlab_client.protocol.rows import Pixels
+from urlab_client.protocol.pixels import Pixels
 from urlab_client.sync._facade import Facade
 from urlab_client.sync.streams import Stream
 

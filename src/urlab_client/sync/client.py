@@ -14,11 +14,11 @@ from urlab_client.aio.client import SESSION_LEVEL, SessionLevel
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS
 from urlab_client.protocol.base import Reply, Request
+from urlab_client.protocol.client_types import Diagnosis, Resync
 from urlab_client.protocol.enums import CameraTiming, ObservationLevel, StepMode, Transport
 from urlab_client.protocol.messages.session import OpInfo, ResetOk, StepOk
 from urlab_client.protocol.messages.streams import ClientEvent, RowSample, StateSnapshot, StreamPolicy
-from urlab_client.protocol.rows import TopicKind
-from urlab_client.protocol.types import Diagnosis, Resync
+from urlab_client.protocol.topics import TopicKind
 from urlab_client.sync._facade import FacadeRoot
 from urlab_client.sync.client_state import ClientState
 from urlab_client.sync.namespaces.debug import DebugNamespace
@@ -278,7 +278,9 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
         """Stream the snapshots that the server publishes while play runs.
 
         One per physics tick in live mode, paused or not; one per step, else ten per second, in `direct`; ten per
-        second in `puppet`. Works beside everything else the client does, and costs the server nothing.
+        second in `puppet`. Works beside everything else the client does, and costs the server nothing. A server that
+        publishes in live mode only, as the beta, is helped out in the other modes: there a snapshot comes with each of
+        this client's own steps.
 
         Args:
             policy: `latest`, or `all` within the buffer.
@@ -308,6 +310,10 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
     ) -> Stream[RowSample]:
         """Stream the small rows that the server publishes in live mode: one joint, sensor or free base each.
 
+        Where a server publishes whole snapshots alone, as the beta, rows are made of those: in live mode of what it
+        publishes, in the other modes of the replies to this client's own steps, with the readings of their level.
+        Accelerations are NaN then.
+
         Args:
             articulation: Key of the articulation; None for all there are, and the plain entities.
             kinds: `joint`, `base_state`, `sensor`, `twist`, `actions`; of entities `xpos`, `xquat`, `qpos`, `qvel`.
@@ -322,7 +328,8 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
         Raises:
             KeyError: Unknown articulation.
             ValueError: Unknown kind or policy, or an empty buffer.
-            URLabError: `discover()` was not called yet.
+            URLabError: `discover()` was not called yet. Or rows have to be made of snapshots, and without a local model
+                joints are not known.
         """
         return self._wrap(
             Stream[RowSample],

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 from urlab_client.aio import client_state as aio
 from urlab_client.aio.transport.base import TransportStats
+from urlab_client.protocol.client_types import ClientConfig, ServerInfo
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.names import NameMap
-from urlab_client.protocol.types import ClientConfig, ServerInfo
 from urlab_client.sync._facade import Facade
 from urlab_client.sync.articulation import URLabArticulation, URLabEntity
 from urlab_client.sync.cameras import URLabCameraView
@@ -90,7 +90,12 @@ class ClientState(Facade, twin=aio.ClientState):
 
     @property
     def data(self) -> mujoco.MjData | None:
-        """Local state that mirrors the server's after each reply, or None without a model."""
+        """Local state that mirrors the server's after each reply, or None without a model.
+
+        Poses and velocities that follow from the state (`xpos`, `site_xpos`, `cvel`, …) are computed when this is read
+        after a reply, so read it again after each step; whoever does not read it pays nothing. Forces and contacts are
+        not computed: use `mujoco.mj_forward` on a copy, or `runtime.get_contacts()`.
+        """
         return self._aio.data
 
     @property

@@ -11,17 +11,14 @@ from urlab_client.aio.transport.regions import Place, Regions, SharedPicture
 from urlab_client.aio.transport.subscriber import MessageHandler, Subscription, Subscriptions
 from urlab_client.protocol import doorbell
 from urlab_client.protocol.enums import CameraMode
+from urlab_client.protocol.layouts import BytesLike
 from urlab_client.protocol.messages.session import CameraInfo
 from urlab_client.protocol.messages.streams import (
     CameraSample,
 )
-from urlab_client.protocol.rows import (
-    BytesLike,
-    camera_filter,
-    decode_camera,
-    resolve_endpoint,
-)
+from urlab_client.protocol.pixels import decode_camera
 from urlab_client.protocol.shm import camera_file
+from urlab_client.protocol.topics import camera_filter, resolve_endpoint
 
 __all__ = ["CameraSource", "HasCamera", "SharedCameraSource"]
 

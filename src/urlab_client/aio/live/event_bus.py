@@ -9,6 +9,7 @@ import msgspec
 
 from urlab_client.aio.streams import Stream
 from urlab_client.aio.transport.subscriber import MessageHandler, client_closed
+from urlab_client.protocol.layouts import BytesLike
 from urlab_client.protocol.messages.streams import (
     ClientEvent,
     PlayEnded,
@@ -21,9 +22,6 @@ from urlab_client.protocol.messages.streams import (
     SessionLost,
     SessionOpened,
     StreamPolicy,
-)
-from urlab_client.protocol.rows import (
-    BytesLike,
 )
 
 __all__ = ["EventBus"]

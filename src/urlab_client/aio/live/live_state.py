@@ -13,8 +13,9 @@ from urlab_client.aio.live.camera_source import CameraSource
 from urlab_client.aio.live.state_source import StateSource
 from urlab_client.aio.transport.subscriber import MessageGone, MessageHandler
 from urlab_client.protocol.errors import ProtocolError, URLabError
+from urlab_client.protocol.layouts import BytesLike
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.protocol.rows import BytesLike, Pixels
+from urlab_client.protocol.pixels import Pixels
 
 __all__ = ["LatestPicture", "LiveState", "LiveStats"]
 

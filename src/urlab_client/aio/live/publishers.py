@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 
 import numpy as np
 
 from urlab_client.aio.live.camera_source import CameraSource, HasCamera, SharedCameraSource
 from urlab_client.aio.live.camera_switch import CameraSwitch
+from urlab_client.aio.live.derived_rows import DerivedRowSource, HasRows
 from urlab_client.aio.live.event_bus import EventBus
 from urlab_client.aio.live.row_source import RowSource
 from urlab_client.aio.live.state_source import OwnSteps, SharedStateSource, StateSource
@@ -17,8 +18,10 @@ from urlab_client.aio.transport.server_regions import SharedMemoryRegions
 from urlab_client.aio.transport.subscriber import Subscriptions, client_closed
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.errors import URLabError
+from urlab_client.protocol.features import Features
 from urlab_client.protocol.messages.streams import StreamPolicy
-from urlab_client.protocol.rows import Pixels, TopicKind
+from urlab_client.protocol.pixels import Pixels
+from urlab_client.protocol.topics import TopicKind
 
 __all__ = ["Publishers", "SharedFrame"]
 
@@ -53,6 +56,7 @@ class Publishers:
         state_port: Tells the port of the state stream.
         default_timeout: Seconds that a stream waits for its first item unless told otherwise; None waits.
         live: Tells whether the server is in live mode, as far as is known.
+        features: Tells what the server can do.
         keys: What the publishers demand; None for nothing.
         memory: Where the regions are, for a client that receives from shared memory.
 
@@ -72,6 +76,7 @@ class Publishers:
         *,
         default_timeout: float | None,
         live: Callable[[], bool] = lambda: True,
+        features: Callable[[], Features] = Features,
         keys: ClientKeys | None = None,
         memory: SharedMemoryRegions | None = None,
     ) -> None:
@@ -84,13 +89,19 @@ class Publishers:
         self._rpc_endpoint = rpc_endpoint
         self._state_port = state_port
         self._live = live
+        self._features = features
 
     def state(self, policy: str = StreamPolicy.LATEST) -> StateSource:
         """Return what brings snapshots to a stream of that policy."""
         # A region keeps the newest only.
         if self.regions is None or policy == StreamPolicy.ALL:
-            return StateSource(self.subscriptions, self._state_endpoint, self.own_steps)
-        return SharedStateSource(self.regions, self.subscriptions, self._state_endpoint, self.own_steps)
+            return StateSource(self.subscriptions, self._state_endpoint, self.own_steps, only_own=self._only_own)
+        return SharedStateSource(
+            self.regions, self.subscriptions, self._state_endpoint, self.own_steps, only_own=self._only_own
+        )
+
+    def _only_own(self) -> bool:
+        return not (self._features().publishes_steps or self._live())
 
     def rows(
         self,
@@ -99,9 +110,16 @@ class Publishers:
         components: Collection[str],
         *,
         entities: bool,
+        robots: Callable[[], Mapping[str, HasRows]],
     ) -> RowSource:
-        """Return what brings rows; see `RowSource`."""
-        return RowSource(self.subscriptions, self._state_endpoint, articulations, kinds, components, entities=entities)
+        """Return what brings rows; see `RowSource`, and `DerivedRowSource` for servers that publish none."""
+        if self._features().publishes_rows:
+            return RowSource(
+                self.subscriptions, self._state_endpoint, articulations, kinds, components, entities=entities
+            )
+        # From the socket, which brings every snapshot: of a region, the newest counts.
+        states = self.state(StreamPolicy.ALL)
+        return DerivedRowSource(states, robots, articulations, kinds, components, entities=entities)
 
     def camera(self, view: HasCamera, policy: str = StreamPolicy.LATEST, *, asked: bool = True) -> CameraSource:
         """Return what brings a camera's pictures to a stream of that policy; see `CameraSource`."""

@@ -8,17 +8,12 @@ from urlab_client.aio.live.source import SocketSource
 from urlab_client.aio.live.state_source import StateSource
 from urlab_client.aio.transport.subscriber import Subscription, Subscriptions
 from urlab_client.protocol.errors import ProtocolError
+from urlab_client.protocol.layouts import BytesLike
 from urlab_client.protocol.messages.streams import (
     RowSample,
 )
-from urlab_client.protocol.rows import (
-    BytesLike,
-    StreamTopic,
-    TopicKind,
-    articulation_filter,
-    decode_row,
-    scene_filter,
-)
+from urlab_client.protocol.rows import decode_row
+from urlab_client.protocol.topics import StreamTopic, TopicKind, articulation_filter, scene_filter
 
 __all__ = ["RowSource"]
 
@@ -38,6 +33,9 @@ class RowSource(SocketSource):
         kinds: Kinds of rows; empty for all that the other arguments allow.
         components: Component names of joints, free joints and sensors; empty for all.
         entities: Whether `kinds` left empty includes the scene rows.
+
+    Attributes:
+        articulations: As given.
 
     Raises:
         ValueError: A kind is not one of rows, a name cannot stand in a topic, or nothing is left to receive.
@@ -62,7 +60,7 @@ class RowSource(SocketSource):
     ) -> None:
         super().__init__(subscriptions)
         self._endpoint = endpoint
-        self._articulations = frozenset(articulations)
+        self.articulations = frozenset(articulations)
         self._components = frozenset(components)
         self._kinds = frozenset(TopicKind(kind) for kind in kinds)
         if not self._kinds:
@@ -77,7 +75,7 @@ class RowSource(SocketSource):
 
     def _narrow(self) -> set[bytes]:
         filters = {scene_filter()} if self._kinds & _OF_SCENE else set[bytes]()
-        for key in self._articulations:
+        for key in self.articulations:
             if not self._components and self._kinds >= _OF_ARTICULATION:
                 filters.add(articulation_filter(key))
                 continue
@@ -97,12 +95,16 @@ class RowSource(SocketSource):
             found = StreamTopic.parse(topic)
         except ProtocolError:
             return False  # a kind of topic that a newer server has
+        return self.has(found)
+
+    def has(self, found: StreamTopic) -> bool:
+        """Whether rows of a topic are among those that are wanted."""
         if found.kind not in self._kinds:
             return False
         if found.kind in _OF_SCENE:
             return True
         named = found.kind not in _OF_COMPONENT or not self._components or found.name in self._components
-        return named and found.owner in self._articulations
+        return named and found.owner in self.articulations
 
     def wants(self, topic: bytes, payload: BytesLike) -> bool:
         """Leave out components that are not in the compiled model: their rows carry a negative id and zeros."""

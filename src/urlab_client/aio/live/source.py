@@ -6,9 +6,7 @@ from abc import ABC, abstractmethod
 
 from urlab_client.aio.transport.regions import Place, Regions
 from urlab_client.aio.transport.subscriber import MessageHandler, Subscription, Subscriptions
-from urlab_client.protocol.rows import (
-    BytesLike,
-)
+from urlab_client.protocol.layouts import BytesLike
 
 __all__ = ["SharedMemorySource", "SocketSource"]
 

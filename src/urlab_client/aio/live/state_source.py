@@ -1,7 +1,8 @@
-"""The snapshots of the simulation: from the state socket, the state region, or the client"s own steps."""
+"""The snapshots of the simulation: from the state socket, the state region, or the client's own steps."""
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable
 
@@ -9,17 +10,21 @@ from urlab_client.aio.live.source import SharedMemorySource, SocketSource
 from urlab_client.aio.transport.regions import Place, Regions
 from urlab_client.aio.transport.subscriber import MessageHandler, Subscription, Subscriptions
 from urlab_client.protocol import doorbell
+from urlab_client.protocol.layouts import BytesLike
 from urlab_client.protocol.messages.session import StateReply
 from urlab_client.protocol.messages.streams import (
     StateSnapshot,
 )
-from urlab_client.protocol.rows import (
-    STATE_FULL,
-    BytesLike,
-)
 from urlab_client.protocol.shm import STATE_FILE
+from urlab_client.protocol.topics import STATE_FULL
 
 __all__ = ["OwnSteps", "SharedStateSource", "StateSource"]
+
+
+_ONLY_OWN = (
+    "This server publishes state in live mode only: client.runtime.set_mode('live'). In the other modes it comes with "
+    "this client's own steps."
+)
 
 
 class OwnSteps:
@@ -54,6 +59,11 @@ class StateSource(SocketSource):
         subscriptions: The client's.
         endpoint: Tells where the state socket is.
         own: What brings the states of the client's own steps, where the server publishes none of them.
+        only_own: Tells whether nothing else comes, as things stand.
+
+    Attributes:
+        subscriptions: As given.
+        endpoint: As given.
     """
 
     name = "state_stream"
@@ -63,10 +73,19 @@ class StateSource(SocketSource):
         "state port?"
     )
 
-    def __init__(self, subscriptions: Subscriptions, endpoint: Callable[[], str], own: OwnSteps | None = None) -> None:
+    def __init__(
+        self,
+        subscriptions: Subscriptions,
+        endpoint: Callable[[], str],
+        own: OwnSteps | None = None,
+        *,
+        only_own: Callable[[], bool] = lambda: False,
+    ) -> None:
         super().__init__(subscriptions)
-        self._endpoint = endpoint
+        self.subscriptions = subscriptions
+        self.endpoint = endpoint
         self._own = OwnSteps() if own is None else own
+        self._only_own = only_own
 
     def attach(self, handler: MessageHandler) -> None:
         """Begin to feed `handler`, from the event loop."""
@@ -80,7 +99,16 @@ class StateSource(SocketSource):
 
     def subscription(self) -> Subscription:
         """See the base class."""
-        return Subscription(self._endpoint(), (STATE_FULL,), STATE_FULL.__eq__)
+        return Subscription(self.endpoint(), (STATE_FULL,), STATE_FULL.__eq__)
+
+    def first_after(self, handler: MessageHandler) -> float:
+        """Return how long the first snapshot may be in coming: where only steps bring any, for ever."""
+        return math.inf if self._only_own() else super().first_after(handler)
+
+    def silence(self, handler: MessageHandler, seconds: float) -> tuple[str, str]:
+        """See the base class."""
+        problem, advice = super().silence(handler, seconds)
+        return problem, _ONLY_OWN if self._only_own() else advice
 
     def decode(self, topic: bytes, payload: BytesLike) -> StateSnapshot:
         """Read a snapshot. Raises `ProtocolError`."""
@@ -102,8 +130,10 @@ class SharedStateSource(SharedMemorySource, StateSource):
         subscriptions: Subscriptions,
         endpoint: Callable[[], str],
         own: OwnSteps | None = None,
+        *,
+        only_own: Callable[[], bool] = lambda: False,
     ) -> None:
-        super().__init__(subscriptions, endpoint, own)
+        super().__init__(subscriptions, endpoint, own, only_own=only_own)
         self.regions = regions
         # The socket may be one ahead of the region. Two are never equal: each tells when it was built.
         self._came = deque[BytesLike](maxlen=2)

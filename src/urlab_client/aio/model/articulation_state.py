@@ -267,15 +267,16 @@ class MirroredArticulation(MirroredEntity):
                 hint="The model changed on the server: call discover().",
             )
 
-    def absorb(self, state: ArticulationState) -> None:
-        """Take over a checked state. Call under the mirror's lock."""
-        self.qpos, self.qvel = state.qpos.copy(), state.qvel.copy()
+    def absorb(self, state: ArticulationState, *, into_mirror: bool) -> None:
+        """Take over a checked state, into the mirror's data, too, if need be. Call under the mirror's lock."""
+        qpos, qvel, ctrl, act = state.qpos, state.qvel, state.ctrl, state.act
+        self.qpos, self.qvel = qpos.copy(), qvel.copy()
         self.force = None if state.actuator_force is None else state.actuator_force.copy()
         self.bodies = state.bodies
-        if state.ctrl is not None:
-            self.applied = state.ctrl.copy()
-        if state.act is not None:
-            self.act = state.act.copy()
+        if ctrl is not None:
+            self.applied = ctrl.copy()
+        if act is not None:
+            self.act = act.copy()
         if state.sensors is not None:
             self.sensors = state.sensors
         if state.user is not None:
@@ -284,19 +285,15 @@ class MirroredArticulation(MirroredEntity):
             self.twist = state.twist
         if state.actions is not None:
             self.actions = state.actions
-
-    def write_mirror(self, state: ArticulationState) -> None:
-        """Write a checked state into the mirror's data. Call under the mirror's lock."""
-        if self._mirrored is None:
-            return
-        qpos, qvel, ctrl, act = self._mirrored
-        layout = self.layout
-        qpos[layout.qpos_adr] = state.qpos
-        qvel[layout.qvel_adr] = state.qvel
-        if state.ctrl is not None:
-            ctrl[layout.ctrl_adr] = state.ctrl
-        if state.act is not None and len(layout.act_adr):
-            act[layout.act_adr] = state.act[layout.act_from]
+        if into_mirror and self._mirrored is not None:
+            layout = self.layout
+            all_qpos, all_qvel, all_ctrl, all_act = self._mirrored
+            all_qpos[layout.qpos_adr] = qpos
+            all_qvel[layout.qvel_adr] = qvel
+            if ctrl is not None:
+                all_ctrl[layout.ctrl_adr] = ctrl
+            if act is not None and len(layout.act_adr):
+                all_act[layout.act_adr] = act[layout.act_from]
 
     def write_set_points(self) -> None:
         """Write set-points that changed since the last time into the mirror's `ctrl`, for a puppet step.
@@ -344,7 +341,7 @@ class MirroredArticulation(MirroredEntity):
         return ArticulationCommand(
             ctrl=self._set_points(),
             control_mode=str(ControlMode.RAW) if bypass else None,
-            xfrc_applied=self._compiled(wrenches or {}) or None,
+            xfrc_applied=self._compiled(wrenches) if wrenches else None,
         )
 
     def _set_points(self) -> list[float]:

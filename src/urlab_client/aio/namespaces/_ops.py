@@ -51,14 +51,8 @@ from urlab_client.protocol.messages.viewport import (
     TrackActor,
     Untrack,
 )
-from urlab_client.protocol.types import (
-    ActorBounds,
-    ActorHierarchyNode,
-    BlueprintInfo,
-    CameraPose,
-    KeyframeInfo,
-    MocapPose,
-)
+from urlab_client.protocol.scene_types import ActorBounds, ActorHierarchyNode, BlueprintInfo
+from urlab_client.protocol.types import CameraPose, KeyframeInfo, MocapPose
 
 __all__ = ["DebugOps", "FarmOps", "OutlinerOps", "ReplayOps", "RuntimeOps", "SceneOps", "ViewportOps"]
 

@@ -28,16 +28,15 @@ from urlab_client.protocol.messages.scene import (
     SpawnLight,
 )
 from urlab_client.protocol.rotation import IDENTITY, euler_to_quat
-from urlab_client.protocol.types import (
-    JobStatus,
+from urlab_client.protocol.scene_types import (
     SceneActor,
     SceneSnapshot,
-    UploadProgress,
     URLabAsset,
     URLabBlueprint,
     URLabLightHandle,
     URLabSpawnHandle,
 )
+from urlab_client.protocol.types import JobStatus, UploadProgress
 
 if TYPE_CHECKING:
     import mujoco

@@ -17,7 +17,7 @@ from urlab_client.aio.model.mirror import model_names
 from urlab_client.protocol.errors import ProtocolError
 from urlab_client.protocol.messages.session import CameraInfo, EntityInfo, HelloOk
 from urlab_client.protocol.names import owner_of
-from urlab_client.protocol.rows import check_picture_size
+from urlab_client.protocol.pixels import check_picture_size
 
 if TYPE_CHECKING:
     import mujoco

@@ -8,6 +8,7 @@ from urlab_client.aio.state.discovery import Discovery
 from urlab_client.aio.state.pending_outcomes import PendingOutcomes
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_mode import ask_mode
+from urlab_client.protocol.client_types import Resync
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import (
     NoActiveManager,
@@ -16,7 +17,6 @@ from urlab_client.protocol.errors import (
     SessionTakenOver,
 )
 from urlab_client.protocol.messages.session import Forward, ForwardOk
-from urlab_client.protocol.types import Resync
 
 __all__ = ["resync"]
 

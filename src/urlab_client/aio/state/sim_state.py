@@ -40,7 +40,7 @@ from urlab_client.protocol.messages.session import (
     StepOk,
 )
 from urlab_client.protocol.messages.streams import PlayEnded, SessionLost, SessionOpened, StateSnapshot
-from urlab_client.protocol.rows import Pixels, decode_camera
+from urlab_client.protocol.pixels import Pixels, decode_camera
 from urlab_client.protocol.sim_options import check_sim_options
 from urlab_client.protocol.types import SimOptions
 
@@ -69,6 +69,10 @@ class StateObserver(Protocol):
 
     def wanted_pictures(self, asked: bool | dict[str, str | None], n_steps: int) -> bool | dict[str, str | None]:
         """Return the pictures that the next step is to bring: what its caller asked for, and more."""
+        ...
+
+    async def ready(self) -> None:
+        """Return when a further state may come: a step in `direct` or `puppet` mode waits for that. Must end."""
         ...
 
 
@@ -257,9 +261,12 @@ class SimState:
         if not math.isfinite(reply.time):
             raise ProtocolError(f"{op}: the simulation time is {reply.time}.", op=op)
         records = self.objects.records
-        articulations = [(records[key], s) for key, s in reply.per_articulation.items() if key in records]
-        for record, state in articulations:
-            record.check(state, op)
+        articulations: list[tuple[MirroredArticulation, ArticulationState]] = []
+        for key, state in reply.per_articulation.items():
+            record = records.get(key)
+            if record is not None:
+                record.check(state, op)
+                articulations.append((record, state))
         entities: list[tuple[MirroredEntity, EntityState]] = []
         if isinstance(reply, (StepOk, StateSnapshot)) and reply.entities:
             known = self.objects.entity_records
@@ -278,16 +285,15 @@ class SimState:
         articulations, entities, pictures = parts
         with self.mirror.lock:
             for record, state in articulations:
-                record.absorb(state)
-                if into_mirror:
-                    record.write_mirror(state)
+                record.absorb(state, into_mirror=into_mirror)
             for entity, pose in entities:
                 entity.absorb_pose(pose, into_mirror=into_mirror)
             for view, pixels, frame in pictures:
                 taken = reply.time if frame.sim_time is None else frame.sim_time
                 view.pictures.deliver(pixels, taken, frame.frame_id)
-            if into_mirror and self.mirror.data is not None:
-                self.mirror.data.time = reply.time
+            data = self.mirror.data
+            if into_mirror and data is not None:
+                data.time = reply.time
             self.mirror.mark_stale()
             self._absorb_clocks(reply, received)
         own = self.publishers.own_steps

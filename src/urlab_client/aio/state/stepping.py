@@ -22,7 +22,7 @@ __all__ = ["take_steps"]
 Cameras = bool | Mapping[str, "str | CameraTiming"]
 
 
-async def take_steps(state: SimState, turn: Turn, n_steps: int, cameras: Cameras, level: str | None) -> StepOk:
+async def take_steps(state: SimState, turn: Turn, n_steps: int, cameras: Cameras, asked: str | None) -> StepOk:
     """Advance physics as the step mode says, and take over the state.
 
     Args:
@@ -30,7 +30,7 @@ async def take_steps(state: SimState, turn: Turn, n_steps: int, cameras: Cameras
         turn: The turn in which all of it happens.
         n_steps: Physics steps.
         cameras: Pictures to bring.
-        level: Observation level of the reply, None for the session's.
+        asked: Observation level of the reply, None for the session's.
     """
     state.require_handshake("step")
     if state.pending.mode is not None:
@@ -38,30 +38,34 @@ async def take_steps(state: SimState, turn: Turn, n_steps: int, cameras: Cameras
     mode = state.mode
     if n_steps < (0 if mode is StepMode.PUPPET else 1):
         raise ValueError(_too_few(n_steps, mode))
+    pictures = await _pictures(state, cameras, n_steps) if state.observers or cameras is not False else None
     if mode is StepMode.LIVE and not state.mode_assumed:
-        return await _live_step(state, turn, _pictures(state, cameras, n_steps))
-    pictures = _pictures(state, cameras, n_steps)
+        return await _live_step(state, turn, pictures)
     request, carried = _puppet_step(state, n_steps) if mode is StepMode.PUPPET else _direct_step(state, n_steps)
-    pictures.ask(request)
+    if pictures is not None:
+        pictures.ask(request)
     assumed, before, session = state.mode_assumed, state.step_count, state.session.session_id
+    level = asked or state.level
+    request.observations = None if level == state.sent_level else level
+    state.sent_level = ""  # unknown to us until the server has answered
     try:
-        reply = await _exchange(state, turn, request, level or state.level, pictures)
+        reply = await turn.call(request, takes=_seconds(pictures))
+        if state.session.session_id == session:  # else it has the level of a handshake that was given up
+            state.sent_level = level if state.session.features.level_sticks else state.level
+        if pictures is not None:
+            pictures.take(reply)
         state.absorb(reply, "step", into_mirror=mode is not StepMode.PUPPET)
     except BaseException as error:
-        if turn.sent and leaves_open(error):
-            state.pending.add_steps(state, error, 1 if mode is StepMode.PUPPET else n_steps, carried)
-        else:
-            give_back(carried)
-        if isinstance(error, StepTimeout):
-            state.mode = StepMode.DIRECT  # no other mode lets a step wait
+        _note_failure(state, turn, error, 1 if mode is StepMode.PUPPET else n_steps, carried)
         raise
-    state.pending.clear()
+    if state.pending:
+        state.pending.clear()
     if assumed:
         # A handshake that was given up and answered meanwhile let the server count anew.
         _learn_mode(state, request, reply, reply.step - (before if state.session.session_id == session else 0))
         if state.mode is StepMode.PUPPET and mode is not StepMode.PUPPET:
-            return await take_steps(state, turn, n_steps, cameras, level)  # all it has done is to set the clock
-    if pictures and state.mode is not StepMode.LIVE:
+            return await take_steps(state, turn, n_steps, cameras, asked)  # all it has done is to set the clock
+    if pictures is not None and state.mode is not StepMode.LIVE:
         state.objects.note_missing_frames(pictures.names, reply)
     if state.mode is StepMode.PUPPET:
         with state.mirror.lock:
@@ -69,33 +73,32 @@ async def take_steps(state: SimState, turn: Turn, n_steps: int, cameras: Cameras
     return reply
 
 
-async def _exchange(state: SimState, turn: Turn, request: Step, level: str, pictures: StepPictures) -> StepOk:
-    if level != state.sent_level:
-        request.observations = level
-    session = state.session.session_id
-    state.sent_level = ""  # unknown to us until the server has answered
-    reply = await turn.call(request, takes=_seconds(pictures))
-    if state.session.session_id == session:  # else it has the level of a handshake that was given up
-        state.sent_level = level if state.session.features.level_sticks else state.level
-    pictures.take(reply)
-    return reply
+def _note_failure(state: SimState, turn: Turn, error: BaseException, steps: int, carried: Carried) -> None:
+    if turn.sent and leaves_open(error):
+        state.pending.add_steps(state, error, steps, carried)
+    else:
+        give_back(carried)
+    if isinstance(error, StepTimeout):
+        state.mode = StepMode.DIRECT  # no other mode lets a step wait
 
 
-async def _live_step(state: SimState, turn: Turn, pictures: StepPictures) -> StepOk:
-    drawn = bool(pictures) and state.session.features.live_pictures_in_steps
+async def _live_step(state: SimState, turn: Turn, pictures: StepPictures | None) -> StepOk:
+    if not state.session.features.live_pictures_in_steps:
+        pictures = None
     carried = take_wrenches(state)  # of no effect on servers that do not take them in this mode
     try:
         request = Step(per_articulation=live_commands(state, carried) or None)
-        if drawn:
+        if pictures is not None:
             pictures.ask(request)
-        reply = await turn.call(request, takes=_seconds(pictures) if drawn else None)
-        pictures.take(reply)
+        reply = await turn.call(request, takes=_seconds(pictures))
+        if pictures is not None:
+            pictures.take(reply)
         state.absorb(reply, "step")
     except BaseException as error:
         if not (turn.sent and leaves_open(error)):
             give_back(carried)
         raise
-    if drawn:
+    if pictures is not None:
         state.objects.note_missing_frames(pictures.names, reply)
     return reply
 
@@ -158,12 +161,16 @@ def _learn_mode(state: SimState, request: Step, reply: StepOk, advanced: int) ->
         )
 
 
-def _pictures(state: SimState, cameras: Cameras, n_steps: int) -> StepPictures:
+async def _pictures(state: SimState, cameras: Cameras, n_steps: int) -> StepPictures | None:
+    """Return the pictures that a step is to bring, None for none, when observers have room for what it brings."""
+    if state.mode is not StepMode.LIVE:
+        for observer in tuple(state.observers):
+            await observer.ready()
     asked: bool | dict[str, str | None]
     asked = cameras if isinstance(cameras, bool) else {name: str(CameraTiming(how)) for name, how in cameras.items()}
     for observer in state.observers:
         asked = observer.wanted_pictures(asked, n_steps)
-    return StepPictures(state, asked)
+    return StepPictures(state, asked) or None
 
 
 def _too_few(n_steps: int, mode: StepMode) -> str:
@@ -172,6 +179,6 @@ def _too_few(n_steps: int, mode: StepMode) -> str:
     return f"step: n_steps is at least 1 in step mode {mode}, got {n_steps}; only a puppet step may take none"
 
 
-def _seconds(pictures: StepPictures) -> float | None:
+def _seconds(pictures: StepPictures | None) -> float | None:
     """Return how long a step may take the server that has to wait for pictures; None for as long as any other."""
-    return (op_of(Step).timeout or 0.0) + pictures.seconds if pictures.seconds else None
+    return None if pictures is None or not pictures.seconds else (op_of(Step).timeout or 0.0) + pictures.seconds

@@ -28,7 +28,7 @@ from urlab_client.aio.transport.subscriber import (
 )
 from urlab_client.protocol import doorbell
 from urlab_client.protocol.errors import ProtocolError, URLabError
-from urlab_client.protocol.rows import BytesLike
+from urlab_client.protocol.layouts import BytesLike
 from urlab_client.protocol.shm import Publication
 
 __all__ = ["Place", "RegionSource", "Regions", "SharedPicture"]

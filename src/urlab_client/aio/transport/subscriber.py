@@ -27,7 +27,7 @@ from urlab_client.aio.transport import connection_status
 from urlab_client.aio.transport.curve import SERVER_KEY_HINT, ClientKeys
 from urlab_client.aio.transport.readiness import Readiness, watch_socket
 from urlab_client.protocol.errors import ClientClosed, ProtocolError, URLabError
-from urlab_client.protocol.rows import BytesLike
+from urlab_client.protocol.layouts import BytesLike
 
 __all__ = ["ConnectionStatus", "MessageGone", "MessageHandler", "Subscription", "Subscriptions", "client_closed"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import copy
 import logging
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -20,6 +20,7 @@ from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import ClientClosed, StreamOverflow, URLabError
 from urlab_client.protocol.messages.session import HelloOk, ResetOk, StateReply, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
+from urlab_client.protocol.names import did_you_mean
 
 __all__ = ["Follower"]
 
@@ -66,6 +67,8 @@ class Follower:
         self._needs_model = needs_model
         self._buffer = buffer
         self._put: Callable[[State | CameraPicture], None] | None = None
+        self._room: Callable[[], Awaitable[None]] | None = None
+        self._lost: Callable[[int], None] | None = None
         self._scene: SceneMessages | None = None
         self._described: HelloOk | None = None
         self._due_at: int | None = None
@@ -94,9 +97,26 @@ class Follower:
             raise KeyError(unknown)
         return self._current()
 
-    def start(self, put: Callable[[State | CameraPicture], None]) -> None:
-        """Hand on what comes from now on; `put` is called on the event loop and must be quick."""
-        self._put = put
+    @property
+    def cameras(self) -> list[str]:
+        """Names of the cameras whose pictures are wanted and that the scene has; empty before `check`."""
+        return [] if self._scene is None else [camera.name for camera in self._scene.cameras.values()]
+
+    def start(
+        self,
+        put: Callable[[State | CameraPicture], None],
+        *,
+        room: Callable[[], Awaitable[None]] | None = None,
+        lost: Callable[[int], None] | None = None,
+    ) -> None:
+        """Hand on what comes from now on.
+
+        Args:
+            put: Takes one item, on the event loop; must be quick.
+            room: Returns when there is room for what a further step brings, in the end at least.
+            lost: Told how many pictures that were due a step did not bring.
+        """
+        self._put, self._room, self._lost = put, room, lost
         self._state.observers.append(self)
         if self._state.mode is StepMode.LIVE:
             self._listen()
@@ -147,6 +167,11 @@ class Follower:
                 chosen[camera.name] = "sync"
         return chosen or False
 
+    async def ready(self) -> None:
+        """Wait until there is room; see `StateObserver`."""
+        if self._put is not None and self._room is not None:
+            await self._room()
+
     # Inside
 
     def _current(self) -> SceneMessages:
@@ -174,7 +199,10 @@ class Follower:
             else [n for n in self._wanted_cameras if not self._state.objects.camera(n)]
         )
         there = ", ".join(self._every_camera()) or "none"
-        return f"no camera {', '.join(map(repr, missing))}; there are: {there}" if missing else ""
+        if not missing:
+            return ""
+        suggested = did_you_mean(missing[0], self._every_camera()).strip()
+        return f"no camera {', '.join(map(repr, missing))}; {f'{suggested} ' if suggested else ''}there are: {there}"
 
     def _views(self) -> list[tuple[str, URLabCameraView]]:
         every = self._every_camera()
@@ -192,14 +220,18 @@ class Follower:
         nanoseconds = round(reply.time * _NS) if clock is None else clock.sec * _NS + clock.nsec
         wall_ns = state.recv_wall_time_ns if wall is None else wall.sec * _NS + wall.nsec
         set_points = {key: record.ctrl.tolist() for key, record in state.objects.records.items()}
-        put(State(scene, reply, set_points, nanoseconds, isinstance(reply, ResetOk), wall_ns))
+        put(State(scene, reply, set_points, nanoseconds, isinstance(reply, ResetOk), wall_ns, not self._live))
         if isinstance(reply, StepOk) and self._due_at is not None:
             self._pictures.done(self._due_at)
             self._due_at = None
+            missing = len(scene.cameras)
             for name, frame in (reply.cameras or {}).items():
                 camera = scene.cameras.get(id(state.objects.camera(name)))
                 if camera is not None:
-                    put(CameraPicture(camera, frame, nanoseconds, wall_ns))
+                    missing -= 1
+                    put(CameraPicture(camera, frame, nanoseconds, wall_ns, waits=True))
+            if missing and self._lost is not None:
+                self._lost(missing)
 
     def _listen(self) -> None:
         """Follow the streams, as live mode brings nothing by replies."""

@@ -12,7 +12,7 @@ from urlab_client.integrations._feed.scene_messages import CameraLayout, SceneMe
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraFrame, StateReply
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.protocol.rows import Pixels, decode_camera
+from urlab_client.protocol.pixels import Pixels, decode_camera
 
 __all__ = ["CameraPicture", "SampleClock", "Schedule", "State", "compressed", "picture_message"]
 
@@ -21,7 +21,10 @@ _FALLBACK_NS = 1_000_000
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """One state on its way to whoever keeps or shows it."""
+    """One state on its way to whoever keeps or shows it.
+
+    `waits` says that it is the reply to a step of ours, so that the next one can wait until there is room.
+    """
 
     scene: SceneMessages
     reply: StateReply | StateSnapshot
@@ -29,6 +32,7 @@ class State:
     nanoseconds: int
     restarts: bool
     wall_ns: int
+    waits: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +43,7 @@ class CameraPicture:
     frame: CameraFrame | Pixels
     nanoseconds: int | None
     wall_ns: int
+    waits: bool = False
 
     def pixels(self) -> Pixels:
         """Return the picture as an array, as `CameraSample.pixels` is."""

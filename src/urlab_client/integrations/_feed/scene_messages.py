@@ -42,7 +42,7 @@ __all__ = [
     "to_metadata",
 ]
 
-_BALL = 1  # mjJNT_BALL
+_BALL, _SLIDE = 1, 2  # mjJNT_BALL, mjJNT_SLIDE
 # From MuJoCo's camera axes (x right, y up, looking along -z) to an image's (x right, y down, looking along z).
 _OPTICAL = np.array([0.0, 1.0, 0.0, 0.0])
 
@@ -51,12 +51,18 @@ _FREE_QVEL = ("vx", "vy", "vz", "wx", "wy", "wz")
 
 
 class SceneLayout(Struct, kw_only=True):
-    """Name of each value of an articulation, in the order of the message's arrays; empty without a local model."""
+    """Name of each value of an articulation, in the order of the message's arrays; empty without a local model.
+
+    `slides` are the names of slide joints, whose positions are metres, None where that is not known, and `sensors` the
+    kind of each sensor by name, as MJCF calls it (`accelerometer`).
+    """
 
     qpos: list[str] = []
     qvel: list[str] = []
     ctrl: list[str] = []
     act: list[str] = []
+    slides: list[str] | None = None
+    sensors: dict[str, str] = {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -300,7 +306,18 @@ def _layout(model: mujoco.MjModel | None, layout: ArticulationLayout) -> SceneLa
     for name, actuator in layout.actuators.items():
         count = int(counts[actuator])
         ctrl += [name] if count == 1 else [f"{name}.{i}" for i in range(count)]
-    return SceneLayout(qpos=qpos, qvel=qvel, ctrl=ctrl, act=list(ctrl))
+    slides = [name for name, joint in layout.joints.items() if int(model.jnt_type[joint]) == _SLIDE]
+    kinds = sensor_kinds()
+    sensors = {name: kinds.get(int(model.sensor_type[sensor]), "") for name, sensor in layout.sensors.items()}
+    return SceneLayout(qpos=qpos, qvel=qvel, ctrl=ctrl, act=list(ctrl), slides=slides, sensors=sensors)
+
+
+def sensor_kinds() -> dict[int, str]:
+    """Return MJCF's word for each number in `model.sensor_type`."""
+    import mujoco  # noqa: PLC0415
+
+    members = mujoco.mjtSensor.__members__
+    return {int(member): name.removeprefix("mjSENS_").lower() for name, member in members.items()}
 
 
 def to_metadata(layout: SceneLayout) -> dict[str, str]:

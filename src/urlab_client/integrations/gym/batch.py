@@ -13,13 +13,14 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from urlab_client._mujoco import batch_class
+from urlab_client.aio.launch import with_model_options
 from urlab_client.aio.model.layout import ArticulationLayout
 from urlab_client.aio.model.mirror import model_names
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn
 from urlab_client.integrations.gym.episode import compiled_prefixes, fields_of
 from urlab_client.integrations.gym.spaces import Field, Observation, SpaceMapping, SpaceMode
 from urlab_client.integrations.gym.threaded_batch import ThreadedBatch
-from urlab_client.integrations.gym.vectorized import Floats, Indices, Vectorized
+from urlab_client.integrations.gym.vectorized import Floats, Found, Indices, Vectorized
 from urlab_client.protocol.enums import ControllerKind
 from urlab_client.protocol.errors import UnknownKeyframe, URLabError
 from urlab_client.protocol.names import compiled_names
@@ -59,7 +60,7 @@ class URLabBatchEnv(Vectorized):
         """Fetch the scene and make the batch.
 
         Args:
-            address: Where the scene comes from: `sim://MODEL`, or a server during play.
+            address: Where the scene comes from: `sim://MODEL`, with the options of the model, or a server during play.
             num_envs: Number of copies.
             space_mode: See `URLabEnv`, here and for the arguments down to `n_substeps`.
             observations: See `URLabEnv`.
@@ -78,7 +79,8 @@ class URLabBatchEnv(Vectorized):
         """
         if num_envs < 1 or n_substeps < 1 or reset_noise < 0:
             raise ValueError("num_envs and n_substeps are at least 1, and reset_noise is 0 or more")
-        model, prefixes, controllers, exact = _fetch(address, {"step_mode": "direct", **client_options})
+        scene = _fetch(with_model_options(address), {"step_mode": "direct", **client_options})
+        model, prefixes, controllers, exact = scene
         mapping = SpaceMapping(model, prefixes, fields_of(observations), space_mode)
         super().__init__(
             num_envs=num_envs,
@@ -108,7 +110,14 @@ class URLabBatchEnv(Vectorized):
         }
         self._step_count = np.zeros(num_envs, dtype=np.int64)
 
-    def _reset_some(self, indices: Indices, keyframe: str | None) -> tuple[Observation, Mapping[int, Exception]]:
+    def _reset_and_step(self, fresh: Indices, acting: Indices, actions: Any) -> tuple[Found, Found]:
+        nothing: Found = (None, {})
+        return (
+            self._reset_some(fresh, self._keyframe) if len(fresh) else nothing,
+            self._step_some(acting, actions) if len(acting) else nothing,
+        )
+
+    def _reset_some(self, indices: Indices, keyframe: str | None) -> Found:
         self._batch.reset(indices, -1 if keyframe is None else self._keyframe_id(keyframe))
         if self._noise:
             qpos = self._arrays["qpos"]
@@ -120,7 +129,7 @@ class URLabBatchEnv(Vectorized):
         self._step_count[indices] = 0
         return self._observe(indices), {}
 
-    def _step_some(self, indices: Indices, actions: Any) -> tuple[Observation, Mapping[int, Exception]]:
+    def _step_some(self, indices: Indices, actions: Any) -> Found:
         ctrl = self._arrays["ctrl"]
         targets: dict[str, NDArray[Any]] = {}
         for key, values in self.mapping.set_points(actions).items():

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, Final, Literal
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, Final, Literal, Self
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client.aio.launch import with_model_options
 from urlab_client.integrations.gym.episode import EnvEpisode
 from urlab_client.integrations.gym.spaces import Observation, SpaceMapping, SpaceMode
 from urlab_client.protocol.enums import CameraMode
@@ -120,6 +122,28 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         self._owns_client = owns_client
         self._observation: Observation = None
         self._elapsed = 0
+
+    @classmethod
+    def connect(cls, address: str, *, client_options: Mapping[str, Any] = MappingProxyType({}), **options: Any) -> Self:
+        """Make an environment over a client of its own, in `direct` mode, which closes with it.
+
+        Args:
+            address: Where the robots are. A server that is started for a `sim://` address honours the model's
+                `<option>`, unless the address says `?no-mjcf-options`.
+            client_options: Further options of the client.
+            options: Arguments of `URLabEnv`.
+
+        Raises:
+            URLabError: The server cannot be reached, or has no articulation.
+        """
+        wanted: dict[str, Any] = {"step_mode": "direct", **client_options}
+        client = URLabClient(with_model_options(address), **wanted)
+        try:
+            client.discover()
+            return cls(client, owns_client=True, **options)
+        except BaseException:
+            client.close()
+            raise
 
     @property
     def mapping(self) -> SpaceMapping:

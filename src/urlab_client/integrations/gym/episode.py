@@ -14,7 +14,7 @@ from urlab_client.integrations.gym.spaces import LEVELS, Field, Observation, Spa
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.enums import CameraMode, ObservationLevel, StepMode
 from urlab_client.protocol.errors import URLabError
-from urlab_client.protocol.rows import Pixels
+from urlab_client.protocol.pixels import Pixels
 
 __all__ = ["EnvEpisode"]
 

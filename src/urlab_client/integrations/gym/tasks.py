@@ -18,7 +18,6 @@ from urlab_client.integrations.gym.env import RewardFn, TerminationFn, URLabEnv
 from urlab_client.integrations.gym.spaces import Observation, SpaceMapping
 from urlab_client.integrations.gym.vector import URLabVectorEnv
 from urlab_client.protocol.base import Floats
-from urlab_client.sync.client import URLabClient
 
 __all__ = ["TASKS", "Task", "make", "make_vec", "register"]
 
@@ -114,13 +113,7 @@ def make(task_id: str, address: str | None = None, **options: Any) -> URLabEnv:
     """
     task = TASKS[task_id]
     options = {"n_substeps": task.n_substeps, "reset_noise": task.reset_noise, **options}
-    client = URLabClient(address or f"sim://{task.robot}", step_mode="direct")
-    try:
-        client.discover()
-        env = URLabEnv(client, owns_client=True, **options)
-    except BaseException:
-        client.close()
-        raise
+    env = URLabEnv.connect(address or f"sim://{task.robot}", **options)
     env.reward_fn = task.reward(env.mapping)
     env.termination_fn = None if task.termination is None else task.termination(env.mapping)
     return env

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.protocol.rows import Pixels
+from urlab_client.protocol.pixels import Pixels
 
 __all__ = ["even", "farthest", "visible"]
 

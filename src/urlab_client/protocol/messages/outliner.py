@@ -21,7 +21,7 @@ from urlab_client.protocol.base import (
     Vec3,
     doc,
 )
-from urlab_client.protocol.types import ActorBounds, BlueprintInfo
+from urlab_client.protocol.scene_types import ActorBounds, BlueprintInfo
 
 __all__ = [
     "OPS",

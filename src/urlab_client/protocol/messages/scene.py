@@ -23,7 +23,7 @@ from urlab_client.protocol.base import (
     Vec3,
     doc,
 )
-from urlab_client.protocol.types import ActorHierarchyNode
+from urlab_client.protocol.scene_types import ActorHierarchyNode
 
 __all__ = [
     "OPS",

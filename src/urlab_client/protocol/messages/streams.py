@@ -12,8 +12,11 @@ from urlab_client.protocol.base import doc
 from urlab_client.protocol.codec import encode_message, from_wire_array
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.errors import ProtocolError
+from urlab_client.protocol.layouts import BytesLike
 from urlab_client.protocol.messages.session import ArticulationState, Clock, EntityState, StateReply, StepOk
-from urlab_client.protocol.rows import BytesLike, Pixels, Row, TopicKind
+from urlab_client.protocol.pixels import Pixels
+from urlab_client.protocol.rows import Row
+from urlab_client.protocol.topics import TopicKind
 
 __all__ = [
     "CameraSample",

@@ -55,7 +55,7 @@ def ignored_options(
     reason = (
         "the first articulation's options apply"
         if honoured
-        else "the plugin's defaults apply; start the server with --mjcf-options to take the first model's"
+        else "the plugin's defaults apply; --mjcf-options (sim://MODEL?mjcf-options) takes the first model's"
     )
     return [f"options of the models have no effect ({'; '.join(ignored)}): {reason}"]
 

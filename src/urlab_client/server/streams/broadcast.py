@@ -16,16 +16,10 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from urlab_client.protocol.codec import encode_reply
+from urlab_client.protocol.control_messages import CameraEndpoint, ControlPayload, JointGains, gains_by_parameter
 from urlab_client.protocol.enums import ObservationLevel, StepMode
 from urlab_client.protocol.messages.session import ArticulationState, Clock, EntityState
-from urlab_client.protocol.rows import (
-    STATE_FULL,
-    CameraEndpoint,
-    ControlPayload,
-    JointGains,
-    TopicKind,
-    gains_by_parameter,
-)
+from urlab_client.protocol.topics import STATE_FULL, TopicKind
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.physics.controllers import ArticulationControl, Twist
 from urlab_client.server.physics.observe import Observer, sim_clock, wall_clock

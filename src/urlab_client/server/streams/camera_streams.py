@@ -20,7 +20,8 @@ from urlab_client._uninterrupted import uninterrupted
 from urlab_client.protocol.dialects import ALPHA, Dialect
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.messages.session import CameraFrame
-from urlab_client.protocol.rows import camera_filter, camera_header
+from urlab_client.protocol.pixels import camera_header
+from urlab_client.protocol.topics import camera_filter
 from urlab_client.server.physics.play import Running
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.system.health import Health

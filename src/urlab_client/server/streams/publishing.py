@@ -16,8 +16,9 @@ from typing import Any, Final
 import zmq
 
 from urlab_client._uninterrupted import uninterrupted
+from urlab_client.protocol.control_messages import CameraEndpoint
 from urlab_client.protocol.errors import ProtocolError
-from urlab_client.protocol.rows import STATE_FULL, CameraEndpoint
+from urlab_client.protocol.topics import STATE_FULL
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.physics.play import Running
 from urlab_client.server.streams.broadcast import Broadcast, Tick

@@ -11,16 +11,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.protocol.rows import (
-    ActionsRow,
-    BaseStateRow,
-    JointRow,
-    SceneRow,
-    SensorRow,
-    StreamTopic,
-    TopicKind,
-    TwistRow,
-)
+from urlab_client.protocol.rows import ActionsRow, BaseStateRow, JointRow, SceneRow, SensorRow, TwistRow
+from urlab_client.protocol.topics import StreamTopic, TopicKind
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.physics.controllers import ArticulationControl
 

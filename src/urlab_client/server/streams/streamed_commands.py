@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from urlab_client._mujoco import actuator_count, control_counts, control_starts
-from urlab_client.protocol.rows import (
+from urlab_client.protocol.control_messages import (
     ActuatorInfo,
     CameraEndpoint,
     ControlPayload,

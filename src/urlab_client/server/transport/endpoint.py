@@ -66,7 +66,7 @@ class PortInUse(OSError):
         super().__init__(
             errno.EADDRINUSE,
             f"{tcp(host)}:{port} is in use: end the program that holds it, "
-            f"or choose another {option} (0 picks a free one)",
+            f"or choose another {option} (0 picks a free one; on the command line --{option.replace('_', '-')} 0)",
         )
         self.host = host
         self.port = port

@@ -7,14 +7,8 @@ from __future__ import annotations
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.namespaces import _ops as aio
 from urlab_client.aio.namespaces._base import Vector
-from urlab_client.protocol.types import (
-    ActorBounds,
-    ActorHierarchyNode,
-    BlueprintInfo,
-    CameraPose,
-    KeyframeInfo,
-    MocapPose,
-)
+from urlab_client.protocol.scene_types import ActorBounds, ActorHierarchyNode, BlueprintInfo
+from urlab_client.protocol.types import CameraPose, KeyframeInfo, MocapPose
 from urlab_client.sync._facade import Facade
 
 __all__ = ["DebugOps", "FarmOps", "OutlinerOps", "ReplayOps", "RuntimeOps", "SceneOps", "ViewportOps"]

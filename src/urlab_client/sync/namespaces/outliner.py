@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.namespaces import outliner as aio
-from urlab_client.protocol.types import ActorInfo
+from urlab_client.protocol.scene_types import ActorInfo
 from urlab_client.sync.namespaces._ops import OutlinerOps
 
 __all__ = ["OutlinerNamespace"]

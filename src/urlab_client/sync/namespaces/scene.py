@@ -11,15 +11,14 @@ from typing import TYPE_CHECKING
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.namespaces import scene as aio
 from urlab_client.aio.namespaces._base import Vector
-from urlab_client.protocol.types import (
-    JobStatus,
+from urlab_client.protocol.scene_types import (
     SceneSnapshot,
-    UploadProgress,
     URLabAsset,
     URLabBlueprint,
     URLabLightHandle,
     URLabSpawnHandle,
 )
+from urlab_client.protocol.types import JobStatus, UploadProgress
 from urlab_client.sync.namespaces._ops import SceneOps
 
 if TYPE_CHECKING:

@@ -1,0 +1,180 @@
+"""Rows made of whole snapshots, for servers that publish no rows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Iterator, Mapping
+from typing import Protocol
+
+import numpy as np
+
+from urlab_client.aio.live.row_source import RowSource
+from urlab_client.aio.live.state_source import StateSource
+from urlab_client.aio.transport.subscriber import MessageHandler
+from urlab_client.protocol.errors import ProtocolError, URLabError
+from urlab_client.protocol.layouts import BytesLike
+from urlab_client.protocol.messages.session import ArticulationState, EntityState
+from urlab_client.protocol.messages.streams import StateSnapshot
+from urlab_client.protocol.rows import ActionsRow, BaseStateRow, JointRow, Row, SceneRow, SensorRow, TwistRow
+from urlab_client.protocol.topics import StreamTopic, TopicKind
+
+__all__ = ["DerivedRowSource", "HasRows"]
+
+_FREE = 0  # mjJNT_FREE
+
+
+class _HasJoint(Protocol):
+    id: int
+    jnt_type: int
+    qpos_local_offset: int
+    qvel_local_offset: int
+
+
+class _HasSensor(Protocol):
+    id: int
+
+
+class HasRows(Protocol):
+    """An articulation as the client knows it: what its state consists of."""
+
+    @property
+    def joints(self) -> Mapping[str, _HasJoint]:
+        """Joints by name."""
+        ...
+
+    @property
+    def sensors(self) -> Mapping[str, _HasSensor]:
+        """Sensors by name."""
+        ...
+
+
+class DerivedRowSource(RowSource):
+    """The rows that a server would publish which sends nothing but snapshots.
+
+    Args:
+        states: What brings the snapshots.
+        articulations: Tells the articulations by key.
+        wanted: Keys of the articulations whose rows are wanted.
+        kinds: As of the base class; likewise the others.
+        components: See there.
+        entities: See there.
+    """
+
+    def __init__(
+        self,
+        states: StateSource,
+        articulations: Callable[[], Mapping[str, HasRows]],
+        wanted: Collection[str],
+        kinds: Collection[str | TopicKind] = (),
+        components: Collection[str] = (),
+        *,
+        entities: bool = False,
+    ) -> None:
+        super().__init__(states.subscriptions, states.endpoint, wanted, kinds, components, entities=entities)
+        self._states = states
+        self._robots = articulations
+        self._feeds: dict[MessageHandler, _RowFeed] = {}
+
+    def attach(self, handler: MessageHandler) -> None:
+        """Begin to feed `handler`, from the event loop."""
+        feed = _RowFeed(handler, self._topics)
+        self._states.attach(feed)
+        self._feeds[handler] = feed
+
+    def detach(self, handler: MessageHandler) -> None:
+        """Stop feeding `handler`. Idempotent."""
+        feed = self._feeds.pop(handler, None)
+        if feed is not None:
+            self._states.detach(feed)
+
+    def wants(self, topic: bytes, payload: BytesLike) -> bool:
+        """Return True: there are rows of what is in the model only."""
+        return True
+
+    def first_after(self, handler: MessageHandler) -> float:
+        """See the source of the snapshots."""
+        return self._states.first_after(self._feeds[handler])
+
+    def silence(self, handler: MessageHandler, seconds: float) -> tuple[str, str]:
+        """See the source of the snapshots."""
+        return self._states.silence(self._feeds[handler], seconds)
+
+    def _topics(self, snapshot: StateSnapshot) -> Iterator[tuple[bytes, Row]]:
+        """Return the wanted rows of a snapshot."""
+        robots = self._robots()
+        for key in self.articulations & snapshot.per_articulation.keys() & robots.keys():
+            for topic, row in _rows_of(key, robots[key], snapshot.per_articulation[key]):
+                if self.has(topic):
+                    yield topic.encode(), row
+        for name, state in snapshot.entities.items():
+            for topic, row in _rows_of_entity(name, state):
+                if self.has(topic):
+                    yield topic.encode(), row
+
+
+def _rows_of(key: str, robot: HasRows, state: ArticulationState) -> Iterator[tuple[StreamTopic, Row]]:
+    for name, joint in robot.joints.items():
+        at, moves = joint.qpos_local_offset, joint.qvel_local_offset
+        if joint.jnt_type == _FREE:
+            base = BaseStateRow.from_free_joint(state.qpos[at : at + 7], state.qvel[moves : moves + 6])
+            yield StreamTopic(TopicKind.BASE_STATE, key, name), base
+        else:
+            row = JointRow(joint.id, float(state.qpos[at]), float(state.qvel[moves]), math.nan)
+            yield StreamTopic(TopicKind.JOINT, key, name), row
+    for name, values in (state.sensors or {}).items():
+        sensor = robot.sensors.get(name)
+        reading = np.array(values, np.float32)
+        yield StreamTopic(TopicKind.SENSOR, key, name), SensorRow(-1 if sensor is None else sensor.id, reading)
+    if state.twist is not None:
+        vx, vy, _ = state.twist.linear
+        yield StreamTopic(TopicKind.TWIST, key), TwistRow(vx, vy, state.twist.angular[2])
+    if state.actions:  # else the plugin sends none either
+        yield StreamTopic(TopicKind.ACTIONS, key), ActionsRow(state.actions)
+
+
+def _rows_of_entity(name: str, state: EntityState) -> Iterator[tuple[StreamTopic, Row]]:
+    values = {
+        TopicKind.XPOS: state.xpos,
+        TopicKind.XQUAT: state.xquat,
+        TopicKind.QPOS: state.qpos,
+        TopicKind.QVEL: state.qvel,
+    }
+    for kind, vector in values.items():
+        if vector is not None:
+            yield StreamTopic(kind, name), SceneRow(kind, np.asarray(vector, np.float64))
+
+
+class _RowFeed(MessageHandler):
+    """Hands the rows of each snapshot on to a reader of rows."""
+
+    def __init__(self, reader: MessageHandler, rows: Callable[[StateSnapshot], Iterator[tuple[bytes, Row]]]) -> None:
+        self._reader = reader
+        self._rows = rows
+
+    def on_message(self, topic: bytes, payload: BytesLike) -> None:
+        """Take one snapshot."""
+        try:
+            for name, row in self._rows(StateSnapshot.decode(payload, topic.decode())):
+                self._reader.on_message(name, row.encode())
+        except (ProtocolError, ValueError, IndexError) as error:  # of another world than the one that is known
+            self._reader.on_malformed(str(error))
+
+    def on_malformed(self, problem: str) -> None:
+        """See the base class."""
+        self._reader.on_malformed(problem)
+
+    def on_end(self, error: Callable[[], URLabError]) -> None:
+        """See the base class."""
+        self._reader.on_end(error)
+
+    def on_drained(self) -> None:
+        """See the base class."""
+        self._reader.on_drained()
+
+    def on_connection(self, connected: bool) -> None:
+        """See the base class."""
+        self._reader.on_connection(connected)
+
+    def on_gap(self, why: str) -> None:
+        """See the base class."""
+        self._reader.on_gap(why)

@@ -1,0 +1,47 @@
+"""Fixed binary layouts: sizes are checked and arrays shaped here. Numbers are little-endian."""
+
+from __future__ import annotations
+
+from struct import Struct as Layout
+from typing import TypeAlias, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from urlab_client.protocol.errors import ProtocolError
+
+__all__ = ["INT32", "BytesLike", "check_size", "damaged", "floats32", "vector"]
+
+BytesLike: TypeAlias = bytes | bytearray | memoryview
+"""A received frame; a memoryview must be one of bytes (format `B`)."""
+
+T = TypeVar("T", bound=np.generic)
+
+
+def damaged(what: str, where: object, problem: str, payload: BytesLike) -> ProtocolError:
+    """Make the error for a message that is not of its layout."""
+    at = f" on {str(where)!r}" if where else ""
+    return ProtocolError(f"{what}{at}: {problem}.", raw=bytes(payload[:256]))
+
+
+def check_size(what: str, where: object, payload: BytesLike, expected: int) -> None:
+    """Raise `ProtocolError` unless a message has its layout's size."""
+    if len(payload) != expected:
+        raise damaged(what, where, f"{len(payload)} bytes, expected {expected}", payload)
+
+
+INT32 = Layout("<i")
+
+
+def floats32(values: ArrayLike) -> NDArray[np.float32]:
+    """Return values as they travel."""
+    # A state that blew up beyond float32 travels as infinity, as the plugin's cast does; it must not stop the stream.
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.asarray(values, dtype="<f4")
+
+
+def vector(what: str, values: NDArray[T], size: int) -> NDArray[T]:
+    """Return an array that has the shape (size,); raise `ValueError` for any other."""
+    if values.shape != (size,):
+        raise ValueError(f"{what} has shape {values.shape}, expected ({size},)")
+    return values

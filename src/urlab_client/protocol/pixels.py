@@ -1,0 +1,188 @@
+"""Camera pictures: from the wire's pixels to arrays, and back."""
+
+from __future__ import annotations
+
+from struct import Struct as Layout
+from typing import TypeAlias
+
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from urlab_client.protocol.enums import CameraMode
+from urlab_client.protocol.layouts import BytesLike, damaged
+
+__all__ = ["CameraImage", "Pixels", "camera_header", "check_picture_size", "decode_camera", "encode_camera"]
+
+Pixels: TypeAlias = NDArray[np.uint8] | NDArray[np.float32]
+
+_FRAME_MAGIC = 0x314D4355
+_FRAME_HEADERS = {1: Layout("<IIQdII"), 2: Layout("<IIQdIId")}
+_OPAQUE = np.uint32(0xFF000000)
+_MAX_SIDE = 16_384  # what graphics cards render at most
+_CENTIMETRES = np.float32(100)
+
+
+class CameraImage(Struct, frozen=True, eq=False):
+    """One picture.
+
+    Attributes:
+        pixels: Top row first. Mode `real`: uint8 (H, W, 4) RGBA with alpha 255. `depth`: float32 (H, W), metres along
+            the optical axis. `semantic`, `instance` and modes unknown here: uint8 (H, W, 4) BGRA as sent.
+        frame_id: The server's number of the frame; None where the server sends no header.
+        sim_time: Simulation time of the frame, seconds; None where the server does not say.
+        capture_time: Unix time of the capture, seconds; None where the server does not say.
+    """
+
+    pixels: Pixels
+    frame_id: int | None = None
+    sim_time: float | None = None
+    capture_time: float | None = None
+
+
+def check_picture_size(width: int, height: int) -> None:
+    """Check the size of a picture as a peer gives it.
+
+    Raises:
+        ValueError: No camera has pictures of this size.
+    """
+    if not (0 < width <= _MAX_SIDE and 0 < height <= _MAX_SIDE):
+        raise ValueError(f"pictures of {width}x{height} pixels; each side has 1 to {_MAX_SIDE}")
+
+
+def decode_camera(
+    payload: BytesLike,
+    mode: CameraMode | str,
+    width: int,
+    height: int,
+    *,
+    out: Pixels | None = None,
+    where: object = "",
+) -> CameraImage:
+    """Read a picture: a camera message, a slot of a camera region or the `data` of a step reply's camera block.
+
+    Newer servers put a header before the pixels. It is recognised by its magic number and by the length together, so
+    that pixels cannot be mistaken for one.
+
+    Args:
+        payload: Pixels, with or without header.
+        mode: Mode of the camera; decides what the pixels mean.
+        width: Columns, as the handshake or the camera block says.
+        height: Rows.
+        out: C-contiguous array of the result's shape and type to fill and return instead of a new one.
+        where: Names the camera in errors.
+
+    Raises:
+        ProtocolError: If the payload does not have the size of such a picture, or there is no picture of this size.
+        ValueError: If `out` does not fit.
+    """
+    try:
+        check_picture_size(width, height)
+    except ValueError as error:
+        raise damaged("camera frame", where, str(error), payload) from None
+    size = width * height * 4
+    header = _frame_header(payload, width, height, where)
+    if header is None and len(payload) != size:
+        problem = f"{len(payload)} bytes, expected {size} ({width}x{height} pixels of 4 bytes)"
+        raise damaged("camera frame", where, problem, payload)
+    start = header.size if header else 0
+    if out is None and mode == CameraMode.REAL:
+        pixels: Pixels = _rgba(np.frombuffer(payload, np.uint8, size, start), width, height)
+    else:
+        pixels = _target(mode, width, height, out)
+        _convert(np.frombuffer(payload, np.uint8, size, start), mode, pixels)
+    if header is None:
+        return CameraImage(pixels)
+    _, _, frame_id, sim_time, _, _, *capture_time = header.unpack_from(payload)
+    return CameraImage(pixels, frame_id, sim_time, *capture_time)
+
+
+def _target(mode: CameraMode | str, width: int, height: int, out: Pixels | None) -> Pixels:
+    depth = mode == CameraMode.DEPTH
+    if out is None:
+        return np.empty((height, width), np.float32) if depth else np.empty((height, width, 4), np.uint8)
+    shape = (height, width) if depth else (height, width, 4)
+    dtype = np.dtype(np.float32 if depth else np.uint8)
+    if out.shape != shape or out.dtype != dtype or not out.flags.c_contiguous:
+        raise ValueError(f"out is {out.dtype} {out.shape}, expected C-contiguous {dtype} {shape}")
+    return out
+
+
+def camera_header(frame_id: int, sim_time: float, width: int, height: int, captured: float) -> bytes:
+    """Return what newer servers put before the pixels of a streamed picture.
+
+    Args:
+        frame_id: Number of the snapshot that it shows.
+        sim_time: Simulation time of that, seconds.
+        width: Columns.
+        height: Rows.
+        captured: When it was taken, Unix seconds.
+    """
+    return _FRAME_HEADERS[2].pack(_FRAME_MAGIC, 2, frame_id, sim_time, width, height, captured)
+
+
+def _frame_header(payload: BytesLike, width: int, height: int, where: object) -> Layout | None:
+    for version, layout in _FRAME_HEADERS.items():
+        if len(payload) != width * height * 4 + layout.size:
+            continue
+        magic, said, _, _, columns, rows, *_ = layout.unpack_from(payload)
+        if magic != _FRAME_MAGIC or said != version:
+            continue
+        if (columns, rows) != (width, height):
+            problem = f"header says {columns}x{rows} pixels, the handshake {width}x{height}"
+            raise damaged("camera frame", where, problem, payload)
+        return layout
+    return None
+
+
+def _rgba(source: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+    # BGRA read big-endian is ARGB written little-endian; beginning one byte later, RGB and the next pixel's alpha. At
+    # the speed of two copies, against four for shifting each pixel into its place.
+    words = np.empty(width * height + 1, "<u4")
+    words[:-1] = source.view(">u4")
+    words |= np.uint32(0xFF)
+    return words.view(np.uint8)[1:-3].reshape(height, width, 4)
+
+
+def _convert(source: NDArray[np.uint8], mode: CameraMode | str, out: Pixels) -> None:
+    flat = out.reshape(-1)
+    if mode == CameraMode.DEPTH:
+        with np.errstate(invalid="ignore"):
+            np.divide(source.view("<f4"), _CENTIMETRES, out=flat)
+    elif mode == CameraMode.REAL:
+        # BGRA read big-endian and shifted by one byte is RGB0 written little-endian: five times faster than by channel.
+        words = flat.view("<u4")
+        words[:] = source.view(">u4")
+        words >>= np.uint32(8)
+        words |= _OPAQUE
+    else:
+        flat[:] = source
+
+
+def encode_camera(pixels: Pixels, mode: CameraMode | str) -> bytes:
+    """Return the bare pixels of a picture, the inverse of `decode_camera`.
+
+    Args:
+        pixels: As in `CameraImage`, top row first; mode `real` also takes RGB, shape (H, W, 3). Alpha is sent as 255.
+        mode: Mode of the camera.
+
+    Raises:
+        ValueError: If the array has not the shape and type of the mode.
+    """
+    if mode == CameraMode.DEPTH:
+        if pixels.ndim != 2 or pixels.dtype != np.float32:
+            raise ValueError(f"depth pixels are {pixels.dtype} {pixels.shape}, expected float32 (H, W)")
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.multiply(pixels, _CENTIMETRES, dtype="<f4").tobytes()
+    channels = (3, 4) if mode == CameraMode.REAL else (4,)
+    if pixels.ndim != 3 or pixels.shape[2] not in channels or pixels.dtype != np.uint8:
+        expected = "(H, W, 3) or (H, W, 4)" if len(channels) == 2 else "(H, W, 4)"
+        raise ValueError(f"{mode} pixels are {pixels.dtype} {pixels.shape}, expected uint8 {expected}")
+    if mode != CameraMode.REAL:
+        return pixels.tobytes()
+    bgra = np.empty((*pixels.shape[:2], 4), np.uint8)
+    bgra[..., 0] = pixels[..., 2]
+    bgra[..., 1] = pixels[..., 1]
+    bgra[..., 2] = pixels[..., 0]
+    bgra[..., 3] = 255
+    return bgra.tobytes()

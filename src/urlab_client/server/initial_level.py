@@ -1,0 +1,76 @@
+"""The level a server starts with: saved, or made of models placed side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from urlab_client.protocol.errors import URLabError
+from urlab_client.server.assets.bundled_robots import bundled_models, unknown_model
+from urlab_client.server.editor.world import EditorWorld
+
+__all__ = ["ModelError", "is_level", "populate"]
+
+GAP_M: Final = 1.0
+"""Free space between the models placed side by side, metres."""
+
+
+class ModelError(URLabError, ValueError):
+    """A model or level that a server was to start with is missing or cannot be used."""
+
+
+def is_level(model: str) -> bool:
+    """Whether a name that a server starts with is that of a saved level."""
+    return model.lower().endswith(".json")
+
+
+def populate(world: EditorWorld, models: Sequence[str]) -> None:
+    """Open the level among `models`, place the others, and see to a manager."""
+    for level in filter(is_level, models):
+        world.levels.load_file(Path(level))
+    edge: float | None = None
+    for row in world.list_actors():
+        edge = _beyond(world, row.name, edge)
+    sources: dict[str, str] = {}
+    for model in models:
+        if not is_level(model):
+            edge = _place(world, model, sources, edge)
+    world.ensure_manager()
+
+
+def _place(world: EditorWorld, model: str, sources: dict[str, str], edge: float | None) -> float | None:
+    """Import a model and place it beyond `edge`, the largest y in use; return the new one.
+
+    `sources` holds the files imported so far by blueprint.
+    """
+    bundled = bundled_models()
+    if not Path(model).suffix and not Path(model).is_file() and model not in bundled:
+        raise ModelError(unknown_model(model))
+    path = model if model in bundled and not Path(model).is_file() else str(Path(model).absolute())
+    # What whoever runs the server names is meant as it is now, whatever an earlier run imported.
+    blueprint, _ = world.blueprints.import_xml(path, force_reimport=path not in sources.values(), trusted=True)
+    other = sources.setdefault(blueprint.stem, path)
+    if other != path:
+        raise ModelError(f"{model} and {other} would both become blueprint '{blueprint.stem}': rename one of the files")
+    actor = world.spawn_actor(blueprint.class_path, _free_id(world, Path(path).stem)).actor
+    bounds = world.get_actor_bounds(actor.name, components_only=True)
+    if bounds.extents != (0.0, 0.0, 0.0) and edge is not None:
+        world.set_actor_transform(actor.name, location=(0.0, edge + GAP_M - bounds.min[1], 0.0))
+    return _beyond(world, actor.name, edge)
+
+
+def _free_id(world: EditorWorld, stem: str) -> str:
+    name, count = stem, 0
+    while world.actor(name) is not None:
+        count += 1
+        name = f"{stem}_{count}"
+    return name
+
+
+def _beyond(world: EditorWorld, actor_name: str, edge: float | None) -> float | None:
+    """Return the larger of `edge` and the actor's largest y; an actor without a box has none."""
+    bounds = world.get_actor_bounds(actor_name, components_only=True)
+    if bounds.extents == (0.0, 0.0, 0.0):
+        return edge
+    return bounds.max[1] if edge is None else max(edge, bounds.max[1])

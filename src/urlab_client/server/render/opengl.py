@@ -1,0 +1,154 @@
+"""Whether pictures can be drawn on this machine, and by what."""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Final
+
+from urlab_client._children import APART
+from urlab_client.protocol.errors import URLabError
+
+__all__ = ["Backend", "RenderingUnavailable", "find_backend", "need_backend", "search_backend"]
+
+logger = logging.getLogger("urlab_client.server")
+
+
+_PROBE_DEADLINE_S: Final = 60.0
+
+_CHOICE: Final = "MUJOCO_GL"
+
+_DISABLED: Final = ("disable", "disabled", "off", "false", "0")
+
+_PACKAGES: Final = "apt install libegl1 libgl1-mesa-dri, or libosmesa6"
+
+_SOFTWARE: Final = ("llvmpipe", "softpipe", "swrast", "software", "swiftshader")
+
+_PROBE: Final = """
+import mujoco
+import numpy
+from mujoco.{name} import GLContext
+from OpenGL import GL
+
+context = GLContext(16, 16)
+context.make_current()
+model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+scene = mujoco.MjvScene(model, 10)
+camera = mujoco.MjvCamera()
+camera.distance = 3
+mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, camera, mujoco.mjtCatBit.mjCAT_ALL.value, scene)
+renderer = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, renderer)
+area = mujoco.MjrRect(0, 0, 16, 16)
+mujoco.mjr_render(area, scene, renderer)
+pixels = numpy.zeros((16, 16, 3), numpy.uint8)
+mujoco.mjr_readPixels(pixels, None, area, renderer)
+if not pixels.any():
+    raise SystemExit("it draws nothing")
+print(GL.glGetString(GL.GL_RENDERER).decode(errors="replace"))
+"""
+
+
+class RenderingUnavailable(URLabError):
+    """No picture can be drawn: this machine has no OpenGL, drawing failed, or it took too long."""
+
+
+@dataclass(frozen=True)
+class Backend:
+    """A way to OpenGL that works on this machine.
+
+    Attributes:
+        name: `egl`, `osmesa`, `cgl` or `glfw`: the module of MuJoCo that makes contexts.
+        renderer: What draws, as the driver calls it.
+    """
+
+    name: str
+    renderer: str
+
+    @property
+    def software(self) -> bool:
+        """Whether the processor draws."""
+        return self.name == "osmesa" or any(name in self.renderer.lower() for name in _SOFTWARE)
+
+
+def find_backend() -> Backend | None:
+    """Return what draws on this machine; None when nothing does.
+
+    `MUJOCO_GL` names the only one to try, or disables drawing. The answer is looked for once per process.
+    """
+    found = search_backend()
+    return found if isinstance(found, Backend) else None
+
+
+def need_backend() -> Backend:
+    """Return what draws on this machine.
+
+    Raises:
+        RenderingUnavailable: Nothing does; the message says why and what to install.
+    """
+    found = search_backend()
+    if isinstance(found, Backend):
+        return found
+    raise RenderingUnavailable(f"nothing can be drawn here: {found}")
+
+
+def search_backend() -> Backend | str:
+    """Return what draws, or why nothing does."""
+    with _probing:
+        return _find(os.environ.get(_CHOICE, "").lower().strip())
+
+
+_probing = threading.Lock()
+
+
+@cache
+def _find(choice: str) -> Backend | str:
+    if choice in _DISABLED:
+        return f"{_CHOICE}={choice} disables OpenGL; unset it"
+    reasons: list[str] = []
+    for name in _candidates(choice):
+        found = _probe(name)
+        if isinstance(found, Backend):
+            logger.info("pictures are drawn with %s by %s", found.name, found.renderer)
+            return found
+        reasons.append(f"{name}: {found}")
+    advice = _PACKAGES if sys.platform == "linux" else "install a graphics driver"
+    return f"no OpenGL works here: {advice} ({'; '.join(reasons)})"
+
+
+def _candidates(choice: str) -> Sequence[str]:
+    if choice in ("egl", "osmesa", "cgl", "glfw"):
+        return (choice,)
+    if sys.platform == "linux":
+        return ("glfw",) if choice == "glx" else ("egl", "osmesa")
+    return ("cgl",) if sys.platform == "darwin" else ("glfw",)
+
+
+def _probe(name: str) -> Backend | str:
+    """Draw in a child process; return what drew, or why nothing did."""
+    environment = {**os.environ, _CHOICE: "disable", "PYTHONSAFEPATH": "1"}
+    environment.pop("PYOPENGL_PLATFORM", None)
+    try:
+        child = subprocess.run(  # noqa: S603 - a script of this module
+            [sys.executable, "-c", _PROBE.format(name=name)],
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            timeout=_PROBE_DEADLINE_S,
+            check=False,
+            **APART,
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return str(error)
+    if child.returncode == 0:
+        return Backend(name, child.stdout.decode(errors="replace").strip())
+    lines = child.stderr.decode(errors="replace").strip().splitlines()
+    return lines[-1].strip() if lines else f"the probe ended with code {child.returncode}"
