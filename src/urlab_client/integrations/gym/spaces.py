@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
@@ -79,6 +80,9 @@ class SpaceMapping:
         layouts = articulation_layouts(model, prefixes)
         self._parts = {key: _part(model, layout) for key, layout in layouts.items()}
         self._where = self._slices()
+        ends = list(itertools.accumulate(len(part.low) for part in self._parts.values()))
+        self._n_actions = ends[-1]
+        self._actions = {key: slice(a, b) for key, a, b in zip(self._parts, [0, *ends], ends, strict=False)}
         self.action_space = self._make_action_space()
         self.observation_space = self._make_observation_space()
 
@@ -102,10 +106,9 @@ class SpaceMapping:
             found = {key: np.asarray(action[key], dtype=np.float64) for key in self.keys}
         else:
             whole = np.asarray(action, dtype=np.float64)
-            ends = np.cumsum([len(part.low) for part in self._parts.values()])
-            if whole.ndim == 0 or whole.shape[-1] != ends[-1]:
-                raise ValueError(f"the action has shape {whole.shape}; its last axis must be {ends[-1]} long")
-            found = dict(zip(self.keys, np.split(whole, ends[:-1], axis=-1), strict=True))
+            if whole.ndim == 0 or whole.shape[-1] != self._n_actions:
+                raise ValueError(f"the action has shape {whole.shape}; its last axis must be {self._n_actions} long")
+            found = {key: whole[..., where] for key, where in self._actions.items()}
         for key, values in found.items():
             n_ctrl = len(self._parts[key].low)
             if values.ndim == 0 or values.shape[-1] != n_ctrl:
