@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -18,9 +18,11 @@ from urlab_client.aio.model.layout import ArticulationLayout
 from urlab_client.aio.model.mirror import model_names
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn
 from urlab_client.integrations.gym.episode import fields_of
+from urlab_client.integrations.gym.pictures import BatchPictures
 from urlab_client.integrations.gym.spaces import Field, Observation, SpaceMapping, SpaceMode
+from urlab_client.integrations.gym.starts import ResetNoise, noise_of
 from urlab_client.integrations.gym.threaded_batch import ThreadedBatch
-from urlab_client.integrations.gym.vectorized import Floats, Found, Indices, Vectorized
+from urlab_client.integrations.gym.vectorized import Floats, Found, Indices, Vectorized, check_render_mode
 from urlab_client.protocol.enums import ControllerKind
 from urlab_client.protocol.errors import UnknownKeyframe, URLabError
 from urlab_client.server.physics.controllers import Controller, ControllerConfig, PassthroughController, PDController
@@ -36,8 +38,8 @@ class URLabBatchEnv(Vectorized):
 
     The scene is what a server compiles: it is fetched once, and the server is not needed any more. Observations,
     rewards and autoreset are those of `URLabVectorEnv`, bit for bit for the same seeds and actions, as long as no
-    wrench is applied; there are no cameras. Controllers act before each physics step, as they do on the server, with
-    the parameters they had when the scene was fetched.
+    wrench is applied; there are no cameras to observe. Controllers act before each physics step, as they do on the
+    server, with the parameters they had when the scene was fetched.
     """
 
     def __init__(
@@ -51,7 +53,10 @@ class URLabBatchEnv(Vectorized):
         termination_fn: TerminationFn | None = None,
         max_episode_steps: int | None = None,
         n_substeps: int = 1,
-        reset_noise: float = 0.0,
+        reset_noise: float | ResetNoise = 0.0,
+        keyframe: str | None = None,
+        render_mode: Literal["rgb_array"] | None = None,
+        render_camera: str | None = None,
         autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
         n_threads: int = 0,
         client_options: Mapping[str, Any] = MappingProxyType({}),
@@ -68,6 +73,9 @@ class URLabBatchEnv(Vectorized):
             max_episode_steps: See `URLabEnv`.
             n_substeps: See `URLabEnv`.
             reset_noise: See `URLabEnv`.
+            keyframe: See `URLabEnv`.
+            render_mode: None or `rgb_array`, with which `render` draws; steps cost the same.
+            render_camera: Camera that `render` shows, `ARTICULATION/CAMERA`; the first one of the scene by default.
             autoreset_mode: `NEXT_STEP`, `SAME_STEP` or `DISABLED`.
             n_threads: Threads that step, the caller's included; 0 for one per processor.
             client_options: Further options of the client that fetches the scene.
@@ -76,8 +84,10 @@ class URLabBatchEnv(Vectorized):
             URLabError: The scene cannot be fetched.
             ValueError: An option out of range.
         """
-        if num_envs < 1 or n_substeps < 1 or reset_noise < 0:
-            raise ValueError("num_envs and n_substeps are at least 1, and reset_noise is 0 or more")
+        if num_envs < 1 or n_substeps < 1:
+            raise ValueError("num_envs and n_substeps are at least 1")
+        noise = noise_of(reset_noise)
+        check_render_mode(render_mode)
         model, keys, controllers = _fetch(with_model_options(address), {"step_mode": "direct", **client_options})
         mapping = SpaceMapping(model, keys, fields_of(observations), space_mode)
         super().__init__(
@@ -91,13 +101,17 @@ class URLabBatchEnv(Vectorized):
         )
         self.model = model
         self._n_substeps = n_substeps
-        self._noise = reset_noise
+        self._noise = noise
+        self._start_keyframe = keyframe
+        self.render_mode = render_mode
+        self._render_camera = render_camera
+        self._pictures: BatchPictures | None = None
         self._batch = (batch_class() or ThreadedBatch)(model, num_envs, n_threads)
         # Bound before the first call: a derived field is computed only where somebody looks at it.
         self._arrays = {name: self._batch.bind(name) for name in ("qpos", "qvel", "ctrl", "act", "sensordata", "time")}
         self._keyframes = {name: i for i, name in enumerate(model_names(model, "key"))}
         self._noisy = {
-            key: model.jnt_qposadr[[mapping.layout(key).joints[name] for name in mapping.joint_names(key, model)]]
+            key: np.array([mapping.layout(key).joints[name] for name in mapping.joint_names(key, model)], dtype=np.intp)
             for key in mapping.keys
         }
         self._sensors = {key: _sensor_addresses(model, mapping.layout(key)) for key in mapping.keys}
@@ -105,6 +119,27 @@ class URLabBatchEnv(Vectorized):
             key: _controller(model, mapping.layout(key), kind, params) for key, (kind, params) in controllers.items()
         }
         self._step_count = np.zeros(num_envs, dtype=np.int64)
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Return a picture of each copy as it is, shape (H, W, 3), RGB; None without a render mode.
+
+        All calls belong on one thread.
+
+        Raises:
+            ValueError: There is no such camera.
+            ImportError: Nothing here can draw.
+        """
+        if self.render_mode is None:
+            return None
+        if self._pictures is None:
+            self._pictures = BatchPictures(self.model, self._render_camera)
+        return tuple(self._pictures.draw(qpos) for qpos in self._arrays["qpos"])
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Free what drew."""
+        pictures, self._pictures = self._pictures, None
+        if pictures is not None:
+            pictures.close()
 
     def _reset_and_step(self, fresh: Indices, acting: Indices, actions: Any) -> tuple[Found, Found]:
         nothing: Found = (None, {})
@@ -114,13 +149,15 @@ class URLabBatchEnv(Vectorized):
         )
 
     def _reset_some(self, indices: Indices, keyframe: str | None) -> Found:
+        keyframe = self._start_keyframe if keyframe is None else keyframe
         self._batch.reset(indices, -1 if keyframe is None else self._keyframe_id(keyframe))
         if self._noise:
             qpos = self._arrays["qpos"]
             for i in map(int, indices):
                 for key in self.mapping.keys:
-                    address = self._noisy[key]
-                    qpos[i, address] += self._rngs[i].uniform(-self._noise, self._noise, len(address))
+                    joints = self._noisy[key]
+                    address = self.model.jnt_qposadr[joints]
+                    qpos[i, address] = self._noise.drawn(self._rngs[i], self.model, joints, qpos[i, address])
             self._batch.forward(indices)
         self._step_count[indices] = 0
         return self._observe(indices), {}

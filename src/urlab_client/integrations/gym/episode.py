@@ -11,13 +11,14 @@ from gymnasium import spaces
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
 from urlab_client.integrations.gym.spaces import LEVELS, Field, Observation, Space, SpaceMapping, SpaceMode, dict_space
+from urlab_client.integrations.gym.starts import ResetNoise, noise_of
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.enums import CameraMode, ObservationLevel, StepMode
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import StepOk
 from urlab_client.protocol.pixels import Pixels
 
-__all__ = ["EnvEpisode"]
+__all__ = ["EnvEpisode", "first_camera"]
 
 
 def fields_of(observations: str | Sequence[str]) -> tuple[Field, ...]:
@@ -54,7 +55,8 @@ class EnvEpisode:
         cameras: Sequence[str],
         rendered: Sequence[str],
         n_substeps: int,
-        reset_noise: float,
+        reset_noise: float | ResetNoise,
+        keyframe: str | None,
     ) -> None:
         """Describe the episodes of a client.
 
@@ -65,7 +67,8 @@ class EnvEpisode:
             cameras: Cameras whose frames come with each observation, `ARTICULATION/CAMERA` or a scene-level name.
             rendered: Further cameras whose frames are to be in `frames`.
             n_substeps: Physics steps per action.
-            reset_noise: Largest deviation of hinge and slide joints at a reset, radians or metres.
+            reset_noise: Largest deviation of joints at a reset; a number is for hinge joints, radians.
+            keyframe: Where episodes start, unless a reset names another one.
 
         Raises:
             URLabError: The client has no model, no articulation, or is in live mode.
@@ -74,8 +77,7 @@ class EnvEpisode:
         """
         if n_substeps < 1:
             raise ValueError(f"n_substeps must be at least 1, not {n_substeps}")
-        if not 0 <= reset_noise < np.inf:
-            raise ValueError(f"reset_noise must be 0 or more, not {reset_noise}")
+        noise = noise_of(reset_noise)
         model = client.model
         if model is None or not client.articulations:
             raise URLabError(
@@ -99,11 +101,13 @@ class EnvEpisode:
         self._level = ObservationLevel.MINIMAL if minimal else ObservationLevel.STANDARD
         self._cameras = {name: client_camera(client, name) for name in (*cameras, *rendered)}
         self._n_substeps = n_substeps
-        self._noise = reset_noise
+        self._noise = noise
+        self._keyframe = keyframe
 
     async def reset(self, rng: np.random.Generator, keyframe: str | None = None) -> Observation:
         """Reset the simulation and return the first observation; set-points become zero."""
         client = self.client
+        keyframe = self._keyframe if keyframe is None else keyframe
         for articulation in client.articulations.values():
             articulation.ctrl_array[:] = 0.0
         await client.reset(keyframe)
@@ -134,9 +138,11 @@ class EnvEpisode:
         for key in self.mapping.keys:
             articulation = self.client.articulations[key]
             names = self.mapping.joint_names(key, self._model)
-            offsets = rng.uniform(-self._noise, self._noise, len(names))
+            joints = self.mapping.layout(key).joints
+            ids = np.array([joints[name] for name in names], dtype=np.intp)
             present = articulation.get_qpos()
-            positions[key] = {name: present[name] + float(offset) for name, offset in zip(names, offsets, strict=True)}
+            drawn = self._noise.drawn(rng, self._model, ids, np.array([present[name] for name in names]))
+            positions[key] = dict(zip(names, drawn.tolist(), strict=True))
         return positions
 
     async def _look(self, keyframe: str | None, overrides: Mapping[str, Mapping[str, float]] | None) -> None:
@@ -177,8 +183,14 @@ class EnvEpisode:
 
         observation = self.mapping.observe(read)
         if self._observed_cameras:
-            observation["cameras"] = {name: self.frames[name] for name in self._observed_cameras}
+            observation["cameras"] = {name: self._shown(name) for name in self._observed_cameras}
         return observation
+
+    def _shown(self, name: str) -> Pixels:
+        frame = self.frames[name]
+        if self._cameras[name].mode != CameraMode.REAL:
+            return frame
+        return np.ascontiguousarray(frame[..., :3], dtype=np.uint8)
 
     def _with_cameras(self, cameras: Sequence[str]) -> Space:
         mapping = self.mapping
@@ -221,9 +233,25 @@ def client_camera(client: URLabClient, name: str) -> URLabCameraView:
     return client.global_cameras[name]
 
 
+def first_camera(client: URLabClient) -> str:
+    """Return the first camera that shows colours.
+
+    Raises:
+        ValueError: There is none.
+    """
+    for key, articulation in client.articulations.items():
+        for name, view in articulation.cameras.items():
+            if view.mode == CameraMode.REAL:
+                return f"{key}/{name}"
+    for name, view in client.global_cameras.items():
+        if view.mode == CameraMode.REAL:
+            return name
+    raise ValueError("the scene has no colour camera to render: add one to its MJCF, or use render_mode=None")
+
+
 def camera_space(view: URLabCameraView) -> Space:
-    """Return the space of a camera's frames: metres for depth, else four bytes per pixel."""
+    """Return the space of a camera's pictures: depths in metres, RGB as `render` has it, RGBA of segmentations."""
     width, height = view.resolution
     if view.mode == CameraMode.DEPTH:
         return spaces.Box(0.0, np.inf, (height, width), dtype=np.float32)
-    return spaces.Box(0, 255, (height, width, 4), dtype=np.uint8)
+    return spaces.Box(0, 255, (height, width, 3 if view.mode == CameraMode.REAL else 4), dtype=np.uint8)
