@@ -3,6 +3,10 @@
 For the dispatcher. A request is decoded to plain data and coerced field by field, as the plugin's engine does: names
 and numbers in odd spellings are understood, unusable values count as absent. A `step` that means exactly what it says
 is decoded by msgspec in one go, and so is a piece of an upload. Both ways agree where the second succeeds.
+
+What that saves, in processor time: field by field a bare `step` takes 6 us instead of 0.5, one with 12 set-points 18
+instead of 1.2, and a piece of an upload 4.5 ms a MiB instead of 0.1. The other ops come too seldom to be worth 0.8 ms
+each of the server's start.
 """
 
 from __future__ import annotations
@@ -10,7 +14,7 @@ from __future__ import annotations
 import types
 from collections.abc import Callable, Mapping
 from functools import cached_property
-from typing import Any, Final, TypeVar, Union, get_args
+from typing import Any, Final, TypeVar, Union
 
 import msgspec
 from msgspec import UNSET, Struct
@@ -109,7 +113,7 @@ class RequestReader:
             if not issubclass(struct, op.request):
                 raise TypeError(f"{struct.__name__} does not derive from {op.request.__name__}")
             self._loose[op.name] = _LooseOp(op, struct)
-            if _worth_a_decoder(op):
+            if op.hot:
                 exact = strict_struct(struct)
                 self._exact[exact] = op
                 strict.append(exact)
@@ -170,16 +174,6 @@ class RequestReader:
         request = loose.convert(fields)
         self._check_strings(loose.op, request, frame, exact=False)
         return Incoming(name, loose.op, _session_id(fields), request, missing)
-
-
-def _worth_a_decoder(op: Op) -> bool:
-    """Whether an op is decoded exactly.
-
-    Field by field a bare `step` takes 6 us of processor time instead of 0.5, one with 12 set-points 18 instead of 1.2,
-    and a piece of an upload 4.5 ms a MiB instead of 0.1. The other ops come too seldom to be worth 0.8 ms each of the
-    server's start.
-    """
-    return op.hot or any(bytes in get_args(field.type) for field in msgspec.structs.fields(op.request))
 
 
 def _session_id(fields: Mapping[str, Plain]) -> str:
