@@ -171,7 +171,7 @@ class MujocoViewer:
         )
 
 
-def _prepare(model: mujoco.MjModel, prefixes: dict[str, str]) -> Shown:
+def _prepare(model: mujoco.MjModel, prefixes: Mapping[str, str]) -> Shown:
     import mujoco  # noqa: PLC0415
 
     bundle: bytes = _payload().serialize_model_bundle(model)

@@ -17,7 +17,7 @@ from urlab_client.aio.launch import with_model_options
 from urlab_client.aio.model.layout import ArticulationLayout
 from urlab_client.aio.model.mirror import model_names
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn
-from urlab_client.integrations.gym.episode import compiled_prefixes, fields_of
+from urlab_client.integrations.gym.episode import client_defaults, compiled_prefixes, fields_of
 from urlab_client.integrations.gym.pictures import BatchPictures
 from urlab_client.integrations.gym.spaces import Field, Observation, SpaceMapping, SpaceMode
 from urlab_client.integrations.gym.starts import ResetNoise, noise_of
@@ -89,7 +89,7 @@ class URLabBatchEnv(Vectorized):
             raise ValueError("num_envs and n_substeps are at least 1")
         noise = noise_of(reset_noise)
         check_render_mode(render_mode)
-        scene = _fetch(with_model_options(address), {"step_mode": "direct", **client_options})
+        scene = _fetch(with_model_options(address), client_defaults(client_options))
         model, prefixes, controllers, exact = scene
         mapping = SpaceMapping(model, prefixes, fields_of(observations), space_mode)
         super().__init__(
@@ -238,8 +238,7 @@ def _fetch(
             raise URLabError(f"There is no articulation at {address}.", hint="Start play first.")
         attached = {key: articulation.controller for key, articulation in client.articulations.items()}
         controllers = {key: (str(found.kind), dict(found.params)) for key, found in attached.items() if found}
-        prefixes = compiled_prefixes(client.articulations)
-        return model, prefixes, controllers, client.server.features.exact_controls
+        return model, compiled_prefixes(client), controllers, client.server.features.exact_controls
 
 
 @dataclass(frozen=True)
