@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from urlab_client import NotSettled, URLabTimeoutError
+from urlab_client.enums import ControllerKind
 from urlab_client.protocol.descriptions import SceneDescription
 from urlab_client.server import ControllerConfig
 
@@ -115,7 +116,7 @@ async def test_actuators_say_what_their_set_points_mean(connect: Any, server: An
 
 
 async def test_under_a_controller_set_points_are_positions(connect: Any, serve: Any, model: Path) -> None:
-    with serve(model, play=True, controllers={"kinds": ControllerConfig(kind="pd")}) as server:
+    with serve(model, play=True, controllers={"kinds": ControllerConfig(kind=ControllerKind.PD)}) as server:
         client = await described(connect, server)
         (art,) = client.articulations.values()
         assert art.describe().controller.in_force
