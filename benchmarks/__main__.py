@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
 
 from benchmarks.harness import Result, measure
 from benchmarks.machine import describe
-from benchmarks.rows import all_rows
+from benchmarks.rows import all_rows, one_row
 
 
 def main() -> int:
@@ -19,21 +20,30 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="under a minute; noisier")
     parser.add_argument("--only", action="append", metavar="NAME", help="rows whose name contains NAME; repeatable")
+    parser.add_argument("--row", metavar="NAME", help="the one row of that name")
+    parser.add_argument("--against", type=Path, metavar="FILE", help="figures of another run to report the change from")
     parser.add_argument("--json", type=Path, default=Path("benchmarks.json"), help="file to write (%(default)s)")
     parser.add_argument("--seconds", type=float, help="seconds to measure each row, instead of 10, or 1 with --quick")
     parser.add_argument("--list", action="store_true", help="list the rows and stop")
     options = parser.parse_args()
-    rows = [row for row in all_rows() if not options.only or any(part in row.name for part in options.only)]
+    if options.row:
+        found = one_row(options.row)
+        rows = [] if found is None else [found]
+    else:
+        rows = [row for row in all_rows() if not options.only or any(part in row.name for part in options.only)]
     if not rows:
-        parser.error(f"no row is named like {' or '.join(options.only)}")
+        parser.error(f"no row is named like {' or '.join(options.only or [options.row])}")
     if options.list:
         for row in rows:
-            print(f"{row.name:<22}{row.what} / {row.floor}")
+            print(f"{row.name:<30}{row.what} / {row.floor}")
         return 0
     seconds = options.seconds or (1.0 if options.quick else 10.0)
     before = describe()
     print(f"{before['cpu']}, {before['cores']} cores, load {before['load']}, Python {before['python']}\n")
-    print(f"{'row':<22}{'ratio':>7}  {'(10-90 % of rounds)':<21}{'to reach':>9}{'p99':>8}{'to keep':>9}  rounds")
+    print(
+        f"{'row':<30}{'ratio':>7}  {'(10-90 % of rounds)':<18}{'to reach':>9}{'p99':>7}{'to keep':>9}"
+        f"{'µs':>8}{'floor':>8}{'processor':>11}{'floor':>7}{'to keep':>9}  rounds"
+    )
     results: list[Result] = []
     for row in rows:
         started = time.perf_counter()
@@ -43,7 +53,28 @@ def main() -> int:
     document = {"before": before, "after": describe(), "seconds": seconds, "rows": [_plain(r) for r in results]}
     options.json.write_bytes(msgspec.json.format(msgspec.json.encode(document), indent=1) + b"\n")
     print(f"\nwritten: {options.json}")
+    if options.against is not None:
+        _compare(results, options.against)
     return 0
+
+
+def _compare(results: Sequence[Result], against: Path) -> None:
+    """Report how far the ratios are from those of another run, which may be of another machine."""
+    if not against.exists():
+        print(f"\nno figures to compare with: {against} does not exist")
+        return
+    known = {row["name"]: row for row in msgspec.json.decode(against.read_bytes())["rows"]}
+    print(f"\nratios by those of {against}; the brackets are the 10-90 % of rounds, then and now")
+    for result in results:
+        row = known.get(result.row.name)
+        if row is None:
+            print(f"{result.row.name:<30}new")
+            continue
+        apart = result.low > row["high"] or result.high < row["low"]
+        print(
+            f"{result.row.name:<30}{row['ratio']:>6.2f} ({row['low']:.2f} - {row['high']:.2f})"
+            f"{result.ratio:>8.2f} ({result.low:.2f} - {result.high:.2f}){'  changed' if apart else ''}"
+        )
 
 
 def _print(result: Result, seconds: float) -> None:
@@ -53,9 +84,12 @@ def _print(result: Result, seconds: float) -> None:
     p99 = "" if result.p99 is None else f"{result.p99:.2f}"
     keep = "" if row.p99 is None else f"≤ {row.p99:.2f}"
     missed = f"  missed: {', '.join(result.misses)}" if result.misses else ""
+    ours, floor = ("", "") if result.cpu_us is None else (f"{each:.1f}" for each in result.cpu_us)
+    most = "" if row.cpu_us is None else f"≤ {row.cpu_us:.0f}"
+    took, floor_took = (f"{1e6 * each:.1f}" for each in result.median_s)
     print(
-        f"{row.name:<22}{result.ratio:>7.2f}  {spread:<21}{f'{sign} {row.reach:.2f}':>9}{p99:>8}{keep:>9}"
-        f"  {result.rounds} in {seconds:.0f} s{missed}"
+        f"{row.name:<30}{result.ratio:>7.2f}  {spread:<18}{f'{sign} {row.reach:.2f}':>9}{p99:>7}{keep:>9}"
+        f"{took:>8}{floor_took:>8}{ours:>11}{floor:>7}{most:>9}  {result.rounds} in {seconds:.0f} s{missed}"
     )
     for figure in result.figures:
         limit = "" if figure.at_most is None else f"  (to keep: ≤ {figure.at_most:g})"
@@ -76,6 +110,8 @@ def _plain(result: Result) -> dict[str, object]:
         "reach": row.reach,
         "p99": result.p99,
         "p99_to_keep": row.p99,
+        "cpu_us": None if result.cpu_us is None else {"ours": result.cpu_us[0], "floor": result.cpu_us[1]},
+        "cpu_us_to_keep": row.cpu_us,
         "rounds": result.rounds,
         "samples": result.samples,
         "median_s": {"ours": result.median_s[0], "floor": result.median_s[1]},

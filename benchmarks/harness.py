@@ -16,6 +16,7 @@ Burst = Callable[[int], list[float]]
 """Does something a number of times; returns seconds per time, one value for each or one mean of all."""
 
 _BURST_S = 0.03
+_CALIBRATIONS = 3
 _MIN_ROUNDS = 4
 _MIN_ROUNDS_QUICK = 2
 
@@ -62,6 +63,7 @@ class Row:
         prepare: Makes the pair, and takes it down.
         kind: `time`: time by the floor's time, to be at most `reach`; `rate`: rate by the floor's rate, at least it.
         p99: The ratio of 99th percentiles to keep, where bursts return single times.
+        cpu_us: Processor time to keep, microseconds each, where bursts return single times.
         burst_s: Seconds per burst: longer than what disturbs single times, shorter than what disturbs whole bursts.
         count: Times per burst, where `burst_s` does not tell: 1 for what takes long.
     """
@@ -73,6 +75,7 @@ class Row:
     prepare: Callable[[], AbstractContextManager[Pair]]
     kind: Literal["time", "rate"] = "time"
     p99: float | None = None
+    cpu_us: float | None = None
     burst_s: float = _BURST_S
     count: int | None = None
 
@@ -88,6 +91,8 @@ class Result:
         p99: Ratio of 99th percentiles; None where single times are not known.
         rounds: Rounds taken.
         samples: Times taken, of each of the two.
+        cpu_us: Median of the rounds' processor times of ours and of the floor, microseconds each: of this process with
+            all its threads, so without the server's. None where single times are not known.
         median_s: Median seconds of ours and of the floor on this machine, to look into; they are not comparable.
         figures: The other figures.
     """
@@ -99,6 +104,7 @@ class Result:
     p99: float | None
     rounds: int
     samples: int
+    cpu_us: tuple[float, float] | None
     median_s: tuple[float, float]
     figures: Sequence[Figure] = field(default_factory=tuple)
 
@@ -110,6 +116,8 @@ class Result:
         missed = [] if reached else ["median"]
         if row.p99 is not None and self.p99 is not None and self.p99 > row.p99:
             missed.append("p99")
+        if row.cpu_us is not None and self.cpu_us is not None and self.cpu_us[0] > row.cpu_us:
+            missed.append("processor time")
         return [*missed, *(f.name for f in self.figures if f.at_most is not None and f.value > f.at_most)]
 
 
@@ -137,9 +145,14 @@ def percentile(values: Sequence[float], percent: float) -> float:
 def measure(row: Row, seconds: float) -> Result:
     """Take a row's ratio in about `seconds`, preparation not counted."""
     with row.prepare() as pair:
-        counts = {burst: row.count or _count(burst, row.burst_s) for burst in (pair.ours, pair.floor)}
+        # Several times, as one that is disturbed gives a number that is far too small.
+        counts = {
+            burst: row.count or max(_count(burst, row.burst_s) for _ in range(_CALIBRATIONS))
+            for burst in (pair.ours, pair.floor)
+        }
         ours: list[list[float]] = []
         floor: list[list[float]] = []
+        busy: dict[Burst, list[float]] = {pair.ours: [], pair.floor: []}
         gc.collect()
         end = time.perf_counter() + seconds
         least = _MIN_ROUNDS if seconds > 2 else _MIN_ROUNDS_QUICK
@@ -147,7 +160,9 @@ def measure(row: Row, seconds: float) -> Result:
             turns = [(pair.ours, ours), (pair.floor, floor)]
             # The order changes, so that neither always has the other's aftermath to bear.
             for burst, taken in turns if len(ours) % 2 else reversed(turns):
+                before = time.process_time()
                 taken.append(burst(counts[burst]))
+                busy[burst].append((time.process_time() - before) / counts[burst])
         figures = pair.figures()
     of_rounds = [_ratio(row, statistics.median(a), statistics.median(b)) for a, b in zip(ours, floor, strict=True)]
     all_ours = [time_s for taken in ours for time_s in taken]
@@ -162,9 +177,16 @@ def measure(row: Row, seconds: float) -> Result:
         p99=percentile(all_ours, 99) / percentile(all_floor, 99) if singles else None,
         rounds=len(ours),
         samples=min(len(all_ours), len(all_floor)),
+        cpu_us=(1e6 * statistics.median(busy[pair.ours]), 1e6 * statistics.median(busy[pair.floor]))
+        if singles
+        else None,
         median_s=medians,
         figures=figures,
     )
+
+
+def _micros(seconds: Sequence[float]) -> float:
+    return 1e6 * statistics.median(seconds)
 
 
 def _ratio(row: Row, ours: float, floor: float) -> float:

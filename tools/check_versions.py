@@ -35,7 +35,7 @@ CORE = (*PHYSICS, "tests/protocol", "tests/aio", "tests/sync", "tests/integratio
 QUICK = {"lowest": CORE, "mujoco-3.11": PHYSICS}
 
 # What the core's tests use of the extra `test`; the rest is for integrations, and takes long to install.
-TESTS_NEED = {"gymnasium", "hypothesis", "pillow", "trio", "uvloop"}
+TESTS_NEED = {"coacd", "gymnasium", "hypothesis", "pillow", "trio", "uvloop"}
 
 
 def project() -> dict[str, Any]:

@@ -67,8 +67,8 @@ def _sessions() -> Iterator[Pair]:
 
         def figures() -> list[Figure]:
             cpu_us = [
-                Figure(name=f"processor time of a step, {who}, µs", value=1e6 * them.cpu_of_a_step_s)
-                for who, them in (("together", many), ("alone", one))
+                Figure(name=f"processor time of a step, {who}, µs", value=1e6 * them.cpu_of_a_step_s, at_most=most)
+                for who, them, most in (("together", many, 60.0), ("alone", one, None))
             ]
             memory = Figure(name="memory of an idle session, MB", value=each_mb, at_most=3.0)
             return [*cpu_us, memory] if before else cpu_us

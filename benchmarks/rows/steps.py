@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import importlib.util
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 from benchmarks.canned import LAST_STEP, Requester, server
+from benchmarks.conditions import warm
 from benchmarks.harness import Pair, Row, each
 from benchmarks.robots import recorded
 from urlab_client import URLabClient, aio
@@ -19,9 +22,13 @@ _JOINTS = 29
 
 
 @contextlib.contextmanager
-def asynchronous() -> Iterator[Pair]:
+def asynchronous(loop_factory: Callable[[], asyncio.AbstractEventLoop] | None = None) -> Iterator[Pair]:
     """Steps of the async client in a loop that does nothing else."""
-    with server(recorded(_JOINTS)) as port, asyncio.Runner() as runner, Requester(port) as floor:
+    with (
+        server(recorded(_JOINTS)) as port,
+        asyncio.Runner(loop_factory=loop_factory) as runner,
+        Requester(port) as floor,
+    ):
         client = aio.URLabClient(f"tcp://127.0.0.1:{port}", step_mode="direct")
         runner.run(client.discover())
         runner.run(client.step())
@@ -88,16 +95,37 @@ def blocking_beside_busy_thread() -> Iterator[Pair]:
 
 _FLOOR = "blocking REQ loop, same bytes, same server, no decoding"
 
+_AIO = Row(
+    name="step-aio",
+    what="await client.step(), 29 DoF, standard observations, answered at once",
+    floor=_FLOOR,
+    reach=1.35,
+    p99=2.0,
+    prepare=asynchronous,
+)
+_FACADE = Row(name="step-facade", what="client.step(), the same", floor=_FLOOR, reach=1.5, prepare=blocking)
+
+
+def _on_uvloop() -> tuple[Row, ...]:
+    if importlib.util.find_spec("uvloop") is None:
+        return ()
+    import uvloop  # noqa: PLC0415  # where it is installed
+
+    row = replace(
+        _AIO,
+        name="step-uvloop",
+        what="await client.step() on uvloop",
+        prepare=lambda: asynchronous(uvloop.new_event_loop),
+    )
+    return row, warm(row, reach=2.2, p99=2.0, cpu_us=75.0)
+
+
 ROWS = (
-    Row(
-        name="step-aio",
-        what="await client.step(), 29 DoF, standard observations, answered at once",
-        floor=_FLOOR,
-        reach=1.35,
-        p99=2.0,
-        prepare=asynchronous,
-    ),
-    Row(name="step-facade", what="client.step(), the same", floor=_FLOOR, reach=1.5, prepare=blocking),
+    _AIO,
+    _FACADE,
+    warm(_AIO, reach=3.0, p99=2.0, cpu_us=75.0),
+    warm(_FACADE, reach=2.0, p99=2.0, cpu_us=60.0),
+    *_on_uvloop(),
     Row(
         name="step-aio-busy",
         what="await client.step() beside a CPU-bound Python thread",

@@ -27,8 +27,10 @@ if TYPE_CHECKING:
 
 __all__ = [
     "MODEL_FILE",
+    "acting_kind",
     "actuator_count",
     "actuator_kind",
+    "asset_bytes",
     "batch_class",
     "check_copy",
     "control_counts",
@@ -40,6 +42,7 @@ __all__ = [
     "merge_assets",
     "mujoco_version",
     "reset_controls",
+    "servo_damping",
     "set_threads",
     "thread_limit",
     "without_newer_attributes",
@@ -103,15 +106,47 @@ def actuator_kind(actuator: Any) -> str:
     """
     if hasattr(actuator, "type"):
         return _constant(actuator.type).lower()
-    dynamics, gain, bias = (_constant(value) for value in (actuator.dyntype, actuator.gaintype, actuator.biastype))
+    return _kind_by_parameters(actuator.dyntype, actuator.gaintype, actuator.biastype, actuator.trntype, actuator)
+
+
+def acting_kind(model: mujoco.MjModel, actuator: int) -> str:
+    """Return the MJCF element that has the gain and bias of a compiled actuator: a `general` with those of a servo is
+    one, which is how `MjSpec.to_xml()` writes servos.
+    """
+    import mujoco  # noqa: PLC0415
+
+    element = model.actuator(actuator)
+    return _kind_by_parameters(
+        mujoco.mjtDyn(int(model.actuator_dyntype[actuator])),
+        mujoco.mjtGain(int(model.actuator_gaintype[actuator])),
+        mujoco.mjtBias(int(model.actuator_biastype[actuator])),
+        mujoco.mjtTrn(int(model.actuator_trntype[actuator])),
+        element,
+    )
+
+
+def servo_damping(model: mujoco.MjModel, actuator: int) -> float:
+    """Return the gain of an actuator on the velocity: of an affine bias, else of its gain."""
+    import mujoco  # noqa: PLC0415
+
+    if model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_AFFINE:
+        return -float(model.actuator_biasprm[actuator][2]) + 0.0  # no negative zero
+    return float(model.actuator_gainprm[actuator][1])
+
+
+def _kind_by_parameters(dyntype: Any, gaintype: Any, biastype: Any, trntype: Any, parameters: Any) -> str:
+    dynamics, gain, bias = (_constant(value) for value in (dyntype, gaintype, biastype))
     if dynamics in ("MUSCLE", "DCMOTOR"):
         return dynamics.lower()
     if bias == "AFFINE":
-        servo = "position" if actuator.biasprm[1] else "velocity"
-        return {"INTEGRATOR": "intvelocity", "FILTER": "cylinder"}.get(dynamics, servo)
+        stiffness = parameters.biasprm[1]
+        if dynamics == "FILTER" and not (stiffness and stiffness == -parameters.gainprm[0]):
+            return "cylinder"
+        servo = "position" if stiffness else "velocity"
+        return {"INTEGRATOR": "intvelocity"}.get(dynamics, servo)
     if gain == "AFFINE":
         return "damper"
-    return "adhesion" if _constant(actuator.trntype) == "BODY" else "motor"
+    return "adhesion" if _constant(trntype) == "BODY" else "motor"
 
 
 def _constant(value: Any) -> str:
@@ -324,6 +359,18 @@ def batch_class() -> Any:
         return importlib.import_module("mujoco.batch").Batch
     except ImportError:
         return None
+
+
+def asset_bytes(model: mujoco.MjModel) -> int:
+    """Return how many bytes of a model are meshes and textures, which `merge_assets` shares.
+
+    Before 3.17 nothing is shared, and this is 0.
+    """
+    import mujoco  # noqa: PLC0415
+
+    if not hasattr(mujoco.MjSpec, "dedup_assets"):
+        return 0
+    return sum(getattr(model, name).nbytes for name in dir(model) if name.startswith(("mesh_", "tex_")))
 
 
 def merge_assets(spec: mujoco.MjSpec, folders: Iterable[Path]) -> None:

@@ -16,7 +16,7 @@ from waiting import DEADLINE_S, eventually, pass_time, until
 import urlab_client
 from urlab_client import ClientClosed, OutcomeUnknown, ServerUnreachable
 from urlab_client.aio import URLabClient
-from urlab_client.aio.launch import serve_arguments, with_model_options
+from urlab_client.aio.launch import serve_arguments, start_seconds, with_model_options
 
 
 def children() -> set[int]:
@@ -71,6 +71,14 @@ async def test_options_of_serve_go_into_the_address(tmp_path: Path) -> None:
         await client.discover()
         await client.step()
         assert client.sim_time == 0.01
+
+
+@pytest.mark.parametrize("text", ["soon", "0", "nan", "inf"])
+def test_how_long_a_start_may_take_is_a_number_of_seconds(text: str) -> None:
+    assert start_seconds("sim://arm?start-timeout=2.5&model=ball") == 2.5
+    assert serve_arguments("sim://arm?start-timeout=2.5&model=ball") == ["arm", "ball"]
+    with pytest.raises(ValueError, match="start-timeout must be a number of seconds above 0"):
+        URLabClient(f"sim://arm?start-timeout={text}")
 
 
 async def test_options_of_a_model_that_have_no_effect_are_told(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from commands import GYMNASIUM_MODELS, urlab
 from PIL import Image
 
 from urlab_client import URLabClient
+from urlab_client._installation import install_command
 from urlab_client.cli import main
 from urlab_client.cli.demo_controllers import SineController
 from urlab_client.cli.robot_file import read_robot
@@ -142,7 +143,9 @@ def test_drives_the_robot_of_a_user(tmp_path: Path, name: str, capsys: pytest.Ca
     assert "--no-render" in capsys.readouterr().out
 
 
-def test_a_robot_without_a_floor_gets_one(tmp_path: Path) -> None:
+def test_a_robot_without_floor_and_actuators_gets_one_and_is_not_said_to_be_driven(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     model = tmp_path / "block.xml"
     model.write_text(
         "<mujoco><worldbody><body pos='0 0 -5'><freejoint/>"
@@ -152,6 +155,9 @@ def test_a_robot_without_a_floor_gets_one(tmp_path: Path) -> None:
     record = json.loads((tmp_path / "run.json").read_bytes())
     heights = [pose["position"][2] for run in record["runs"] for pose in run["final_base_poses"]]
     assert heights == pytest.approx([0.1, 0.1, 0.1], abs=0.01)
+    kinds = {controller["kind"] for controllers in record["controllers"].values() for controller in controllers}
+    assert kinds == {"none"}
+    assert "0 actuators: nothing is driven" in capsys.readouterr().out
 
 
 def test_goes_on_without_opengl(
@@ -173,7 +179,9 @@ def test_a_missing_extra_is_one_line(
 ) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "rich" else object())
     assert main(["demo", "--output", str(tmp_path)]) == 2
-    assert capsys.readouterr() == ("", "urlab demo: rich is not installed; run: pip install 'urlab-client[demo]'\n")
+    command = install_command("demo")
+    assert "[demo]" in command
+    assert capsys.readouterr() == ("", f"urlab demo: rich is not installed; run: {command}\n")
 
 
 def test_a_model_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -125,7 +125,7 @@ def test_somebody_who_does_not_answer(capsys: pytest.CaptureFixture[str]) -> Non
     assert "does not speak ZeroMQ" in line
 
 
-@pytest.mark.parametrize("address", ["robot", "http://localhost", "sim://nothing.xml", "tcp://"])
+@pytest.mark.parametrize("address", ["http://localhost", "sim://nothing.xml", "tcp://"])
 def test_an_address_that_is_none(address: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert address.removeprefix("sim://") in refused(capsys, address)
 

@@ -185,7 +185,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
 
 def test_a_missing_model(capsys: pytest.CaptureFixture[str]) -> None:
     line = refused(capsys, "robbot.xml")
-    assert line.startswith("urlab serve: robbot.xml: no such file")
+    assert line.startswith("urlab serve: robbot.xml is neither a file nor a bundled robot")
     assert "quadruped" in line
 
 

@@ -12,6 +12,7 @@ from commands import refusal, urlab
 from PIL import Image
 
 from urlab_client import URLabClient
+from urlab_client._installation import install_command
 from urlab_client.cli import main
 from urlab_client.server import SimulatedServer
 
@@ -31,6 +32,13 @@ def test_models_in_a_process_of_its_own(tmp_path: Path) -> None:
     done = urlab("snapshot", "quadruped", "arm", "--size", "160x90", cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (0, "snapshot.png: 160x90\n", "")
     assert np.asarray(Image.open(tmp_path / "snapshot.png")).shape == (90, 160, 4)
+
+
+def test_the_ending_chooses_the_format(tmp_path: Path) -> None:
+    picture = tmp_path / "ball.jpg"
+    assert main(["snapshot", "ball", "--size", "32x24", "-o", str(picture)]) == 0
+    with Image.open(picture) as image:
+        assert (image.format, image.size) == ("JPEG", (32, 24))
 
 
 def test_modes_and_moments_differ() -> None:
@@ -66,6 +74,8 @@ def test_a_camera_of_a_running_server(capsys: pytest.CaptureFixture[str]) -> Non
         address = f"{server.address}:{server.step_port}"
         assert main(["snapshot", address]) == 2
         assert "--camera, one of arm/overview, arm/wrist" in capsys.readouterr().err
+        assert main(["snapshot", address, "--camera", "arm/wirst"]) == 2
+        assert "Did you mean 'arm/wrist'" in capsys.readouterr().err
         assert picture(address, "--camera", "arm/overview", "--timeout", "60").shape == (480, 640, 4)
         assert main(["snapshot", address, "--camera", "arm/overview", "--seconds", "1"]) == 2
         assert "--seconds are for models" in capsys.readouterr().err
@@ -87,6 +97,9 @@ def test_a_stepped_server_publishes_nothing(capsys: pytest.CaptureFixture[str]) 
         (["arm", "--mode", "depth"], ["without --camera", "wireframe"]),
         (["arm", "--mode", "unlit", "--camera", "arm/wrist"], ["with --camera", "semantic"]),
         (["arm", "-o", "nowhere/x.png"], ["nowhere"]),
+        (["arm", "-o", "x.txt"], ["x.txt", ".png or .jpg", "x.png"]),
+        (["amr"], ["amr", "Did you mean 'arm'?"]),
+        (["tcp://localhost:1", "--mjcf-options"], ["sim://MODEL", "tcp://localhost:1"]),
         (["tcp://localhost:1", "arm"], ["one address"]),
     ],
 )
@@ -108,4 +121,4 @@ def test_without_the_library_the_extra_is_named(
 ) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert main(["snapshot", "arm"]) == 2
-    assert "pip install 'urlab-client[demo]'" in capsys.readouterr().err
+    assert install_command("demo") in capsys.readouterr().err

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import shlex
 import signal
 import socket
 import subprocess
@@ -13,7 +15,8 @@ from pathlib import Path
 import pytest
 from commands import DEADLINE_S, child, refusal, urlab
 
-from urlab_client.cli import main
+from urlab_client.cli import _parser, main
+from urlab_client.server import bundled_models
 
 
 def test_help_needs_no_heavy_library_and_a_command_none_of_the_others(tmp_path: Path) -> None:
@@ -34,8 +37,8 @@ def test_help_needs_no_heavy_library_and_a_command_none_of_the_others(tmp_path: 
 
 
 COMMANDS = (
-    "serve", "console", "ping", "doctor", "demo", "keys", "snapshot", "record", "info", "convert", "plot", "run-policy",
-    "view",
+    "serve", "console", "ping", "doctor", "demo", "robots", "keys", "snapshot", "record", "info", "convert", "plot",
+    "run-policy", "view",
 )  # fmt: skip
 
 
@@ -45,6 +48,33 @@ def test_each_command_explains_itself(command: str, capsys: pytest.CaptureFixtur
         main([command, "--help"])
     assert end.value.code == 0
     assert capsys.readouterr().out.startswith(f"usage: urlab {command}")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_examples_of_each_command_are_understood(command: str) -> None:
+    parser = _parser()
+    for line, what in parser.commands[command].examples:
+        assert what
+        words = shlex.split(line)
+        assert words[0] == "urlab"
+        parser.parse_args(words[1:])
+
+
+def test_the_command_alone_prints_the_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 0
+    text, errors = capsys.readouterr()
+    assert errors == ""
+    assert all(command in text for command in COMMANDS)
+
+
+def test_the_robots_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["robots"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].split() == ["arm", "8", "7", "2", "2", "home"]
+    assert main(["robots", "--json"]) == 0
+    listed = json.loads(capsys.readouterr().out)
+    assert [robot["name"] for robot in listed] == [*bundled_models()]
+    assert all(Path(robot["path"]).is_file() for robot in listed)
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
@@ -57,8 +87,14 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ([], ["COMMAND"]),
         (["fly"], ["'fly'", "serve", "ping", "demo"]),
+        (["sreve"], ["'sreve'", "Did you mean 'serve'?"]),
+        (["keys", "shwo"], ["'shwo'", "Did you mean 'show'?"]),
+        (["doctor", "--stepmode", "live"], ["urlab doctor: --stepmode", "'--step-mode'"]),
+        (["doctor", "--step-mode", "drect"], ["'drect'", "Did you mean 'direct'?"]),
+        (["plot", "run.mcap", "--field", "sensor"], ["'sensor'", "Did you mean 'sensors'?"]),
+        (["ping", "arm"], ["'arm'", "sim://arm"]),
+        (["ping", "one", "two"], ["'two'", "too many"]),
         (["serve"], ["MODEL"]),
         (["serve", "arm", "--step-port", "70000"], ["--step-port", "'70000'", "65535"]),
         (["serve", "arm", "--step-mode", "slow"], ["--step-mode", "'slow'", "puppet"]),
@@ -109,6 +145,13 @@ def test_an_address_that_is_none_is_one_line_that_says_so(
     out, err = capsys.readouterr()
     assert (out, err.count("\n")) == ("", 1)
     assert err.startswith(f"urlab {name}: 'gopher://lab' is not a valid address; write tcp://HOST")
+
+
+def test_a_terminal_without_the_characters_of_a_file_name_shows_their_numbers(tmp_path: Path) -> None:
+    done = urlab("keys", "new", "ключ", cwd=tmp_path, environment={"PYTHONIOENCODING": "cp1252"})
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith(r"\u043a\u043b\u044e\u0447.key")
+    assert (tmp_path / "ключ.key").is_file()
 
 
 def test_the_package_runs_as_the_command(tmp_path: Path) -> None:

@@ -170,6 +170,21 @@ async def test_forces_without_a_model_are_told_where_it_is_clear_whose_they_are(
         assert [actuator.force for actuator in mimo.actuators.values()] == [None] * 3
 
 
+async def test_data_have_the_poses_of_the_present_state_when_they_are_read(connect: Any, serve: Any, bot: str) -> None:
+    with serve(bot, play=True) as server:
+        client = connect(server, step_mode="direct")
+        await client.discover()
+        for _ in range(3):
+            await client.step(20)
+            data = client.data
+            expected = mujoco.MjData(client.model)
+            expected.qpos, expected.qvel = data.qpos, data.qvel
+            mujoco.mj_forward(client.model, expected)
+            for name in ("xpos", "xquat", "geom_xpos", "site_xpos", "cam_xpos", "cvel", "subtree_com"):
+                assert np.array_equal(getattr(data, name), getattr(expected, name)), name
+            assert data.xpos[1:].any()
+
+
 async def test_handles(connect: Any, serve: Any, bot: str) -> None:
     with serve(bot, play=True) as server:
         client = connect(server, step_mode="direct")

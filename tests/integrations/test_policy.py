@@ -14,6 +14,7 @@ import pytest
 from waiting import until
 
 from urlab_client import URLabClient, URLabError, aio
+from urlab_client._installation import install_command
 from urlab_client.integrations import policy as policies
 from urlab_client.integrations.policy import (
     Policy,
@@ -25,6 +26,7 @@ from urlab_client.integrations.policy import (
     run,
     run_blocking,
 )
+from urlab_client.server import SimulatedServer
 
 QUADRUPED = "sim://quadruped?controller=quadruped=pd"
 
@@ -136,6 +138,11 @@ def test_a_declaration_that_cannot_work_is_refused_by_file_and_key(old: str, new
     assert str(caught.value).startswith("walk.toml: ")
 
 
+def test_a_table_for_a_normaliser_gets_advice() -> None:
+    with pytest.raises(PolicyFileError, match=r"unknown field `normalizer`.*`offset` and `scale` of each term"):
+        parse_spec(WALK + "\n[normalizer]\nmean = [0.0]\n", "walk.toml")
+
+
 def test_files_that_are_not_there_are_named(tmp_path: Path) -> None:
     with pytest.raises(PolicyFileError, match=r"away.toml: cannot be read: No such file"):
         policies.load(tmp_path / "away.onnx")
@@ -150,7 +157,7 @@ def test_files_that_are_not_there_are_named(tmp_path: Path) -> None:
 def test_the_extra_is_named_when_it_is_missing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "it.toml").write_text(WALK)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ImportError, match=re.escape("pip install 'urlab-client[onnx]'")):
+    with pytest.raises(ImportError, match=re.escape(install_command("onnx"))):
         policies.load(tmp_path / "it.onnx")
 
 
@@ -389,3 +396,33 @@ async def test_in_live_mode_actions_keep_the_pace_of_the_simulation(monkeypatch:
         with pytest.raises(URLabError, match="Physics stands still"):
             await run(client, policy, seconds=60.0, on_action=pause)
         await tasks[0]
+
+
+@pytest.mark.parametrize("dialect", ["alpha", "beta"])
+def test_a_general_actuator_with_an_affine_bias_is_a_servo(dialect: str, tmp_path: Path) -> None:
+    """What `MjSpec.to_xml()` makes of servos, and what the plugins call `motor` and `general`: Beta statement 6."""
+    body = '<body><joint name="{0}"/><geom size="0.1"/></body>'
+    joints = "".join(body.format(name) for name in ("hip", "knee", "wheel"))
+    written = mujoco.MjSpec.from_string(
+        f"<mujoco><worldbody>{joints}</worldbody><actuator>"
+        '<position name="hip" joint="hip" kp="30" kv="2"/><position name="knee" joint="knee" kp="20" timeconst="0.1"/>'
+        '<general name="wheel" joint="wheel" gainprm="3"/></actuator></mujoco>'
+    )
+    written.compile()
+    model = tmp_path / "leg.xml"
+    model.write_text(written.to_xml(), encoding="utf-8")
+    torques = 'robot = "leg"\nstep_modes = ["direct"]\ntimestep = 0.002\ndecimation = 1\n'
+    torques += (
+        '[[observation]]\nterm = "clock"\nhz = 1.0\n[action]\nvia = "actuators"\nkind = "torque"\njoints = ["{}"]'
+    )
+    with (
+        SimulatedServer(str(model), play=True, model_roots=[tmp_path], dialect=dialect) as server,
+        URLabClient(**server.client_options(), step_mode="direct") as client,
+    ):
+        client.discover()
+        leg = client.articulations["leg"].actuators
+        assert [str(leg[name].type) for name in ("hip", "knee", "wheel")] == ["position", "position", "motor"]
+        assert (leg["hip"].kp, leg["hip"].kv) == (30.0, 2.0)
+        require(client, policy_of(torques.format("wheel")))
+        with pytest.raises(PolicyMismatch, match=r"'hip' of 'leg' is a position; .* requires a motor"):
+            require(client, policy_of(torques.format("hip")))

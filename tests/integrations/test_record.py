@@ -19,11 +19,12 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from waiting import until
+from waiting import eventually, until
 
 import urlab_client
 from urlab_client import NotReady
 from urlab_client.aio import URLabClient as AsyncClient
+from urlab_client.aio.state.step_pictures import StepPictures
 from urlab_client.integrations._feed.messages import (
     ArticulationMessage,
     CameraCalibration,
@@ -455,16 +456,102 @@ def test_what_the_file_cannot_keep_up_with_is_dropped_and_counted(
         write(self, item)
 
     monkeypatch.setattr(writing._Sink, "write", slowly)
-    with record(client, tmp_path / "run.mcap", buffer_mib=0.1) as recorder:
-        for _ in range(200):
-            client.step()
-        dropped = recorder.stats.dropped_states
-        assert recorder.stats.waiting_bytes <= 0.1 * 2**20
-        assert 100 < dropped < 200
-        going.set()
+
+    def drive() -> Any:
+        with record(client, tmp_path / "run.mcap", buffer_mib=0.1, lossless=False) as recorder:
+            for _ in range(200):
+                client.step()
+            assert recorder.stats.waiting_bytes <= 0.1 * 2**20
+            going.set()
+        return recorder
+
+    with pytest.warns(UserWarning, match=r"run\.mcap: 1\d\d states and 0 pictures were lost"):
+        recorder = drive()
+    dropped = recorder.stats.dropped_states
+    assert 100 < dropped < 200
     table, summary = read_run(recorder.path).table(), read_run(recorder.path).summary()
     assert (len(table), summary.dropped_states) == (200 - dropped, dropped)
     assert table.step.tolist() == list(range(1, 201 - dropped))
+
+
+@pytest.fixture
+def seeing() -> Iterator[urlab_client.URLabClient]:
+    """A client of a server that draws small pictures."""
+    with (
+        SimulatedServer("arm", play=True, camera_size=(64, 48)) as server,
+        urlab_client.URLabClient(**server.client_options(), step_mode="direct") as client,
+    ):
+        client.discover()
+        yield client
+
+
+def test_steps_wait_for_a_file_that_cannot_keep_up(
+    seeing: urlab_client.URLabClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    going = threading.Event()
+    write: Callable[..., None] = writing._Sink.write
+    seen: list[int] = []
+
+    def slowly(self: Any, item: Any) -> None:
+        assert going.wait(30)
+        write(self, item)
+
+    monkeypatch.setattr(writing._Sink, "write", slowly)
+    with record(seeing, tmp_path / "run.mcap", cameras=["arm/wrist"], camera_hz=500, buffer_mib=0.2) as recorder:
+
+        def drive() -> None:
+            for _ in range(40):
+                seeing.step()
+                seen.append(recorder.stats.waiting_bytes)
+
+        stepping = threading.Thread(target=drive)
+        stepping.start()
+        eventually(lambda: seen and seen[-1] > 0.1 * 2**20)
+        assert len(seen) < 40
+        assert seen[-1] < 0.2 * 2**20
+        going.set()
+        stepping.join()
+    summary = read_run(recorder.path).summary()
+    assert (summary.dropped_states, summary.dropped_frames) == (0, 0)
+    assert summary.topics["/state/arm"].messages == summary.topics["/camera/arm/wrist"].messages == 40
+
+
+def test_a_file_that_takes_nothing_any_more_is_not_waited_for_without_end(
+    client: urlab_client.URLabClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    going = threading.Event()
+    write: Callable[..., None] = writing._Sink.write
+
+    def never(self: Any, item: Any) -> None:
+        assert going.wait(30)
+        write(self, item)
+
+    monkeypatch.setattr(writing._Sink, "write", never)
+    monkeypatch.setattr(writing, "_STALL_S", 0.1)
+
+    def drive() -> None:
+        with record(client, tmp_path / "run.mcap", buffer_mib=0.05):
+            for _ in range(100):
+                client.step()
+            going.set()
+
+    with pytest.warns(UserWarning, match=r"\d\d+ states and 0 pictures were lost"):
+        drive()
+
+
+def test_pictures_that_a_server_did_not_send_are_told(
+    seeing: urlab_client.URLabClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(StepPictures, "take", lambda self, reply: setattr(reply, "cameras", {}))
+
+    def drive() -> None:
+        with record(seeing, tmp_path / "run.mcap", cameras=["arm/wrist"], camera_hz=500):
+            for _ in range(3):
+                seeing.step()
+
+    with pytest.warns(UserWarning, match="0 states and 3 pictures were lost"):
+        drive()
+    assert read_run(tmp_path / "run.mcap").summary().dropped_frames == 3
 
 
 # Messages

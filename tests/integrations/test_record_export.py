@@ -12,15 +12,22 @@ from typing import Any
 import av
 import numpy as np
 import pytest
+from PIL import Image
 from pyarrow import parquet
 
 import urlab_client
 from urlab_client.cli import main
+from urlab_client.cli.figures import Quantity, Trace, plot_trace
+from urlab_client.integrations._feed.quantities import component_name, quantities
+from urlab_client.integrations._feed.scene_messages import SceneLayout
 from urlab_client.integrations.gym import URLabEnv
 from urlab_client.integrations.record import RecordingError, Run, export, read_run, record
 from urlab_client.integrations.record.pixels import visible
 from urlab_client.integrations.record.transitions import transitions
 from urlab_client.server import SimulatedServer
+
+C0_AND_C2 = (0x1F, 0x77, 0xB4), (0x2C, 0xA0, 0x2C)
+"""Matplotlib's first and third colour."""
 
 # Stands in for LeRobot, which the tests do not install: keeps what it is given.
 LEROBOT = """
@@ -279,6 +286,72 @@ def test_plot_draws_the_joints_that_are_named(
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
     assert run("plot", recorded.path, "--joints", "nose", "-o", tmp_path / "b.png") == 2
     assert "arm/shoulder_pan" in capsys.readouterr().err
+
+
+def test_values_say_what_they_measure() -> None:
+    layout = SceneLayout(qpos=["base.x", "base.qw", "elbow", "rail"], slides=["rail"], sensors={"imu": "accelerometer"})
+    angles = quantities(layout, "qpos", layout.qpos)
+    assert angles == ["position (m)", "orientation (w, x, y, z)", "angle (rad)", "position (m)"]
+    assert quantities(layout, "sensors", ["imu.0", "odd"]) == ["linear acceleration (m/s²)", "reading"]
+    assert [component_name(layout, name) for name in ("imu.0", "imu.2", "odd.1")] == ["imu.x", "imu.z", "odd.1"]
+    # A recording of an earlier release does not say which joints slide.
+    assert quantities(SceneLayout(), "qpos", ["elbow"]) == ["position (rad, m)"]
+
+
+def test_sensors_of_one_kind_share_an_axis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    traces: list[Trace] = []
+    monkeypatch.setattr("urlab_client.cli.figures.plot_trace", lambda trace, _path: traces.append(trace))
+    with (
+        SimulatedServer("quadruped", play=True) as server,
+        urlab_client.URLabClient(**server.client_options(), step_mode="direct") as client,
+    ):
+        client.discover()
+        with record(client, tmp_path / "run.mcap"):
+            client.step()
+    assert run("plot", tmp_path / "run.mcap", "--field", "sensors", "--joints", "imu_gyro.*", "imu_acc*.x") == 0
+    assert [(quantity.label, quantity.names) for quantity in traces[0].quantities] == [
+        ("quadruped\nlinear acceleration (m/s²)", ["imu_accelerometer.x"]),
+        ("quadruped\nangular velocity (rad/s)", ["imu_gyro.x", "imu_gyro.y", "imu_gyro.z"]),
+    ]
+
+
+def test_curves_in_one_place_can_be_told_apart(tmp_path: Path) -> None:
+    time = np.linspace(0, 1, 50)
+    values = np.stack([np.sin(time), np.cos(time), np.sin(time)], axis=1)
+    colours = []
+    for columns in ([0, 1], [0, 1, 2]):
+        names = ["a", "b", "c"][: len(columns)]
+        plot_trace(Trace("", time, values, [Quantity("q", names, columns)]), tmp_path / "plot.png")
+        pixels = np.asarray(Image.open(tmp_path / "plot.png"))[:, :1150, :3]  # without the legend
+        colours.append([int((np.abs(pixels.astype(int) - colour).max(axis=-1) < 10).sum()) for colour in C0_AND_C2])
+    (alone, none), (shared, twin) = colours
+    assert none == 0
+    assert 0.3 < twin / shared < 3
+    assert 0.7 < (shared + twin) / alone < 1.3
+
+
+def test_record_says_that_no_picture_came(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "disable")
+    path = tmp_path / "run.mcap"
+    options = ["--camera", "all", "--step-mode", "direct", "--seconds", "0.02"]
+    with SimulatedServer("arm", play=True) as server:
+        ports = ["--step-port", server.step_port, "--state-port", server.state_port]
+        assert run("record", server.address, path, *ports, *options) == 1
+    assert "no picture of arm/overview, arm/wrist came" in capsys.readouterr().err
+    assert len(read_run(path).table())
+    # A server of its own draws with what is here, so that this is known before.
+    assert run("record", "sim://arm", tmp_path / "other.mcap", *options) == 2
+    assert "MUJOCO_GL=disable" in capsys.readouterr().err
+    assert not (tmp_path / "other.mcap").exists()
+
+
+def test_record_writes_mcap_files_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("record", tmp_path / "out.txt") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "out.txt" in line
+    assert "out.mcap" in line
 
 
 @pytest.mark.parametrize("mode", ["direct", "live"])

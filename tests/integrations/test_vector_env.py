@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -13,6 +15,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 import urlab_client
+from urlab_client.aio.launch import LaunchedTransport
 from urlab_client.integrations.gym import TASKS, URLabBatchEnv, URLabVectorEnv
 from urlab_client.server import Drop, Faults, SimulatedServer
 
@@ -166,6 +169,66 @@ def test_a_slow_environment_counts_as_failed_and_holds_up_nobody_for_longer(made
         assert infos["restarts"].tolist() == [0, 1]
 
 
+def test_an_environment_that_takes_long_to_come_back_holds_up_nobody(
+    servers: list[str], made: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = URLabVectorEnv(servers, step_timeout=0.5)
+    made.append(env)
+    env.reset(seed=0)
+    action = np.zeros(env.action_space.shape)
+    ready, opened = threading.Event(), env._sessions[0].open
+
+    async def slowly() -> None:
+        await asyncio.to_thread(ready.wait)
+        await opened()
+
+    monkeypatch.setattr(env._sessions[0], "open", slowly)
+    env._portal.call(env._sessions[0].episode.client.close)
+    *_, infos = env.step(action)
+    assert isinstance(infos["error"][0], urlab_client.ClientClosed)
+    for count in (2, 3):
+        *_, truncated, infos = env.step(action)
+        assert truncated.tolist() == [True, False]
+        assert "environment 0 is still being started" in str(infos["error"][0])
+        assert infos["step_count"][1] == count
+    ready.set()
+    while "error" in infos:
+        *_, infos = env.step(action)
+    assert infos["restarts"].tolist() == [1, 0]
+
+
+def test_no_more_servers_start_at_once_than_there_are_processors(
+    made: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    starting, most = 0, 0
+    launch = LaunchedTransport._launch
+
+    async def counted(self: Any, op: Any) -> Any:
+        nonlocal starting, most
+        starting += 1
+        most = max(most, starting)
+        try:
+            return await launch(self, op)
+        finally:
+            starting -= 1
+
+    monkeypatch.setattr(LaunchedTransport, "_launch", counted)
+    monkeypatch.setattr("urlab_client.integrations.gym.vector._processors", lambda: 1)
+    env = URLabVectorEnv("sim://ball", 3, start_timeout=120.0)
+    made.append(env)
+    assert most == 1
+    assert env.reset()[0].shape[0] == 3
+
+
+@pytest.mark.long
+def test_sixty_four_servers_come_up(made: list[Any]) -> None:
+    env = URLabVectorEnv("sim://quadruped", 64)
+    made.append(env)
+    env.reset(seed=0)
+    *_, infos = env.step(np.zeros(env.action_space.shape, dtype=np.float32))
+    assert infos["step_count"].tolist() == [1] * 64
+
+
 def test_a_session_that_cannot_start_is_named(servers: list[str]) -> None:
     with pytest.raises(urlab_client.URLabError, match="Environment 1 at sim://no-such-robot"):
         URLabVectorEnv([servers[0], "sim://no-such-robot"])
@@ -184,6 +247,7 @@ def test_environments_with_other_spaces_are_refused(servers: list[str]) -> None:
         ((["sim://arm"], 2), {}, "1 addresses"),
         (([],), {}, "0 addresses"),
         ((["sim://arm"],), {"step_timeout": 0.0}, "above 0"),
+        ((["sim://arm"],), {"start_timeout": 0.0}, "above 0"),
     ],
 )
 def test_wrong_arguments_start_nothing(arguments: Any, options: Any, reason: str) -> None:
@@ -247,3 +311,27 @@ def test_a_tasks_rewards_are_the_same_from_servers_and_batch(task_id: str, made:
     batch.reset(seed=0)
     for action in actions_of(wire, 3):
         assert np.array_equal(wire.step(action)[1], batch.step(action)[1])
+
+
+def test_servers_and_batch_render_each_environment(servers: list[str], made: list[Any]) -> None:
+    options: Any = {"render_mode": "rgb_array", "render_camera": "arm/overview", "keyframe": "home", "reset_noise": 0.3}
+    wire, batch = URLabVectorEnv(servers, **options), URLabBatchEnv("sim://arm", 2, **options)
+    made += [wire, batch]
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        wire.render()
+    for env in (wire, batch):
+        observations, _ = env.reset(seed=1)
+        assert observations[:, 7].tolist() == [0.04] * 2, "the keyframe of the constructor"
+        first = env.render()
+        env.step(actions_of(env, 1)[0])
+        second = env.render()
+        assert [picture.shape for picture in (*first, *second)] == [(480, 640, 3)] * 4
+        assert len({picture.tobytes() for picture in first}) == 2
+        assert all(np.ptp(picture) > 100 for picture in first)
+    drawn, again = (env.render()[0].astype(int) for env in (wire, batch))
+    assert np.abs(drawn - again).mean() < 20, "the same robot in the same pose, with and without shadows"
+    with pytest.raises(ValueError, match="no camera 'arm/nose'"):
+        URLabBatchEnv("sim://arm", 1, render_mode="rgb_array", render_camera="arm/nose").render()
+    for env in (URLabVectorEnv, URLabBatchEnv):
+        with pytest.raises(ValueError, match="render_mode"):
+            env("sim://arm", 1, render_mode="human")

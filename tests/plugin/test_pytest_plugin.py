@@ -190,7 +190,7 @@ def test_a_mark_that_cannot_work_says_why(pytester: pytest.Pytester) -> None:
     result.assert_outcomes(errors=3)
     result.stdout.fnmatch_lines(
         [
-            "*@pytest.mark.urlab does not start: no_such_robot is neither a file nor a bundled model*",
+            "*@pytest.mark.urlab does not start: no_such_robot is neither a file nor a bundled robot*",
             "*@pytest.mark.urlab does not start: *unexpected keyword argument 'colour'",
             "*@pytest.mark.urlab does not start: step_port must be a number from 0 to 65535, not -1",
         ]

@@ -24,7 +24,7 @@ def scene_of(tmp_path: Path) -> Callable[..., CompiledScene]:
     def build(*placed: Place) -> CompiledScene:
         world = EditorWorld(ContentRoot(tmp_path))
         for name, location in placed:
-            world.spawn_actor(world.import_xml(name)[0].class_path, location=location)
+            world.spawn_actor(world.blueprints.import_xml(name)[0].class_path, location=location)
         return compile_scene(world.freeze())
 
     return build

@@ -273,7 +273,7 @@ ROBOTS = ["humanoid.xml", "ant.xml", "walker2d_v5.xml", "pusher_v5.xml"]
 @pytest.mark.parametrize("file", ROBOTS)
 def test_real_robots_twice(tmp_path: Path, file: str) -> None:
     world = EditorWorld(ContentRoot(tmp_path, model_roots=[GYMNASIUM]))
-    blueprint, _ = world.import_xml(file)
+    blueprint, _ = world.blueprints.import_xml(file)
     for at in range(2):
         world.spawn_actor(blueprint.class_path, location=(0.0, 10.0 * at, 0.0))
 
@@ -306,7 +306,7 @@ def test_real_robots_twice(tmp_path: Path, file: str) -> None:
 @pytest.mark.parametrize("file", ROBOTS)
 def test_a_robot_in_a_scene_moves_as_it_does_alone(tmp_path: Path, file: str) -> None:
     world = EditorWorld(ContentRoot(tmp_path, model_roots=[GYMNASIUM]))
-    world.spawn_actor(world.import_xml(file)[0].class_path)
+    world.spawn_actor(world.blueprints.import_xml(file)[0].class_path)
     scene = compile_scene(world.freeze())
     alone = mujoco.MjModel.from_xml_path(str(GYMNASIUM / file))
     for name in dir(alone.opt):
@@ -397,7 +397,7 @@ def meshy(workspace: Workspace, name: str, size: float) -> str:
             head='<asset><mesh file="part.obj"/><mesh file="shell.stl"/></asset>',
         ),
     )
-    return workspace.world.import_xml(f"{name}/{name}.xml")[0].class_path
+    return workspace.world.blueprints.import_xml(f"{name}/{name}.xml")[0].class_path
 
 
 @pytest.mark.mujoco("3.17")
@@ -494,7 +494,7 @@ def level(workspace: Workspace, *actors: dict[str, Any]) -> CompiledScene:
     file = workspace.saved / "Levels" / "props.json"
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(json.dumps({"format": "urlab-level", "version": 1, "blueprints": {}, "actors": actors}))
-    workspace.world.load_level("props")
+    workspace.world.levels.load("props")
     workspace.world.spawn_actor(workspace.blueprint("ball", BALL), location=(5, 0, 0))
     return compile_scene(workspace.world.freeze())
 

@@ -31,7 +31,7 @@ def workspace(tmp_path: Path) -> Workspace:
 
 @pytest.fixture
 def world(workspace: Workspace) -> EditorWorld:
-    workspace.world.create_level("lab")
+    workspace.world.levels.create("lab")
     return workspace.world
 
 
@@ -70,7 +70,7 @@ def same_rotation(a: Any, b: Any) -> bool:
 
 
 def test_blueprints_are_listed_by_name(bot: str, ball: str, world: EditorWorld) -> None:
-    rows = world.list_blueprints()
+    rows = world.blueprints.list_blueprints()
 
     assert [item.short_name for item in rows] == ["ball", "bot"]
     assert [item.class_path for item in rows] == [ball, bot]
@@ -100,7 +100,7 @@ def test_actors_take_the_new_model_of_a_reimport_at_the_next_play(
     before = world.freeze()
     workspace.write("bot.xml", BOT.replace('mass="1"', 'mass="3"'))
 
-    world.import_xml("bot.xml", force_reimport=True)
+    world.blueprints.import_xml("bot.xml", force_reimport=True)
 
     def mass(actors: tuple[Any, ...]) -> float:
         return float(compile_scene(actors).model.body_mass.sum())
@@ -112,14 +112,14 @@ def test_actors_take_the_new_model_of_a_reimport_at_the_next_play(
 def test_a_blueprint_in_use_is_not_destroyed(bot: str, world: EditorWorld) -> None:
     world.spawn_actor(bot, "a")
 
-    refused = refusal(world.destroy_asset, "/Game/MuJoCoImports/bot.bot")
+    refused = refusal(world.blueprints.destroy_asset, "/Game/MuJoCoImports/bot.bot")
 
     assert refused.code == "destroy_asset_failed"
     assert "bot" in refused.message
     world.destroy_actor("a")
-    assert world.destroy_asset("/Game/MuJoCoImports/bot.bot")
-    assert not world.destroy_asset("/Game/MuJoCoImports/bot.bot")
-    assert world.list_blueprints() == []
+    assert world.blueprints.destroy_asset("/Game/MuJoCoImports/bot.bot")
+    assert not world.blueprints.destroy_asset("/Game/MuJoCoImports/bot.bot")
+    assert world.blueprints.list_blueprints() == []
 
 
 @pytest.mark.parametrize(
@@ -127,16 +127,16 @@ def test_a_blueprint_in_use_is_not_destroyed(bot: str, world: EditorWorld) -> No
     ["/Game/MuJoCoImports/bot.bot_C", "/Game/MuJoCoImports/bot.ball", "/Game/Levels/none.none", "/Game/../x.x", "bot"],
 )
 def test_what_is_no_asset_is_not_found(bot: str, world: EditorWorld, path: str) -> None:
-    assert world.destroy_asset(path) is False
+    assert world.blueprints.destroy_asset(path) is False
 
 
 # Levels
 
 
 def test_a_level_without_a_name_cannot_be_saved(workspace: Workspace) -> None:
-    assert workspace.world.current_level() == "/Temp/Untitled_1"
+    assert workspace.world.levels.package == "/Temp/Untitled_1"
 
-    refused = refusal(workspace.world.save_level)
+    refused = refusal(workspace.world.levels.save)
 
     assert refused.code == "save_level_failed"
     assert "create_level" in refused.message
@@ -146,12 +146,12 @@ def test_a_level_is_created_once_unless_forced(workspace: Workspace, bot: str) -
     world = workspace.world
     world.spawn_actor(bot, "a")
 
-    assert refusal(world.create_level, "lab").code == "create_level_failed"
+    assert refusal(world.levels.create, "lab").code == "create_level_failed"
     assert len(world.list_actors()) == 1
-    assert world.create_level("lab", force_overwrite=True) == "/Game/Levels/lab"
+    assert world.levels.create("lab", force_overwrite=True) == "/Game/Levels/lab"
     assert world.list_actors() == []
-    assert refusal(world.create_level, "").code == "missing_field"
-    assert refusal(world.create_level, "../lab").code == "create_level_failed"
+    assert refusal(world.levels.create, "").code == "missing_field"
+    assert refusal(world.levels.create, "../lab").code == "create_level_failed"
 
 
 def test_levels_keep_what_was_saved(workspace: Workspace, bot: str, ball: str, world: EditorWorld) -> None:
@@ -160,42 +160,42 @@ def test_levels_keep_what_was_saved(workspace: Workspace, bot: str, ball: str, w
     world.spawn_actor(ball)
     world.spawn_light("spot", "lamp", location=(0, 0, 4), rotation_euler=(0, -90, 0), intensity=123.456)
     before = world.list_actors()
-    world.save_level()
+    world.levels.save()
     world.spawn_actor(ball, "unsaved")
-    world.create_level("other")
+    world.levels.create("other")
     assert world.list_actors() == []
 
-    assert world.load_level("lab") == world.current_level() == "/Game/Levels/lab"
+    assert world.levels.load("lab") == world.levels.package == "/Game/Levels/lab"
 
     assert world.list_actors() == before
-    assert EditorWorld(ContentRoot(workspace.saved)).load_level("/Game/Levels/lab")
+    assert EditorWorld(ContentRoot(workspace.saved)).levels.load("/Game/Levels/lab")
 
 
 @pytest.mark.parametrize("name", ["nowhere", "/Engine/lab", "../lab"])
 def test_a_level_that_is_not_there_is_not_loaded(bot: str, world: EditorWorld, name: str) -> None:
     world.spawn_actor(bot, "a")
 
-    assert refusal(world.load_level, name).code == "load_level_failed"
+    assert refusal(world.levels.load, name).code == "load_level_failed"
     assert names(world.list_actors()) == ["bot"]
 
 
 def test_destroying_the_open_level_opens_an_untitled_one(bot: str, world: EditorWorld) -> None:
     world.spawn_actor(bot, "a")
-    world.save_level()
+    world.levels.save()
 
-    assert world.destroy_asset("/Game/Levels/lab.lab")
+    assert world.blueprints.destroy_asset("/Game/Levels/lab.lab")
 
-    assert world.current_level() == "/Temp/Untitled_1"
+    assert world.levels.package == "/Temp/Untitled_1"
     assert world.list_actors() == []
-    assert refusal(world.load_level, "lab").code == "load_level_failed"
+    assert refusal(world.levels.load, "lab").code == "load_level_failed"
 
 
 @pytest.mark.parametrize(
     ("op", "code"),
     [
-        (lambda world: world.create_level("new"), "create_level_failed"),
-        (lambda world: world.load_level("lab"), "load_level_failed"),
-        (lambda world: world.save_level(), "save_level_failed"),
+        (lambda world: world.levels.create("new"), "create_level_failed"),
+        (lambda world: world.levels.load("lab"), "load_level_failed"),
+        (lambda world: world.levels.save(), "save_level_failed"),
     ],
 )
 def test_levels_are_not_touched_during_play(world: EditorWorld, op: Callable[[EditorWorld], str], code: str) -> None:
@@ -207,7 +207,7 @@ def test_levels_are_not_touched_during_play(world: EditorWorld, op: Callable[[Ed
 def test_a_save_that_fails_leaves_the_level_as_it_was(
     workspace: Workspace, bot: str, world: EditorWorld, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    world.save_level()
+    world.levels.save()
     world.spawn_actor(bot, "a")
 
     def fail(*_: object) -> None:
@@ -215,22 +215,22 @@ def test_a_save_that_fails_leaves_the_level_as_it_was(
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", fail)
-        refused = refusal(world.save_level)
+        refused = refusal(world.levels.save)
 
     assert refused.code == "save_level_failed"
     assert "No space" in refused.message
-    world.load_level("lab")
+    world.levels.load("lab")
     assert world.list_actors() == []
 
 
 def test_a_content_root_can_be_moved(workspace: Workspace, bot: str, world: EditorWorld, tmp_path: Path) -> None:
     world.spawn_actor(bot, "a")
-    world.save_level()
+    world.levels.save()
     shutil.rmtree(workspace.models)
     moved = workspace.saved.rename(tmp_path / "elsewhere")
 
     fresh = EditorWorld(ContentRoot(moved))
-    fresh.load_level("lab")
+    fresh.levels.load("lab")
 
     assert compile_scene(fresh.freeze()).model.nu == 1
 
@@ -238,14 +238,14 @@ def test_a_content_root_can_be_moved(workspace: Workspace, bot: str, world: Edit
 def test_a_level_file_with_its_models_can_be_moved(tmp_path: Path) -> None:
     workspace = Workspace(tmp_path / "here")
     bot = workspace.blueprint("bot", BOT)
-    workspace.world.create_level("lab")
+    workspace.world.levels.create("lab")
     workspace.world.spawn_actor(bot, "a")
-    workspace.world.save_level()
+    workspace.world.levels.save()
     shutil.rmtree(workspace.saved / "MuJoCoImports")
     (tmp_path / "here").rename(tmp_path / "there")
 
     fresh = EditorWorld(ContentRoot(tmp_path / "fresh"))
-    fresh.load_level_file(tmp_path / "there" / "saved" / "Levels" / "lab.json")
+    fresh.levels.load_file(tmp_path / "there" / "saved" / "Levels" / "lab.json")
 
     assert names(fresh.list_actors()) == ["bot"]
     assert compile_scene(fresh.freeze()).model.nu == 1
@@ -255,22 +255,22 @@ def test_a_level_file_brings_its_snapshot_along(
     workspace: Workspace, bot: str, world: EditorWorld, tmp_path: Path
 ) -> None:
     world.spawn_actor(bot, "a")
-    world.save_level()
+    world.levels.save()
     shutil.rmtree(workspace.models)
 
     fresh = EditorWorld(ContentRoot(tmp_path / "fresh"))
-    fresh.load_level_file(workspace.saved / "Levels" / "lab.json")
+    fresh.levels.load_file(workspace.saved / "Levels" / "lab.json")
     shutil.rmtree(workspace.saved)
 
     assert compile_scene(fresh.freeze()).model.nu == 1
-    assert [item.short_name for item in fresh.list_blueprints()] == ["bot"]
+    assert [item.short_name for item in fresh.blueprints.list_blueprints()] == ["bot"]
 
 
 def test_a_level_file_is_saved_where_it_was_opened(
     workspace: Workspace, bot: str, world: EditorWorld, tmp_path: Path
 ) -> None:
     world.spawn_actor(bot, "a")
-    world.save_level()
+    world.levels.save()
     file = tmp_path / "elsewhere" / "my level.json"
     file.parent.mkdir()
     text = (
@@ -279,17 +279,17 @@ def test_a_level_file_is_saved_where_it_was_opened(
     file.write_text(text.replace("../models", "../models").replace("../saved/models", "../models"))
     fresh = EditorWorld(ContentRoot(tmp_path / "fresh"))
 
-    assert fresh.load_level_file(file) == "/Game/Levels/my_level"
+    assert fresh.levels.load_file(file) == "/Game/Levels/my_level"
     fresh.set_actor_transform("a", location=(7, 0, 0))
-    fresh.save_level()
+    fresh.levels.save()
     fresh.set_actor_transform("a", location=(8, 0, 0))
-    fresh.load_level("my_level")
+    fresh.levels.load("my_level")
 
     assert row(fresh, "a").location == (7, 0, 0)
     assert json.loads(file.read_text())["actors"][0]["location"] == [7.0, 0.0, 0.0]
     assert not (tmp_path / "fresh" / "Levels").exists()
-    assert refusal(fresh.create_level, "my_level", force_overwrite=True).code == "create_level_failed"
-    assert refusal(fresh.destroy_asset, "/Game/Levels/my_level.my_level").code == "destroy_asset_failed"
+    assert refusal(fresh.levels.create, "my_level", force_overwrite=True).code == "create_level_failed"
+    assert refusal(fresh.blueprints.destroy_asset, "/Game/Levels/my_level.my_level").code == "destroy_asset_failed"
     assert file.exists()
 
 
@@ -297,11 +297,11 @@ def test_the_levels_own_model_wins_when_the_level_was_named_by_the_user(
     bot: str, world: EditorWorld, workspace: Workspace, tmp_path: Path
 ) -> None:
     world.spawn_actor(bot, "a")
-    world.save_level()
+    world.levels.save()
     other = Workspace(tmp_path / "other")
     other.blueprint("bot", BALL.replace('model="ball"', 'model="impostor"'))
 
-    other.world.load_level_file(workspace.saved / "Levels" / "lab.json")
+    other.world.levels.load_file(workspace.saved / "Levels" / "lab.json")
 
     assert compile_scene(other.world.freeze()).model.nu == 1
 
@@ -309,16 +309,16 @@ def test_the_levels_own_model_wins_when_the_level_was_named_by_the_user(
 def test_bundled_models_in_a_level_are_found_on_any_machine(
     workspace: Workspace, world: EditorWorld, tmp_path: Path
 ) -> None:
-    world.import_xml("ball")
+    world.blueprints.import_xml("ball")
     world.spawn_actor("/Game/MuJoCoImports/ball", "b")
-    world.save_level()
+    world.levels.save()
     level = tmp_path / "level.json"
     text = (workspace.saved / "Levels" / "lab.json").read_text()
     level.write_text(text)
     shutil.rmtree(workspace.saved)
 
     fresh = EditorWorld(ContentRoot(tmp_path / "fresh"))
-    fresh.load_level_file(level)
+    fresh.levels.load_file(level)
 
     assert '"bundled:ball"' in text
     assert names(fresh.list_actors()) == ["ball"]
@@ -332,7 +332,7 @@ def load(workspace: Workspace, level: object) -> EditorWorld:
     file = workspace.saved / "Levels" / "hand.json"
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(level if isinstance(level, str) else json.dumps(level))
-    workspace.world.load_level("hand")
+    workspace.world.levels.load("hand")
     return workspace.world
 
 
@@ -363,13 +363,13 @@ def load(workspace: Workspace, level: object) -> EditorWorld:
     ],
 )
 def test_a_level_that_makes_no_sense_is_refused_with_the_place(workspace: Workspace, level: object, text: str) -> None:
-    workspace.world.create_level("lab")
+    workspace.world.levels.create("lab")
 
     refused = refusal(load, workspace, level)
 
     assert refused.code == "load_level_failed"
     assert text in refused.message
-    assert workspace.world.current_level() == "/Game/Levels/lab"
+    assert workspace.world.levels.package == "/Game/Levels/lab"
 
 
 def test_a_level_brings_meshes_which_no_op_can(workspace: Workspace) -> None:
@@ -397,7 +397,7 @@ def test_a_level_brings_meshes_which_no_op_can(workspace: Workspace) -> None:
     tree = world.actor_hierarchy("crate")
     assert [child.name for child in tree.children] == ["rock"]
 
-    world.save_level()
+    world.levels.save()
     saved = json.loads((workspace.saved / "Levels" / "hand.json").read_text())
     assert saved["actors"][1]["mesh"]["file"] == "meshes/rock.obj"
 
@@ -416,17 +416,17 @@ def test_any_level_comes_back_as_it_was(
     workspace: Workspace, robots: list[tuple[str, Any, Any]], lights: list[tuple[str, str, Any]]
 ) -> None:
     world = workspace.world
-    world.create_level("any", force_overwrite=True)
+    world.levels.create("any", force_overwrite=True)
     bot = workspace.blueprint("bot", BOT)
     for actor_id, location, euler in robots:
         world.spawn_actor(bot, f"bot_{actor_id}", location=location, rotation_euler=euler)
     for kind, actor_id, location in lights:
         world.spawn_light(kind, actor_id, location=location)
     before = [snapshot_row(actor, compiled=False) for actor in world.snapshot()]
-    world.save_level()
+    world.levels.save()
 
     fresh = EditorWorld(ContentRoot(workspace.saved))
-    fresh.load_level("any")
+    fresh.levels.load("any")
 
     assert [snapshot_row(actor, compiled=False) for actor in fresh.snapshot()] == before
 
@@ -523,8 +523,8 @@ def test_what_is_missing_is_named(bot: str, world: EditorWorld) -> None:
         assert refusal(op, "").code == "missing_field"
     assert refusal(world.duplicate_actor, "", "b").code == "missing_field"
     assert refusal(world.actor_hierarchy, "").code == "missing_field"
-    assert refusal(world.destroy_asset, "").code == "missing_field"
-    assert refusal(world.load_level, "").code == "missing_field"
+    assert refusal(world.blueprints.destroy_asset, "").code == "missing_field"
+    assert refusal(world.levels.load, "").code == "missing_field"
 
 
 def test_a_grid_is_placed_x_first(ball: str, world: EditorWorld) -> None:
@@ -721,13 +721,13 @@ def test_play_shows_the_level_as_it_was_at_its_start(bot: str, ball: str, world:
     assert (names(world.find_actors()[0]), world.find_actors()[1]) == (["bot", "ball"], False)
     assert world.actor_hierarchy("bot").location == (0, 0, 0)
     assert refusal(world.actor_hierarchy, "ball").code == "actor_hierarchy_failed"
-    assert world.shown_level() == "/Game/Levels/UEDPIE_0_lab"
-    assert world.current_level() == "/Game/Levels/lab"
+    assert world.levels.shown() == "/Game/Levels/UEDPIE_0_lab"
+    assert world.levels.package == "/Game/Levels/lab"
 
     world.pie_running = False
     assert names(world.snapshot()) == ["bot", "ball"]
     assert world.find_actors(in_pie=True)[1] is False
-    assert world.shown_level() == "/Game/Levels/lab"
+    assert world.levels.shown() == "/Game/Levels/lab"
 
 
 def test_bounds_hold_the_geoms_at_the_authored_pose(workspace: Workspace, world: EditorWorld) -> None:
@@ -777,18 +777,18 @@ def test_lights_managers_and_bare_models_have_no_bounds(workspace: Workspace, wo
 def test_a_mesh_is_converted_with_the_settings_of_the_last_call(workspace: Workspace) -> None:
     world = load(workspace, HEAD | {"actors": [BOX]})
 
-    world.add_quick_convert("crate", static=True, coacd_threshold=0.1, friction=(0.5, 0.1, 0.1))
+    world.quick_convert.add("crate", static=True, coacd_threshold=0.1, friction=(0.5, 0.1, 0.1))
     settings_ = row(world, "crate").quick_convert
     assert settings_ is not None
     assert (settings_.static, settings_.friction) == (True, (0.5, 0.1, 0.1))
     assert settings_.coacd_threshold == 0.10000000149011612
-    world.add_quick_convert("crate")
+    world.quick_convert.add("crate")
     again = row(world, "crate").quick_convert
     assert again is not None
     assert (again.static, again.friction) == (False, (1, 1, 1))
-    world.remove_quick_convert("crate")
+    world.quick_convert.remove("crate")
     assert row(world, "crate").quick_convert is None
-    assert refusal(world.remove_quick_convert, "crate").code == "remove_quick_convert_failed"
+    assert refusal(world.quick_convert.remove, "crate").code == "remove_quick_convert_failed"
 
 
 def test_only_meshes_are_converted(workspace: Workspace, bot: str) -> None:
@@ -797,11 +797,11 @@ def test_only_meshes_are_converted(workspace: Workspace, bot: str) -> None:
     world.spawn_actor(bot, "a")
     code = "add_quick_convert_failed"
 
-    assert refusal(world.add_quick_convert, "a").code == code
-    assert refusal(world.add_quick_convert, "nobody").code == code
-    assert refusal(world.add_quick_convert, "crate", friction=(math.nan, 0, 0)).code == code
-    assert refusal(world.add_quick_convert, "ground").code == code
-    assert world.add_quick_convert("ground", static=True).quick_convert is not None
+    assert refusal(world.quick_convert.add, "a").code == code
+    assert refusal(world.quick_convert.add, "nobody").code == code
+    assert refusal(world.quick_convert.add, "crate", friction=(math.nan, 0, 0)).code == code
+    assert refusal(world.quick_convert.add, "ground").code == code
+    assert world.quick_convert.add("ground", static=True).quick_convert is not None
 
 
 def test_play_gets_the_actors_in_spawn_order(bot: str, ball: str, world: EditorWorld) -> None:

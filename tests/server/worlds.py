@@ -63,4 +63,4 @@ class Workspace:
 
     def blueprint(self, name: str, text: str) -> str:
         """Write `<name>.xml`, import it and return the class path."""
-        return self.world.import_xml(str(self.write(f"{name}.xml", text)))[0].class_path
+        return self.world.blueprints.import_xml(str(self.write(f"{name}.xml", text)))[0].class_path

@@ -58,7 +58,7 @@ fi
 # Under Wine the interpreter starts only where its output is a pipe.
 cat >"$target/winpy" <<EOF
 #!/usr/bin/env bash
-export WINEPREFIX=$target/prefix WINEDEBUG=\${WINEDEBUG:--all} WINEARCH=win64 PYTHONDONTWRITEBYTECODE=1
+export WINEPREFIX=\${WINEPREFIX:-$target/prefix} WINEDEBUG=\${WINEDEBUG:--all} WINEARCH=win64 WINEDLLOVERRIDES=winedbg.exe=d PYTHONDONTWRITEBYTECODE=1
 set -o pipefail
 wine "$target/py/python.exe" "\$@" 2>&1 </dev/null | cat
 EOF
@@ -72,7 +72,8 @@ import tomllib
 
 with open(sys.argv[1], "rb") as file:
     project = tomllib.load(file)["project"]
-for requirement in [*project["dependencies"], *project["optional-dependencies"]["test"], "cffi", "colorama"]:  # pip asks Linux what Windows needs
+# pip asks Linux what Windows needs: the last ones are dependencies of dependencies there alone, and pip itself.
+for requirement in [*project["dependencies"], *project["optional-dependencies"]["test"], "cffi", "colorama", "pip"]:
     if not requirement.startswith(("selenium", "uvloop")):
         print(requirement)
 EOF

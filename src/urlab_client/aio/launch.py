@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
 import os
 import signal
 import subprocess
@@ -32,12 +33,20 @@ from urlab_client.protocol.errors import ClientClosed, ServerUnreachable
 from urlab_client.protocol.messages.session import Hello, HelloOk
 from urlab_client.protocol.messages.streams import ClientEvent
 
-__all__ = ["SCHEME", "LaunchedTransport", "serve_arguments", "with_model_options"]
+__all__ = [
+    "SCHEME",
+    "LaunchedTransport",
+    "serve_arguments",
+    "start_seconds",
+    "with_model_options",
+    "with_start_timeout",
+]
 
 log = logging.getLogger("urlab_client.launch")
 
 SCHEME = "sim://"
 _START_S = 60.0
+_START_TIMEOUT = "start-timeout"
 _CHUNK_BYTES = 65536
 _STOP_S = 10.0  # it takes 0.2 on an idle machine, and 3 where eight programs want a processor
 
@@ -55,7 +64,8 @@ def serve_arguments(address: str) -> list[str]:
     """Return the `urlab serve` arguments for a `sim://` address.
 
     `sim://MODEL` names an MJCF file, a saved level or a bundled robot. `?model=…` adds another one, any other query
-    item is an option of `urlab serve`: `sim://arm?model=ball&mjcf-options&controller=arm=pd`.
+    item is an option of `urlab serve`: `sim://arm?model=ball&mjcf-options&controller=arm=pd`. `start-timeout=SECONDS`
+    is for the client that starts it, see `start_seconds`.
 
     Raises:
         ValueError: No model is named.
@@ -67,9 +77,33 @@ def serve_arguments(address: str) -> list[str]:
     for key, value in parse_qsl(query, keep_blank_values=True):
         if key == "model":
             models.append(value)
-        else:
+        elif key != _START_TIMEOUT:
             options.append(f"--{key}={value}" if value else f"--{key}")
     return [*models, *options]
+
+
+def start_seconds(address: str) -> float:
+    """Return how long the server of a `sim://` address may take to start, seconds: 60, or its `start-timeout`.
+
+    Raises:
+        ValueError: It is not a number of seconds above 0.
+    """
+    given = dict(parse_qsl(address.partition("?")[2])).get(_START_TIMEOUT)
+    try:
+        seconds = _START_S if given is None else float(given)
+    except ValueError:
+        seconds = math.nan
+    if not 0 < seconds < math.inf:
+        raise ValueError(f"{address!r}: {_START_TIMEOUT} must be a number of seconds above 0, not {given!r}")
+    return seconds
+
+
+def with_start_timeout(address: str, seconds: float) -> str:
+    """Return an address whose server may take that long to start, unless it is not `sim://`, or says so itself."""
+    _, _, query = address.partition("?")
+    if not address.startswith(SCHEME) or _START_TIMEOUT in dict(parse_qsl(query, keep_blank_values=True)):
+        return address
+    return f"{address}{'&' if query else '?'}{_START_TIMEOUT}={seconds:g}"
 
 
 def with_model_options(address: str) -> str:
@@ -96,6 +130,7 @@ class LaunchedTransport:
         self.stats = TransportStats()
         self._address = address
         self._arguments = serve_arguments(address)
+        self._start_s = start_seconds(address)
         if shm and not any(argument.startswith("--shm-dir") for argument in self._arguments):
             self._arguments.append(f"--shm-dir={_memory_directory()}")
         self._process: asyncio.subprocess.Process | _Watched | None = None
@@ -239,14 +274,14 @@ class LaunchedTransport:
         if output is None or errors is None:
             raise TypeError("the server's output must be a pipe")
         try:
-            async with asyncio.timeout(_START_S):
+            async with asyncio.timeout(self._start_s):
                 line = await output.readline()
                 if line:
                     return line
                 reason = (await errors.read()).decode(errors="replace").strip()
                 await process.wait()
         except TimeoutError:
-            reason = f"not ready within {_START_S:g} s"
+            reason = f"not ready within {self._start_s:g} s; an address may say ?{_START_TIMEOUT}=SECONDS"
         raise ServerUnreachable(
             f"{op.name}: no simulated server for {self._address}: {reason or 'it exited without output'}", op=op.name
         )

@@ -1,4 +1,4 @@
-"""The `urlab` command: a simulated server, a look at who answers, a diagnosis, a demonstration.
+"""The `urlab` command: servers, diagnoses, demonstrations, recordings, views and policies at the terminal.
 
 Each command has a module of its own and imports what is heavy (MuJoCo, the server, the demo's libraries) when it
 runs. A failure that can be foreseen is one line on standard error and exit code 2.
@@ -12,6 +12,7 @@ import logging
 import os
 import signal
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from importlib import import_module
 
@@ -23,12 +24,15 @@ from urlab_client.protocol.errors import URLabError
 
 __all__ = ["main"]
 
+logger = logging.getLogger("urlab_client.cli")
+
 _COMMANDS = (
     "serve",
     "console",
     "ping",
     "doctor",
     "demo",
+    "robots",
     "keys",
     "snapshot",
     "record",
@@ -50,6 +54,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Arguments without the program's name; default those of this process.
     """
     argv = sys.argv[1:] if argv is None else argv
+    if (reconfigure := getattr(sys.stdout, "reconfigure", None)) is not None:
+        reconfigure(errors="backslashreplace")  # not every terminal has the characters of every file's name
+    if not argv:
+        print(_parser().format_help(), end="")
+        return 0
     # Every `sim://` server is an `urlab serve`, which starts sooner without the modules of the other commands.
     parser = _parser(*(name for name in argv[:1] if name in _COMMANDS))
     arguments = parser.parse_args(argv)
@@ -58,7 +67,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     handler = _StderrHandler(name)
     logging.getLogger("urlab_client").addHandler(handler)
     try:
-        return run(arguments)
+        with warnings.catch_warnings():
+            # What users are to know, as that there is another MuJoCo here, is a line like any other.
+            warnings.simplefilter("default", UserWarning)
+            warnings.showwarning = _log_warning
+            return run(arguments)
     except KeyboardInterrupt:
         return _INTERRUPTED
     except (CommandError, MissingExtra, URLabError, OSError) as error:
@@ -84,14 +97,23 @@ def _parser(*commands: str) -> Parser:
     parser = Parser(
         prog="urlab",
         description="Clients and a simulated server for URLab, the Unreal plugin that embeds MuJoCo.",
-        epilog="Exit codes: 0 success, 1 a diagnosis with problems, 2 wrong usage or a failure explained on standard "
-        "error, 130 Ctrl-C.",
+        epilog="Exit codes: 0 success, 1 a result with problems (each command's help says which), 2 wrong usage or a "
+        "failure explained on standard error, 130 Ctrl-C.",
+        examples=(
+            ("urlab demo", "see a robot move; needs no Unreal"),
+            ("urlab robots", "the robots that are included"),
+            ("urlab COMMAND --help", "options and examples of a command"),
+        ),
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="show program's version number and exit")
     subparsers = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND", required=True)
     for name in commands or _COMMANDS:
         import_module(f"{__name__}.{name.replace('-', '_')}").add_parser(subparsers)
     return parser
+
+
+def _log_warning(message: Warning | str, *_: object) -> None:
+    logger.warning("%s", message)
 
 
 class _Version(argparse.Action):  # argparse's own needs the version in advance, and reading it takes a while

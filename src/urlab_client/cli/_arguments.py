@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
-from typing import Any, Literal, NoReturn, Protocol, TypeVar
+from collections.abc import Callable, Sequence
+from enum import StrEnum
+from typing import Any, Literal, NoReturn, Protocol, TypeVar, cast
 
 from urlab_client.cli._failure import CommandError
 from urlab_client.protocol.enums import StepMode
+from urlab_client.protocol.names import did_you_mean
 
 __all__ = [
     "ADDRESSES",
     "Commands",
+    "Example",
     "Parser",
     "ServerArguments",
     "add_address",
     "add_cameras",
     "add_keys",
+    "add_mjcf_options",
     "add_ports",
     "add_step_mode",
     "cameras",
@@ -25,39 +29,92 @@ __all__ = [
     "image_size",
     "index",
     "make_client",
+    "one_of",
     "port",
     "seconds",
 ]
 
-ADDRESSES = "tcp://HOST[:PORT], ipc://PATH, or sim://MODEL to start a server for the occasion"
+ADDRESSES = (
+    "HOST[:PORT], tcp://HOST[:PORT], ipc://PATH, or sim://MODEL to start a simulated server just for this command"
+)
+
+Example = tuple[str, str]
+"""A command line, and what it does."""
 
 C = TypeVar("C")
+E = TypeVar("E", bound=StrEnum)
 
 _STEP_PORT, _STATE_PORT = 5559, 5555
 _LARGEST_IMAGE = 16384
 
 
 class Parser(argparse.ArgumentParser):
-    """Says in one line what is wrong with the arguments, and exits with code 2."""
+    """Says in one line what is wrong with the arguments, and exits with code 2.
 
-    def __init__(self, **options: Any) -> None:
+    Attributes:
+        examples: Shown at the end of the help.
+    """
+
+    def __init__(self, *, examples: Sequence[Example] = (), **options: Any) -> None:
         # An abbreviation that works today would be ambiguous, or another option, tomorrow.
         super().__init__(allow_abbrev=False, **options)
+        self.examples = examples
+
+    @property
+    def commands(self) -> dict[str, Parser]:
+        """The parser of each command that was added, by name."""
+        choices: list[Any] = [action.choices for action in self._actions]
+        groups = [cast("dict[str, Parser]", group) for group in choices if isinstance(group, dict)]
+        return {name: parser for group in groups for name, parser in group.items()}
+
+    def format_help(self) -> str:
+        """See `argparse.ArgumentParser.format_help`."""
+        text = super().format_help()
+        if self.examples:
+            text += "\nexamples:\n" + "".join(f"  {command}\n      {what}\n" for command, what in self.examples)
+        return text
+
+    def parse_known_args(  # pyright: ignore[reportIncompatibleMethodOverride]  # the base class has overloads
+        self, args: Sequence[str] | None = None, namespace: Any = None
+    ) -> tuple[Any, list[str]]:
+        """See `argparse.ArgumentParser.parse_known_args`; the parser of a command refuses what it does not know."""
+        found, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            word = unknown[0]
+            if not word.startswith("-"):
+                self.error(f"{word!r} is one argument too many")
+            option = word.partition("=")[0]
+            options = [name for action in self._actions for name in action.option_strings]
+            self.error(f"{option} is not an option.{did_you_mean(option, options)}")
+        return found, unknown
 
     def error(self, message: str) -> NoReturn:
         """See `argparse.ArgumentParser.error`."""
         self.exit(2, f"{self.prog}: {' '.join(message.split())} (see {self.prog} --help)\n")
 
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is not None and value not in action.choices:
+            known = [str(choice) for choice in action.choices]
+            raise argparse.ArgumentError(action, _not_one_of(str(value), known))
+
 
 class Commands(Protocol):
     """What a command adds its parser to."""
 
-    def add_parser(self, name: str, *, help: str, description: str) -> Parser: ...  # noqa: A002 - argparse's word
+    def add_parser(
+        self,
+        name: str,
+        *,
+        help: str,  # noqa: A002 - argparse's word
+        description: str,
+        examples: Sequence[Example],
+    ) -> Parser: ...
 
 
 class ServerArguments(argparse.Namespace):
-    """How to reach a server, besides its address; see `add_ports` and `add_keys`."""
+    """How to reach a server, besides its address; see `add_ports`, `add_keys` and `add_mjcf_options`."""
 
+    mjcf_options: bool
     step_port: int
     state_port: int
     server_key: str | None
@@ -67,9 +124,17 @@ class ServerArguments(argparse.Namespace):
 def make_client(flavour: Callable[..., C], address: str, arguments: ServerArguments, **options: Any) -> C:
     """Return a client of one of the two classes for the server that the arguments name.
 
+    Another MuJoCo than the server's is no reason to refuse work: the client warns and compiles the model here.
+
     Raises:
         CommandError: The address or an option is malformed.
     """
+    if arguments.mjcf_options:
+        if not address.startswith("sim://"):
+            raise CommandError(
+                f"--mjcf-options is for sim://MODEL; a server that runs already, as {address}, takes it when it starts"
+            )
+        address = f"{address}{'&' if '?' in address else '?'}mjcf-options"
     try:
         return flavour(
             address,
@@ -77,20 +142,42 @@ def make_client(flavour: Callable[..., C], address: str, arguments: ServerArgume
             state_port=arguments.state_port,
             server_key=arguments.server_key,
             client_key=arguments.client_key,
-            **options,
+            **{"mujoco_version_check": False, **options},
         )
     except ValueError as error:
         raise CommandError(str(error)) from None
 
 
-def add_address(parser: argparse.ArgumentParser) -> None:
-    """Add the address of a server, which is one on this machine unless said otherwise."""
+def add_address(parser: argparse.ArgumentParser, default: str | None = "tcp://localhost", otherwise: str = "") -> None:
+    """Add the address of a server, and `--mjcf-options` for one that it starts.
+
+    Args:
+        parser: The command's parser.
+        default: Address without the argument.
+        otherwise: What happens without the argument, where that is not the default address.
+    """
     parser.add_argument(
         "address",
         nargs="?",
-        default="tcp://localhost",
+        type=address,
+        default=default,
         metavar="ADDRESS",
-        help=f"{ADDRESSES} (default: %(default)s)",
+        help=f"{ADDRESSES} (default: {otherwise or '%(default)s'})",
+    )
+    add_mjcf_options(parser, "with sim://MODEL")
+
+
+def add_mjcf_options(parser: argparse.ArgumentParser, when: str) -> None:
+    """Add `--mjcf-options` to a command that can load models.
+
+    Args:
+        parser: The command's parser.
+        when: When it may be given.
+    """
+    parser.add_argument(
+        "--mjcf-options",
+        action="store_true",
+        help=f"{when}: use the <option> of each model (timestep, integrator, ...) instead of the plugin's defaults",
     )
 
 
@@ -124,8 +211,8 @@ def add_step_mode(parser: argparse.ArgumentParser) -> None:
     """Add the choice between watching physics run and stepping it."""
     parser.add_argument(
         "--step-mode",
-        type=StepMode,
-        choices=[StepMode.LIVE, StepMode.DIRECT],
+        type=one_of(StepMode.LIVE, StepMode.DIRECT),
+        metavar="MODE",
         default=StepMode.LIVE,
         help="live or direct (default: %(default)s)",
     )
@@ -162,6 +249,32 @@ def add_keys(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def address(text: str) -> str:
+    """Parse the address of a server; a host without a scheme is one that TCP leads to."""
+    if "://" in text:
+        return text
+    from urlab_client.server.assets.bundled_robots import bundled_models  # noqa: PLC0415
+
+    if text in bundled_models() or text.endswith((".xml", ".json")):
+        raise argparse.ArgumentTypeError(f"{text!r} is a model, not an address; write sim://{text} to start a server")
+    return f"tcp://{text}"
+
+
+def one_of(*allowed: E) -> Callable[[str], E]:
+    """Return what parses one of some members of an enumeration."""
+
+    def parse(text: str) -> E:
+        try:
+            found = type(allowed[0])(text)  # which may know other names of its members
+        except ValueError:
+            found = None
+        if found not in allowed:
+            raise argparse.ArgumentTypeError(_not_one_of(text, [str(member) for member in allowed]))
+        return found
+
+    return parse
+
+
 def port(text: str) -> int:
     """Parse a TCP port, 0 to 65535."""
     return _whole(text, 0, 65535, "a port is a whole number from 0 (any free one) to 65535")
@@ -195,6 +308,10 @@ def image_size(text: str) -> tuple[int, int]:
         if all(0 < side <= _LARGEST_IMAGE for side in size):
             return size
     raise argparse.ArgumentTypeError(f"{text!r}: write WIDTHxHEIGHT in pixels, 1 to {_LARGEST_IMAGE}, as in 640x480")
+
+
+def _not_one_of(value: str, known: Sequence[str]) -> str:
+    return f"{value!r} is not one of {', '.join(known)}.{did_you_mean(value, known)}"
 
 
 def _whole(text: str, low: int, high: int, advice: str) -> int:

@@ -8,7 +8,20 @@ import tempfile
 from collections.abc import Generator
 from pathlib import Path
 
-__all__ = ["replaced"]
+from urlab_client.cli._failure import CommandError
+
+__all__ = ["check_ending", "replaced"]
+
+
+def check_ending(path: Path, *endings: str) -> None:
+    """Check that a file to write is called what it will be.
+
+    Raises:
+        CommandError: Its name ends differently.
+    """
+    if path.suffix.lower() not in endings:
+        better = path.with_suffix(endings[0]).name if path.name else f"FILE{endings[0]}"
+        raise CommandError(f"{path}: write a file that ends in {' or '.join(endings)}, for example {better}")
 
 
 @contextlib.contextmanager

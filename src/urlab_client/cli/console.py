@@ -7,6 +7,7 @@ import socket
 import webbrowser
 from contextlib import suppress
 
+from urlab_client._installation import install_command
 from urlab_client.cli._arguments import (
     Commands,
     ServerArguments,
@@ -41,6 +42,11 @@ def add_parser(commands: Commands) -> None:
         help="a page in the browser to see and touch a simulation",
         description="Serve a page to see and touch a simulation, on this machine alone, and print a link that lets one "
         "browser in. The page makes links for more. It ends with exit code 0 on SIGINT (Ctrl-C) and SIGTERM.",
+        examples=(
+            ("urlab console", "the server on this machine, at a link for your browser"),
+            ("urlab console sim://quadruped --open", "a simulated robot, opened in the browser"),
+            ("urlab console --port 0", "any free port for the page"),
+        ),
     )
     add_address(parser)
     add_ports(parser)
@@ -77,7 +83,7 @@ def run(arguments: ConsoleArguments) -> int:
 
         from urlab_client.web import Access  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]
     except ImportError as error:
-        raise CommandError(f"{error.name or error}: not installed; pip install 'urlab-client[web]'") from None
+        raise CommandError(f"{error.name or error} is not installed; run: {install_command('web')}") from None
     if arguments.host not in {"127.0.0.1", "::1", "localhost"} and not arguments.allow_host:
         raise CommandError(f"--host {arguments.host}: pass --allow-host NAME, the name under which browsers reach it")
     import_mujoco()
@@ -142,5 +148,7 @@ def _bound(host: str, number: int) -> socket.socket:
         listener.listen()  # before the link is printed: whoever is quick waits, and is not refused
     except OSError as error:
         listener.close()
-        raise OSError(error.errno, f"port {number} of {host} cannot be used: {error.strerror}") from None
+        raise OSError(
+            error.errno, f"port {number} of {host} cannot be used: {error.strerror}; --port 0 takes any free one"
+        ) from None
     return listener

@@ -45,6 +45,11 @@ def add_parser(commands: Commands) -> None:
         description="Convert a recording made by `urlab record` or record(). CSV, Parquet and LeRobot hold states with "
         "the actions taken at them; NumPy all states; MP4 the pictures of one camera. Needs the extra "
         "'urlab-client[mcap]'; Parquet 'dataset', MP4 'video', besides.",
+        examples=(
+            ("urlab convert run.mcap run.csv", "states as a table"),
+            ("urlab convert run.mcap run.mp4 --camera arm/overview", "the pictures of one camera as a video"),
+            ("urlab convert run.mcap run.npz --camera arm/wrist", "states and pictures as NumPy arrays"),
+        ),
     )
     parser.add_argument("recording", type=Path, metavar="FILE", help="the recording, a .mcap file")
     parser.add_argument("output", type=Path, metavar="OUTPUT", help="the file to write; its ending says the format")

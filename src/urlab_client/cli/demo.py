@@ -57,6 +57,11 @@ def add_parser(commands: Commands) -> None:
         description="Start a simulated server, author a level, drive a robot through the blocking client and two of "
         "them through the async client, and write joints.png, last_state.png and run.json. Needs the extra "
         "'urlab-client[demo]'.",
+        examples=(
+            ("urlab demo", "the bundled quadruped; results in urlab-demo/"),
+            ("urlab demo robot.xml --steps 500 --output run1", "your own model"),
+            ("urlab demo arm --no-render", "without a picture of the last state"),
+        ),
     )
     parser.add_argument(
         "model",
@@ -90,6 +95,7 @@ def run(arguments: DemoArguments) -> int:
     need("matplotlib", "PIL", "rich", extra="demo")
     import_mujoco()
 
+    from urlab_client.cli.demo_controllers import NOTHING_DRIVEN  # noqa: PLC0415
     from urlab_client.cli.demo_runs import drive_one, drive_two  # noqa: PLC0415
     from urlab_client.cli.robot_file import read_robot  # noqa: PLC0415
     from urlab_client.server.simulated import SimulatedServer  # noqa: PLC0415
@@ -103,6 +109,8 @@ def run(arguments: DemoArguments) -> int:
         one = drive_one(server, robot, steps, _bar(progress, "blocking client, one robot", steps))
         two = asyncio.run(drive_two(server, robot, fewer, _bar(progress, "async client, two robots", fewer)))
     console.print(_table(robot, [one.outcome, two.outcome]))
+    if not one.driven:
+        console.print(f"{robot.name}: {NOTHING_DRIVEN}; gravity alone moves it.", soft_wrap=True, highlight=False)
     written = _write(folder, robot, one, two, render=not arguments.no_render)
     for file, note in written.items():
         console.print(f"{file}  {note}", soft_wrap=True, highlight=False)
@@ -192,12 +200,13 @@ def _write(folder: Path, robot: RobotFile, one: DemoRun, two: DemoRun, *, render
 
     plot, picture, record = folder / "joints.png", folder / "last_state.png", folder / "run.json"
     plot_trace(one.trace, plot)
-    notes = {plot: "joint positions over simulation time, blocking run"}
+    moment = one.outcome.sim_time
+    notes = {plot: f"joint positions over the {moment:.3f} s of the blocking run"}
     drawn_by: str | None = None
     if render:
         try:
-            drawn_by = draw_state(two.model, two.data, picture)
-            notes[picture] = f"last state, two robots (OpenGL: {drawn_by})"
+            drawn_by = draw_state(one.model, one.data, picture)
+            notes[picture] = f"last state of the blocking run, after {moment:.3f} s (OpenGL: {drawn_by})"
         except NoPicture as reason:
             notes[picture] = f"not drawn: {reason}"
     else:
@@ -242,4 +251,5 @@ def _configuration(robot: RobotFile, one: DemoRun, two: DemoRun) -> dict[str, An
             run.outcome.level: [controller.settings for controller in run.controllers] for run in (one, two)
         },
         "runs": [one.outcome, two.outcome],
+        "joints_png_and_last_state_png": one.outcome.level,
     }

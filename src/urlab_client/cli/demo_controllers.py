@@ -15,7 +15,18 @@ from urlab_client.protocol.base import Floats
 from urlab_client.protocol.enums import ActuatorType
 from urlab_client.server.assets.bundled_robots import bundled_models
 
-__all__ = ["DemoController", "DemoRobot", "SineController", "TrotController", "make_demo_controller"]
+__all__ = [
+    "NOTHING_DRIVEN",
+    "DemoController",
+    "DemoRobot",
+    "NoController",
+    "SineController",
+    "TrotController",
+    "make_demo_controller",
+]
+
+
+NOTHING_DRIVEN = "0 actuators: nothing is driven"
 
 
 class DemoRobot(Protocol):
@@ -61,10 +72,27 @@ class DemoController(Protocol):
 
 
 def make_demo_controller(robot: RobotFile, articulation: DemoRobot, turn: float = 0.0) -> DemoController:
-    """Return a controller: a trot that `turn` bends for the bundled quadruped, a gentle swing for other robots."""
+    """Return a controller: a trot that `turn` bends for the bundled quadruped, a gentle swing for other robots.
+
+    A robot without actuators gets one that does nothing and says so.
+    """
+    if not articulation.actuators:
+        return NoController()
     if robot.path == bundled_models()["quadruped"]:
         return TrotController(articulation, turn)
     return SineController(articulation, robot.home_ctrl)
+
+
+class NoController:
+    """Leaves a robot without actuators to gravity."""
+
+    @property
+    def settings(self) -> dict[str, object]:
+        """See `DemoController.settings`."""
+        return {"kind": "none", "reason": NOTHING_DRIVEN}
+
+    def act(self, time: float) -> None:
+        """See `DemoController.act`."""
 
 
 class TrotController:

@@ -11,7 +11,7 @@ import numpy as np
 from msgspec import Struct
 
 from urlab_client import URLabAsset, URLabClient, URLabError, aio
-from urlab_client.cli.demo_controllers import DemoController, DemoRobot, make_demo_controller
+from urlab_client.cli.demo_controllers import DemoController, DemoRobot, NoController, make_demo_controller
 from urlab_client.cli.figures import Quantity, Trace
 from urlab_client.cli.robot_file import RobotFile
 from urlab_client.server.assets.bundled_robots import bundled_models
@@ -81,6 +81,11 @@ class DemoRun:
         self.trace = trace
         self.model = model
         self.data = data
+
+    @property
+    def driven(self) -> bool:
+        """Whether anything drove the robots."""
+        return not all(isinstance(controller, NoController) for controller in self.controllers)
 
 
 def drive_one(server: SimulatedServer, robot: RobotFile, steps: int, advance: Advance) -> DemoRun:

@@ -17,6 +17,7 @@ from urlab_client.cli._arguments import (
     add_keys,
     add_ports,
     make_client,
+    one_of,
     seconds,
 )
 from urlab_client.cli._mujoco import import_mujoco
@@ -48,15 +49,20 @@ def add_parser(commands: Commands) -> None:
         description="Examine a server from its sockets to the set-points and say what keeps robots from moving. "
         "Opens a session, which takes the server over from the client that drives it; a program of your own can call "
         "client.explain() without doing so. Exit code 0 when nothing is in the way, 1 when something is.",
+        examples=(
+            ("urlab doctor", "the server on this machine"),
+            ("urlab doctor 'sim://arm?unpaused'", "a simulated server, started for this command"),
+            ("urlab doctor --step-mode direct --json", "as a program that steps would find it, as JSON"),
+        ),
     )
     add_address(parser)
     add_ports(parser)
     parser.add_argument(
         "--step-mode",
-        type=StepMode,
-        choices=list(StepMode),
+        type=one_of(*StepMode),
+        metavar="MODE",
         default=StepMode.AUTO,
-        help="the mode your program asks for (default: %(default)s)",
+        help="the mode your program asks for: auto, live, direct or puppet (default: %(default)s)",
     )
     parser.add_argument("--timeout", type=seconds, default=2.0, metavar="S", help="deadline (default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="print JSON")
@@ -84,7 +90,6 @@ async def _diagnose(arguments: DoctorArguments) -> Diagnosis:
         step_mode=arguments.step_mode,
         # Promoting the server would mend what is to be found.
         auto_promote_step_mode=False,
-        mujoco_version_check=False,
         rcv_timeout_ms=round(arguments.timeout * 1000),
     )
     async with client:

@@ -1,4 +1,4 @@
-"""The demo's plot: joint positions over simulation time."""
+"""Curves over simulation time as a picture, for `urlab demo` and `urlab plot`."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ __all__ = ["Quantity", "Trace", "plot_trace"]
 
 _PER_PANEL = 6  # more lines in one panel cannot be told apart
 _DPI = 150
+_COVERS = 0.003  # of the axis: less than the width of a line
+_PERIOD = 18.0  # of a dashed line, in line widths
 
 
 @dataclass(frozen=True)
@@ -63,8 +65,11 @@ def plot_trace(trace: Trace, path: Path) -> None:
     figure.suptitle(trace.title)
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     for axis, panel in zip(axes, panels, strict=True):
+        twins = _twins(trace.values[:, list(panel.columns)])
         for index, (name, column) in enumerate(zip(panel.names, panel.columns, strict=True)):
-            axis.plot(trace.time, trace.values[:, column], label=name, lw=1.4, color=f"C{index}")
+            first, place, count = twins[index]
+            label = name if first == index else f"{name} (like {panel.names[first]})"
+            axis.plot(trace.time, trace.values[:, column], label=label, color=f"C{index}", **_style(place, count))
         axis.set_ylabel(panel.label)
         axis.grid(visible=True, alpha=0.3)
         axis.margins(x=0.01)
@@ -73,6 +78,28 @@ def plot_trace(trace: Trace, path: Path) -> None:
     axes[-1].set_xlabel("simulation time (s)")
     with replaced(path) as temporary:
         figure.savefig(temporary, dpi=_DPI)
+
+
+def _twins(values: NDArray[np.float64]) -> list[tuple[int, int, int]]:
+    """Return, per column, the first column that it covers, its place among those that do, and their number."""
+    near = _COVERS * np.ptp(np.nan_to_num(values)) if values.size else 0.0
+    firsts = [
+        next(
+            other
+            for other in range(index + 1)
+            if np.allclose(values[:, other], values[:, index], rtol=0, atol=near, equal_nan=True)
+        )
+        for index in range(values.shape[1])
+    ]
+    return [(first, firsts[:index].count(first), firsts.count(first)) for index, first in enumerate(firsts)]
+
+
+def _style(place: int, count: int) -> dict[str, Any]:
+    """Return the line of one of several curves in one place: those drawn later leave gaps in which the others show."""
+    if place == 0:
+        return {"linewidth": 1.4}
+    dash = _PERIOD / count
+    return {"linewidth": 1.4, "linestyle": (place * dash, (dash, _PERIOD - dash))}
 
 
 def _panels(quantity: Quantity) -> list[Quantity]:

@@ -34,6 +34,10 @@ def add_parser(commands: Commands) -> None:
         help="show what is in a recording",
         description="Show duration, topics, rates and gaps of a recording. Exit code 0, or 1 when the file was not "
         "finished or states were dropped. Needs the extra 'urlab-client[mcap]'.",
+        examples=(
+            ("urlab info run.mcap", "duration, topics, rates and gaps"),
+            ("urlab info run.mcap --json", "the same for programs"),
+        ),
     )
     parser.add_argument("recording", type=Path, metavar="FILE", help="the recording, a .mcap file")
     parser.add_argument("--json", action="store_true", help="print JSON")

@@ -27,6 +27,10 @@ def add_parser(commands: Commands) -> None:
         help="make and show CURVE keys",
         description="Make and show CURVE keys. A server that is open to a network needs a key, so that clients know "
         "it, and one of each client, so that it knows them.",
+        examples=(
+            ("urlab keys new server ada", "make keys for a server and for a client called ada"),
+            ("urlab keys show server.key", "print a public key"),
+        ),
     )
     actions = parser.add_subparsers(title="actions", dest="action", metavar="ACTION", required=True)
     new = actions.add_parser(
@@ -34,10 +38,16 @@ def add_parser(commands: Commands) -> None:
         help="make key pairs",
         description="Make key pairs: NAME.key, which may be given to anybody, and NAME.key_secret, which only its "
         "owner can read (mode 0600) and which stays on this machine. Files that exist are never overwritten.",
+        examples=[("urlab keys new server", "server.key and server.key_secret in this folder")],
     )
     new.add_argument("names", nargs="+", metavar="NAME", help="for example server, or the name of a client")
     new.add_argument("--dir", type=Path, default=Path(), metavar="DIR", help="where to write (default: here)")
-    show = actions.add_parser("show", help="print public keys", description="Print the public key of each file.")
+    show = actions.add_parser(
+        "show",
+        help="print public keys",
+        description="Print the public key of each file.",
+        examples=[("urlab keys show server.key", "its public key and kind")],
+    )
     show.add_argument("files", nargs="+", type=Path, metavar="FILE", help="a .key or .key_secret file")
     parser.set_defaults(run=run)
 

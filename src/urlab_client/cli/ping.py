@@ -117,6 +117,11 @@ def add_parser(commands: Commands) -> None:
         description="Show who answers at an address: versions, play state and step mode, articulations, and the "
         "round-trip times of `meta`. Reading them opens a session, which takes the server over from the client that "
         "drives it; with --no-session only the op list and the round-trip times are read, and nobody is disturbed.",
+        examples=(
+            ("urlab ping", "the server on this machine: versions, play state, robots, round trip"),
+            ("urlab ping 192.168.1.20:5559 --no-session", "another machine, without taking over its session"),
+            ("urlab ping --all", "every server that this machine's registry lists"),
+        ),
     )
     add_address(parser)
     add_ports(parser, state=False)

@@ -11,23 +11,17 @@ import numpy as np
 
 from urlab_client.cli._arguments import Commands
 from urlab_client.cli._failure import CommandError
+from urlab_client.cli._files import check_ending
 from urlab_client.cli._output import progress_bar
 from urlab_client.integrations._extras import need
+from urlab_client.protocol.names import did_you_mean
 
 if TYPE_CHECKING:
     from urlab_client.integrations.record import Table
 
 __all__ = ["add_parser", "run"]
 
-_LABELS = {
-    "qpos": "position\n(rad, m)",
-    "qvel": "velocity\n(rad/s, m/s)",
-    "ctrl": "control",
-    "set_points": "set-point",
-    "act": "activation",
-    "sensors": "reading",
-    "pose": "pose",
-}
+_FIELDS = ("qpos", "qvel", "ctrl", "set_points", "act", "sensors", "pose")
 
 
 class PlotArguments(argparse.Namespace):
@@ -46,6 +40,11 @@ def add_parser(commands: Commands) -> None:
         help="draw curves of a recording",
         description="Draw joint positions, or other values, of a recording over simulation time. Needs the extras "
         "'urlab-client[mcap]' and 'urlab-client[demo]'.",
+        examples=(
+            ("urlab plot run.mcap", "all joint positions; the picture is run.png"),
+            ("urlab plot run.mcap --joints 'shoulder_*' elbow --field qvel -o fast.png", "velocities of some joints"),
+            ("urlab plot run.mcap --field sensors --joints 'imu*'", "readings of some sensors"),
+        ),
     )
     parser.add_argument("recording", type=Path, metavar="FILE", help="the recording, a .mcap file")
     parser.add_argument(
@@ -55,8 +54,10 @@ def add_parser(commands: Commands) -> None:
         metavar="NAME",
         help="names, with or without ARTICULATION/ before them; * stands for anything (default: all but free bases)",
     )
-    parser.add_argument("--field", choices=_LABELS, default="qpos", help="what to draw of them (default: %(default)s)")
-    parser.add_argument("-o", "--output", type=Path, metavar="PNG", help="the picture (default: FILE with .png)")
+    parser.add_argument("--field", choices=_FIELDS, default="qpos", help="what to draw of them (default: %(default)s)")
+    parser.add_argument(
+        "-o", "--output", type=Path, metavar="PICTURE", help="a .png, .pdf or .svg file (default: FILE with .png)"
+    )
     parser.set_defaults(run=run)
 
 
@@ -71,6 +72,8 @@ def run(arguments: PlotArguments) -> int:
     from urlab_client.cli.figures import Quantity, Trace, plot_trace  # noqa: PLC0415
     from urlab_client.integrations.record import read_run  # noqa: PLC0415
 
+    target = arguments.output or arguments.recording.with_suffix(".png")
+    check_ending(target, ".png", ".pdf", ".svg")
     recording = read_run(arguments.recording)
     with progress_bar(arguments.recording.name, recording.path.stat().st_size) as progress:
         table = recording.table(progress)
@@ -78,11 +81,14 @@ def run(arguments: PlotArguments) -> int:
     curves: list[np.ndarray[tuple[int], np.dtype[np.float64]]] = []
     for key, names in _chosen(table, arguments).items():
         owner, column = key.rpartition("/")[0], table.columns[key]
-        first = len(curves)
-        curves += [column.values[:, column.names.index(name)] for name in names]
-        label = f"{owner}\n{_LABELS[arguments.field]}"
-        quantities.append(Quantity(label, names, range(first, len(curves))))
-    target = arguments.output or arguments.recording.with_suffix(".png")
+        places: dict[str, list[int]] = {}  # one axis for what has one unit
+        for place in map(column.names.index, names):
+            places.setdefault(column.quantities[place], []).append(place)
+        for quantity, chosen in places.items():
+            first = len(curves)
+            curves += [column.values[:, place] for place in chosen]
+            labels = [column.labels[place] for place in chosen]
+            quantities.append(Quantity(f"{owner}\n{quantity}", labels, range(first, len(curves))))
     title = arguments.recording.name
     plot_trace(Trace(title, table.time, np.stack(curves, axis=1), quantities), target)
     print(f"{target}  {len(curves)} curves, {len(table)} states")
@@ -101,16 +107,23 @@ def _chosen(table: Table, arguments: PlotArguments) -> dict[str, list[str]]:
         there += [f"{owner}/{name}" for name in column.names]
         plain = arguments.joints == ["*"] and field in {"qpos", "qvel"}
         names = joint_columns(column.names, dof=field == "qvel") if plain else column.names
+        labels = dict(zip(column.names, column.labels, strict=True))
         found = [
             name
             for name in names
-            if any(fnmatchcase(name, want) or fnmatchcase(f"{owner}/{name}", want) for want in arguments.joints)
+            if any(
+                fnmatchcase(spelled, want)
+                for want in arguments.joints
+                for spelled in (name, f"{owner}/{name}", labels[name], f"{owner}/{labels[name]}")
+            )
         ]
         if found:
             chosen[key] = found
     if not chosen or not len(table):
         wanted = " ".join(arguments.joints)
+        close = did_you_mean(arguments.joints[0], [*there, *(name.rpartition("/")[2] for name in there)])
         raise CommandError(
-            f"{arguments.recording}: no {arguments.field} named {wanted}; there are {', '.join(there) or 'none'}"
+            f"{arguments.recording}: no {arguments.field} named {wanted}.{close} "
+            f"There are: {', '.join(there) or 'none'}"
         )
     return chosen

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from urlab_client.cli._arguments import (
-    ADDRESSES,
     Commands,
     ServerArguments,
+    add_address,
     add_cameras,
     add_keys,
     add_ports,
@@ -20,6 +20,7 @@ from urlab_client.cli._arguments import (
     seconds,
 )
 from urlab_client.cli._failure import CommandError
+from urlab_client.cli._files import check_ending
 from urlab_client.cli._mujoco import import_mujoco
 from urlab_client.cli._output import progress_bar
 from urlab_client.cli._watching import go_on, interruptible
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
 __all__ = ["add_parser", "run"]
 
-_DROPPED = 1
+_INCOMPLETE = 1
 
 
 class RecordArguments(ServerArguments):
@@ -56,9 +57,20 @@ def add_parser(commands: Commands) -> None:
         "physics runs by itself and is watched; in direct mode this command resets and steps it, with all set-points "
         "zero or those of the keyframe. Opens a session, which takes the server over from the client that drives it; a "
         "program of your own can call record(client, FILE). Ctrl-C ends the recording early. Exit code 1 when states "
-        "were dropped. Needs the extra 'urlab-client[mcap]'.",
+        "were dropped or a camera sent no picture. Needs the extra 'urlab-client[mcap]'.",
+        examples=(
+            ("urlab record run.mcap --seconds 30", "thirty seconds of the server on this machine, in live mode"),
+            (
+                "urlab record sim://arm run.mcap --step-mode direct --camera all",
+                "a simulated robot, stepped by this command, with every camera",
+            ),
+            (
+                "urlab record lab-pc:5559 run.mcap --camera arm/wrist --camera-hz 15",
+                "another machine and one of its cameras",
+            ),
+        ),
     )
-    parser.add_argument("address", metavar="ADDRESS", help=ADDRESSES)
+    add_address(parser)
     parser.add_argument("output", type=Path, metavar="FILE", help="the file to write, a .mcap file")
     add_ports(parser)
     add_step_mode(parser)
@@ -77,19 +89,24 @@ def add_parser(commands: Commands) -> None:
 
 
 def run(arguments: RecordArguments) -> int:
-    """Record; return 1 if states were dropped, else 0.
+    """Record; return 1 if states were dropped or a camera sent no picture, else 0.
 
     Raises:
         CommandError: The file or an option cannot be used.
         MissingExtra: A library is missing.
     """
     import_mujoco()
+    check_ending(arguments.output, ".mcap")
     if arguments.output.exists() and not arguments.overwrite:
         raise CommandError(f"{arguments.output} exists; --overwrite replaces it")
     if arguments.keyframe is not None and arguments.step_mode is not StepMode.DIRECT:
         raise CommandError("--keyframe resets the simulation, which needs --step-mode direct")
     import urlab_client.integrations.record  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]  # is it there?
 
+    if arguments.camera and arguments.address.startswith("sim://"):
+        from urlab_client.server.render.opengl import need_backend  # noqa: PLC0415
+
+        need_backend()  # the server that starts here draws with what this machine has
     try:
         recorder = asyncio.run(_record(arguments))
     except KeyError as error:
@@ -103,7 +120,7 @@ def run(arguments: RecordArguments) -> int:
             else ""
         )
     )
-    return _DROPPED if stats.dropped_states else 0
+    return _INCOMPLETE if stats.dropped_states or recorder.without_pictures else 0
 
 
 async def _record(arguments: RecordArguments) -> AsyncRecorder:

@@ -10,7 +10,7 @@ import numpy as np
 
 from urlab_client._mujoco import actuator_count, control_starts
 from urlab_client.cli._failure import CommandError, one_line
-from urlab_client.server.assets.bundled_robots import bundled_models
+from urlab_client.server.assets.bundled_robots import bundled_models, unknown_model
 from urlab_client.server.assets.importer import mujoco_messages
 from urlab_client.server.editor.geometry import box_around
 
@@ -57,7 +57,7 @@ def read_robot(model: str) -> RobotFile:
     if model in bundled and not path.is_file():
         path = bundled[model]
     if not path.is_file():
-        raise CommandError(f"{model}: no such file, and no bundled robot, which are {', '.join(bundled)}")
+        raise CommandError(unknown_model(model))
     path = path.resolve()
     try:
         with mujoco_messages():  # the server repeats what it has to say about the model

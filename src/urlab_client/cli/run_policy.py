@@ -15,17 +15,19 @@ import numpy as np
 
 from urlab_client.aio.launch import with_model_options
 from urlab_client.cli._arguments import (
-    ADDRESSES,
     Commands,
     ServerArguments,
+    add_address,
     add_cameras,
     add_keys,
     add_ports,
     cameras,
     make_client,
+    one_of,
     seconds,
 )
 from urlab_client.cli._failure import CommandError
+from urlab_client.cli._files import check_ending
 from urlab_client.cli._mujoco import import_mujoco
 from urlab_client.cli._output import output, progress_bar
 from urlab_client.protocol.enums import StepMode
@@ -68,9 +70,20 @@ def add_parser(commands: Commands) -> None:
         "requires. Without an address it starts a simulated server; with one it opens a session, which takes the "
         "server over from the client that drives it. Exit code 1 when the robot fell. Needs the extra "
         "'urlab-client[onnx]'.",
+        examples=(
+            ("urlab run-policy walk.onnx", "walk.toml beside it names the robot, which is simulated here"),
+            (
+                "urlab run-policy walk.onnx --command 0.5 0 0 --seconds 20 --compare",
+                "walk forward at 0.5 m/s; compare with zero and random outputs",
+            ),
+            (
+                "urlab run-policy walk.onnx tcp://localhost --record walk.mcap",
+                "drive the robot of a running server, and record it",
+            ),
+        ),
     )
     parser.add_argument("policy", type=Path, metavar="POLICY", help="the network, a .onnx file")
-    parser.add_argument("address", nargs="?", metavar="ADDRESS", help=f"{ADDRESSES} (default: a server for --robot)")
+    add_address(parser, default=None, otherwise="a simulated server for --robot")
     parser.add_argument(
         "--declaration", type=Path, metavar="FILE", help="the .toml file (default: that beside POLICY, of its name)"
     )
@@ -93,8 +106,8 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument(
         "--step-mode",
-        type=StepMode,
-        choices=[StepMode.DIRECT, StepMode.LIVE],
+        type=one_of(StepMode.DIRECT, StepMode.LIVE),
+        metavar="MODE",
         help="direct or live (default: the first that the declaration allows)",
     )
     parser.add_argument("--compare", action="store_true", help="run zero and random outputs first, for comparison")
@@ -140,6 +153,7 @@ def _check_record(arguments: RunPolicyArguments) -> None:
         if arguments.camera or arguments.overwrite:
             raise CommandError("--camera and --overwrite go with --record")
         return
+    check_ending(arguments.record, ".mcap")
     if arguments.record.exists() and not arguments.overwrite:
         raise CommandError(f"{arguments.record} exists; --overwrite replaces it")
     import urlab_client.integrations.record  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]  # is it there?

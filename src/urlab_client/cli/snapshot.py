@@ -12,17 +12,19 @@ from urlab_client.cli._arguments import (
     Commands,
     ServerArguments,
     add_keys,
+    add_mjcf_options,
     add_ports,
     image_size,
     make_client,
     seconds,
 )
 from urlab_client.cli._failure import CommandError
-from urlab_client.cli._files import replaced
+from urlab_client.cli._files import check_ending, replaced
 from urlab_client.cli._mujoco import import_mujoco
 from urlab_client.integrations._extras import need
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.errors import URLabTimeoutError
+from urlab_client.protocol.names import did_you_mean
 
 if TYPE_CHECKING:
     from urlab_client import URLabCameraView, URLabClient
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
 __all__ = ["add_parser", "run"]
 
 _VIEW_MODES = ("lit", "unlit", "wireframe", "collision")
+_FORMATS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg", ".webp": "webp"}
 _TIMEOUT_S = 5.0
 _CHUNK = 100  # physics steps of one request, which the server gives 5 s
 _BEYOND_M = 1e5  # farther than what a ray can meet
@@ -53,9 +56,18 @@ def add_parser(commands: Commands) -> None:
     parser = commands.add_parser(
         "snapshot",
         help="write a picture of a model, a level or a camera",
-        description="Write a PNG of models or of a saved level, in a server of its own; or of what a camera of a "
+        description="Write a picture of models or of a saved level, in a server of its own; or of what a camera of a "
         "running server in live mode sees, which opens a session and so takes the server over from the client that "
         "drives it. Needs the extra 'urlab-client[demo]'.",
+        examples=(
+            ("urlab snapshot quadruped -o quadruped.png", "a bundled robot"),
+            (
+                "urlab snapshot robot.xml --keyframe home --seconds 1 -o robot.jpg",
+                "your own model, one second after its keyframe, as JPEG",
+            ),
+            ("urlab snapshot arm --camera arm/wrist --mode depth", "what a camera of the model sees"),
+            ("urlab snapshot tcp://localhost --camera arm/overview", "what a camera of a running server sees"),
+        ),
     )
     parser.add_argument(
         "sources",
@@ -65,7 +77,12 @@ def add_parser(commands: Commands) -> None:
         "address of a running server, tcp://HOST[:PORT] or ipc://PATH",
     )
     parser.add_argument(
-        "-o", "--output", type=Path, default=Path("snapshot.png"), metavar="FILE", help="default: %(default)s"
+        "-o",
+        "--output",
+        type=Path,
+        default=Path("snapshot.png"),
+        metavar="FILE",
+        help="a .png, .jpg or .webp file (default: %(default)s)",
     )
     parser.add_argument(
         "--camera", metavar="ARTICULATION/CAMERA", help="what this camera sees (default: everything, from outside)"
@@ -85,6 +102,7 @@ def add_parser(commands: Commands) -> None:
     )
     parser.add_argument("--keyframe", metavar="NAME", help="start play at this keyframe")
     parser.add_argument("--seconds", type=seconds, metavar="S", help="simulate for this long before")
+    add_mjcf_options(parser, "for models")
     add_ports(parser, state=False)
     parser.add_argument(
         "--timeout",
@@ -108,6 +126,7 @@ def run(arguments: SnapshotArguments) -> int:
     need("PIL", extra="demo")
     if not arguments.output.parent.is_dir():
         raise CommandError(f"{arguments.output}: no such folder")
+    check_ending(arguments.output, *_FORMATS)
     _check_mode(arguments)
     import_mujoco()
     if any("://" in source for source in arguments.sources):
@@ -142,6 +161,7 @@ def _of_models(arguments: SnapshotArguments) -> NDArray[np.uint8]:
         play=play,
         camera_modes={camera: CameraMode(arguments.mode or CameraMode.REAL)} if camera else {},
         camera_size=arguments.size,
+        mjcf_options=arguments.mjcf_options,
     ) as server:
         with URLabClient(**server.client_options(), step_mode="direct") as client:
             client.discover()
@@ -178,7 +198,8 @@ def _of_running_server(arguments: SnapshotArguments) -> NDArray[np.uint8]:
         client.discover()
         if arguments.camera is None:
             raise CommandError(
-                f"{address}: no op asks for the viewport's picture; say --camera, one of {_names(client)}"
+                f"{address}: the plugin has no op for the viewport's picture; give --camera, one of "
+                f"{', '.join(_camera_names(client)) or 'none (is play running?)'}"
             )
         view = _camera(client, arguments.camera)
         if arguments.mode not in (None, view.mode):
@@ -196,12 +217,14 @@ def _camera(client: URLabClient, key: str) -> URLabCameraView:
     try:
         return client.articulations[articulation].cameras[camera]
     except KeyError:
-        raise CommandError(f"no camera '{key}'; there is {_names(client)}") from None
+        names = _camera_names(client)
+        raise CommandError(
+            f"no camera '{key}'.{did_you_mean(key, names)} There are: {', '.join(names) or 'none (is play running?)'}"
+        ) from None
 
 
-def _names(client: URLabClient) -> str:
-    names = [f"{key}/{camera}" for key, robot in client.articulations.items() for camera in robot.cameras]
-    return ", ".join(names) or "none (is play running?)"
+def _camera_names(client: URLabClient) -> list[str]:
+    return [f"{key}/{camera}" for key, robot in client.articulations.items() for camera in robot.cameras]
 
 
 def _pixels(view: URLabCameraView) -> NDArray[np.uint8]:
@@ -225,5 +248,8 @@ def _pixels(view: URLabCameraView) -> NDArray[np.uint8]:
 def _write(path: Path, image: NDArray[np.uint8]) -> None:
     from PIL import Image  # noqa: PLC0415
 
+    kind = _FORMATS[path.suffix.lower()]
+    picture = Image.fromarray(image)
     with replaced(path) as temporary:
-        Image.fromarray(image).save(temporary, format="png")
+        # JPEG has no transparency, and what a camera draws has none either.
+        (picture.convert("RGB") if kind == "jpeg" else picture).save(temporary, format=kind)

@@ -63,6 +63,12 @@ def add_parser(commands: Commands) -> None:
         "server over from the client that drives it; a program of your own can call rerun_view(client) and its "
         "siblings instead. Ctrl-C ends it. --rerun needs the extra 'urlab-client[rerun]', --foxglove "
         "'urlab-client[foxglove]', --web 'urlab-client[web]'.",
+        examples=(
+            ("urlab view sim://quadruped", "MuJoCo's window"),
+            ("urlab view --rerun --camera all", "the server on this machine in Rerun, with every camera"),
+            ("urlab view sim://arm --rerun --save arm.rrd --seconds 5", "five seconds as a Rerun file"),
+            ("urlab view --foxglove", "a server that Foxglove connects to"),
+        ),
     )
     add_address(parser)
     where = parser.add_mutually_exclusive_group()
@@ -136,6 +142,7 @@ def _console_arguments(arguments: ViewArguments) -> console.ConsoleArguments:
         port=console.PAGE_PORT if arguments.port is None else arguments.port,
         allow_host=[],
         open=False,
+        mjcf_options=arguments.mjcf_options,
         step_port=arguments.step_port,
         state_port=arguments.state_port,
         server_key=arguments.server_key,

@@ -5,9 +5,11 @@ Needs the extra `ray`. The driver calls `ray.init()` before anything here.
 
 import importlib.util
 
+from urlab_client._installation import install_command
+
 for _module in ("ray", "gymnasium"):
     if importlib.util.find_spec(_module) is None:
-        raise ImportError(f"{_module} is not installed; run: pip install 'urlab-client[ray]'", name=_module)
+        raise ImportError(f"{_module} is not installed; run: {install_command('ray')}", name=_module)
 
 from urlab_client.cluster.episodes import Episode, Policy, RolloutError  # noqa: E402
 from urlab_client.cluster.leases import Lease, LeaseLost, LeasePool  # noqa: E402

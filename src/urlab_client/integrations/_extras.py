@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 
+from urlab_client._installation import install_command
+
 __all__ = ["MissingExtra", "need"]
 
 
@@ -19,4 +21,4 @@ def need(*modules: str, extra: str) -> None:
     """
     for name in modules:
         if importlib.util.find_spec(name) is None:
-            raise MissingExtra(f"{name} is not installed; run: pip install 'urlab-client[{extra}]'", name=name)
+            raise MissingExtra(f"{name} is not installed; run: {install_command(extra)}", name=name)

@@ -57,7 +57,7 @@ class ControlMode(StrEnum):
 
 
 class ActuatorType(StrEnum):
-    """Authored MJCF actuator element; `<general>` is reported as `MOTOR`."""
+    """MJCF actuator element. The plugin reports `<general>` as `MOTOR`; the client goes by its gain and bias."""
 
     MOTOR = "motor"
     POSITION = "position"

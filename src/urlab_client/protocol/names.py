@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from typing import Any, NoReturn, TypeVar, cast, overload
 
-__all__ = ["NameMap", "UnknownName", "owner_of", "split_prefix"]
+__all__ = ["NameMap", "UnknownName", "did_you_mean", "owner_of", "split_prefix"]
 
 T = TypeVar("T")
 D = TypeVar("D")
@@ -65,6 +65,12 @@ class UnknownName(KeyError):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.kind, self.name, self.matches, self.known, self.suggestions)
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return a sentence, after a blank, that suggests the names spelled most alike; empty where none is."""
+    close = difflib.get_close_matches(name, list(known))
+    return f" Did you mean {_listed(close, 'or')}?" if close else ""
 
 
 def _listed(names: Sequence[str], conjunction: str) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from urlab_client.protocol.errors import URLabError
-from urlab_client.server.assets.bundled_robots import bundled_models
+from urlab_client.server.assets.bundled_robots import bundled_models, unknown_model
 from urlab_client.server.editor.world import EditorWorld
 
 __all__ = ["ModelError", "is_level", "populate"]
@@ -28,7 +28,7 @@ def is_level(model: str) -> bool:
 def populate(world: EditorWorld, models: Sequence[str]) -> None:
     """Open the level among `models`, place the others, and see to a manager."""
     for level in filter(is_level, models):
-        world.load_level_file(Path(level))
+        world.levels.load_file(Path(level))
     edge: float | None = None
     for row in world.list_actors():
         edge = _beyond(world, row.name, edge)
@@ -46,10 +46,10 @@ def _place(world: EditorWorld, model: str, sources: dict[str, str], edge: float 
     """
     bundled = bundled_models()
     if not Path(model).suffix and not Path(model).is_file() and model not in bundled:
-        raise ModelError(f"{model} is neither a file nor a bundled model; those are {', '.join(bundled)}")
+        raise ModelError(unknown_model(model))
     path = model if model in bundled and not Path(model).is_file() else str(Path(model).absolute())
     # What whoever runs the server names is meant as it is now, whatever an earlier run imported.
-    blueprint, _ = world.import_xml(path, force_reimport=path not in sources.values(), trusted=True)
+    blueprint, _ = world.blueprints.import_xml(path, force_reimport=path not in sources.values(), trusted=True)
     other = sources.setdefault(blueprint.stem, path)
     if other != path:
         raise ModelError(f"{model} and {other} would both become blueprint '{blueprint.stem}': rename one of the files")

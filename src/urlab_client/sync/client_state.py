@@ -12,7 +12,9 @@ from urlab_client.aio.transport.base import TransportStats
 from urlab_client.protocol.client_types import ClientConfig, ServerInfo
 from urlab_client.protocol.descriptions import SceneDescription
 from urlab_client.protocol.enums import StepMode
+from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.names import NameMap
+from urlab_client.protocol.observer import ClientObserver
 from urlab_client.sync._facade import Facade
 from urlab_client.sync.articulation import URLabArticulation, URLabEntity
 from urlab_client.sync.cameras import URLabCameraView
@@ -91,7 +93,12 @@ class ClientState(Facade, twin=aio.ClientState):
 
     @property
     def data(self) -> mujoco.MjData | None:
-        """Local state that mirrors the server's after each reply, or None without a model."""
+        """Local state that mirrors the server's after each reply, or None without a model.
+
+        Poses and velocities that follow from the state (`xpos`, `site_xpos`, `cvel`, …) are computed when this is read
+        after a reply, so read it again after each step; whoever does not read it pays nothing. Forces and contacts are
+        not computed: use `mujoco.mj_forward` on a copy, or `runtime.get_contacts()`.
+        """
         return self._aio.data
 
     @property
@@ -160,6 +167,29 @@ class ClientState(Facade, twin=aio.ClientState):
         Sends nothing. `msgspec.json.encode` and `msgspec.to_builtins` take the result as it is.
         """
         return self._aio.describe()
+
+    def camera(self, name: str) -> URLabCameraView:
+        """Return a camera by `<articulation>/<camera>`, or by `<camera>` where that means one of them.
+
+        Raises:
+            KeyError: There is no such camera, or there are several.
+        """
+        return self._wrap(URLabCameraView, self._aio.camera(name))
+
+    def matches(self, snapshot: StateSnapshot) -> bool:
+        """Return whether a published state is of the world that the last handshake described, as far as it shows.
+
+        Right after play began anew, a stream may bring states of a world that `discover()` has not been told of.
+        """
+        return self._aio.matches(snapshot)
+
+    def add_observer(self, observer: ClientObserver) -> None:
+        """Tell `observer` of each handshake and state from now on, until `remove_observer()`. Idempotent."""
+        self._aio.add_observer(observer)
+
+    def remove_observer(self, observer: ClientObserver) -> None:
+        """Tell `observer` nothing more. Idempotent."""
+        self._aio.remove_observer(observer)
 
     @property
     def _data_lock(self) -> RLock:

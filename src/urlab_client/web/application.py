@@ -173,26 +173,26 @@ class _Site:
         if op is None:
             return _error(404, "unknown_op", f"There is no op {request.path_params['op']!r} here.", "See openapi.json.")
         body = await _body(request)
-        return _json(encode(await self.console.do(self._viewer(request), parse(op, body))))
+        return _json(encode(await self.console.controls.do(self._viewer(request), parse(op, body))))
 
     async def _ctrl(self, request: Request) -> Response:
         values = msgspec.json.decode(await _body(request), type=dict[str, dict[str, float]])
-        self.console.set_points(self._viewer(request), values)
+        self.console.controls.set_points(self._viewer(request), values)
         return _json(b"{}")
 
     async def _run(self, request: Request) -> Response:
-        await self.console.run(
+        await self.console.controls.run(
             self._viewer(request), msgspec.json.decode(await _body(request), type=_RunRequest).running
         )
         return _json(b"{}")
 
     async def _step(self, request: Request) -> Response:
         steps = msgspec.json.decode(await _body(request) or b"{}", type=_StepRequest)
-        return _json(encode(await self.console.step(self._viewer(request), steps.n_steps)))
+        return _json(encode(await self.console.controls.step(self._viewer(request), steps.n_steps)))
 
     async def _seek(self, request: Request) -> Response:
         wanted = msgspec.json.decode(await _body(request), type=_SeekRequest).frame
-        frame, total = await self.console.seek(self._viewer(request), wanted)
+        frame, total = await self.console.controls.seek(self._viewer(request), wanted)
         return _json(encode({"frame": frame, "total": total}))
 
     async def _lease(self, request: Request) -> Response:
@@ -295,7 +295,7 @@ class _Site:
                         one.viewer.name = " ".join(message.name.split())[:24] or one.viewer.name
                         self.console.tell()
                     case "ctrl":
-                        self.console.set_points(one.viewer, message.values)
+                        self.console.controls.set_points(one.viewer, message.values)
                     case _:
                         raise ValueError(f"there is no message of type {message.type!r}")  # noqa: TRY301 - answered
             except (NotDriving, ValueError, KeyError, RecursionError, msgspec.MsgspecError) as error:

@@ -1,4 +1,4 @@
-"""What all viewers share: the session that is kept, the newest state, the log, the controls.
+"""What all viewers share: the session that is kept, the newest state, the log.
 
 Nothing is queued for anybody. A viewer is told that something changed and takes what is newest when they are ready.
 """
@@ -10,20 +10,15 @@ import contextlib
 import logging
 import time
 from collections import deque
-from collections.abc import AsyncGenerator, Generator, Mapping
+from collections.abc import AsyncGenerator, Generator
 from typing import TYPE_CHECKING, Any
 
 import anyio
 import numpy as np
 from msgspec import Struct, structs
 
-from urlab_client.protocol.base import Effect, Request
-from urlab_client.protocol.codec import op_of
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import ClientClosed, URLabError, URLabTimeoutError
-from urlab_client.protocol.messages.recording import RecordingStart, RecordingStop, ReplayStart, ReplayStop
-from urlab_client.protocol.messages.runtime import SetControlSource, SetPaused, SetSimSpeed, SetTwist
-from urlab_client.protocol.messages.session import ArticulationCommand, Step
 from urlab_client.protocol.messages.streams import (
     ClientEvent,
     PlayEnded,
@@ -36,14 +31,15 @@ from urlab_client.protocol.messages.streams import (
     SessionOpened,
     StateSnapshot,
 )
+from urlab_client.web.controls import Controls
 from urlab_client.web.description import WorldDescription, describe
 from urlab_client.web.driving_lease import DrivingLease, Viewer
 from urlab_client.web.mujoco_viewer import MujocoViewer
-from urlab_client.web.ops import encode, perform
+from urlab_client.web.ops import encode
 from urlab_client.web.pictures import Feed
 
 if TYPE_CHECKING:
-    from urlab_client.aio import URLabArticulation, URLabCameraView, URLabClient
+    from urlab_client.aio import URLabCameraView, URLabClient
 
 __all__ = ["Audience", "ConsoleSession", "Link", "LogEntry"]
 
@@ -55,7 +51,6 @@ _PULSE_S = 0.5
 _CONNECT_S = 3.0
 _KEPT = 300
 _DIGITS = 5
-_SEEK_STEPS = 8  # recordings have about one frame a timestep
 _MOVING_S = 0.4  # a paused server repeats its state ten times a second
 
 
@@ -112,6 +107,7 @@ class ConsoleSession:
         self.audience: set[Audience] = set()
         self.snapshot: StateSnapshot | None = None
         self.mujoco_viewer = MujocoViewer(client)
+        self.controls = Controls(self)
         self._bells: set[asyncio.Event] = set()
         self._n = 0
         self._want: str | None = "discover"
@@ -120,17 +116,7 @@ class ConsoleSession:
         self._moved_at = 0.0
         self._rate = 0.0
         self._rate_from: tuple[float, float] | None = None
-        self._running = False
-        self._wake_runner = asyncio.Event()
-        self._seeded: set[str] = set()
-        self._pending: set[str] = set()
-        self._commanded = asyncio.Event()
         self._feeds: dict[str, Feed] = {}
-        self._speed: float | None = None
-        self._source: str | None = None
-        self._recording = self._replaying = False
-        self._replay: tuple[int, int] | None = None
-        self._twists: dict[str, tuple[float, float, float]] = {}
 
     # Life
 
@@ -138,7 +124,8 @@ class ConsoleSession:
     async def open(self) -> AsyncGenerator[None]:
         """Keep the session and receive state while the body runs."""
         async with anyio.create_task_group() as tasks:
-            for job in (self._keep, self._receive, self._command, self._run_direct, self._pulse):
+            controls = self.controls
+            for job in (self._keep, self._receive, controls.send_set_points, controls.keep_stepping, self._pulse):
                 tasks.start_soon(job)
             try:
                 yield
@@ -204,14 +191,14 @@ class ConsoleSession:
                 self._set_link("connected")
             case SessionLost() if event.session_id == self.client.session_id and self._want is None:
                 self._set_link("taken_over", "another program has taken the server over")
-                self._running = False
+                self.controls.running = False
             case PlayStarted():
                 if event.articulations or not self.client.session_id:
                     self._begin_anew()
                 else:
                     self._want = "discover"
             case PlayEnded() | SessionOpened():
-                self._running = False
+                self.controls.running = False
                 self._begin_anew()
             case _:
                 pass
@@ -228,13 +215,11 @@ class ConsoleSession:
 
     def _begin_anew(self) -> None:
         """Forget what belonged to the play before."""
-        self._seeded.clear()
-        self._twists.clear()
-        self._recording = self._replaying = False
-        self._replay = None
-        self._redescribe()
+        self.controls.begin_anew()
+        self.redescribe()
 
-    def _redescribe(self) -> None:
+    def redescribe(self) -> None:
+        """Describe the world anew: something in it is another."""
         self.world = describe(self.client, self.world.version + 1, self.mujoco_viewer.missing)
         self.world_json = encode({"type": "world", "world": self.world})
         self.tell()
@@ -297,7 +282,7 @@ class ConsoleSession:
 
     def _targets(self, key: str) -> list[float] | None:
         art = self.client.articulations.get(key)
-        return _rounded(art.ctrl_array) if art is not None and key in self._seeded else None
+        return _rounded(art.ctrl_array) if art is not None and self.controls.commands(key) else None
 
     @property
     def moving(self) -> bool:
@@ -313,15 +298,15 @@ class ConsoleSession:
             "address": self.client.address,
             "playing": self.client.manager_present,
             "moving": self.moving,
-            "running": self._running if self.client.step_mode is not StepMode.LIVE else self.moving,
+            "running": self.controls.running if self.client.step_mode is not StepMode.LIVE else self.moving,
             "rate": round(self._rate, 3) if self.moving else 0.0,
             "mode": self.client.step_mode,
-            "speed": self._speed,
-            "source": self._source,
-            "recording": self._recording,
-            "replaying": self._replaying,
-            "replay": self._replay,
-            "twists": self._twists,
+            "speed": self.controls.speed,
+            "source": self.controls.source,
+            "recording": self.controls.recording,
+            "replaying": self.controls.replaying,
+            "replay": self.controls.replay,
+            "twists": self.controls.twists,
             "viewers": len(self.audience),
             "driver": None if holder is None else holder.name,
             "mine": holder is not None and holder.key == viewer.key,
@@ -358,192 +343,11 @@ class ConsoleSession:
         self.entries.append(LogEntry(self._n, time.time(), kind, who, what, text, ms))
         self.tell()
 
-    # Acting
-
-    async def do(self, viewer: Viewer, request: Request[Any]) -> object:
-        """Perform an op for a viewer.
-
-        Raises:
-            NotDriving: It changes something, and somebody else has the controls.
-            URLabError: As the client raises.
-        """
-        op = op_of(request)
-        if op.effect is not Effect.READ and not (isinstance(request, SetPaused) and request.paused):
-            self.lease.use(viewer)
-        began = time.perf_counter()
-        try:
-            reply = await perform(self.client, request)
-        except (URLabError, ValueError, TypeError, KeyError) as error:
-            self.note("error", viewer.name, op.name, str(error), 1e3 * (time.perf_counter() - began))
-            raise
-        if op.effect is not Effect.READ:
-            arguments = encode(structs.asdict(request)).decode()
-            self.note("call", viewer.name, op.name, arguments, 1e3 * (time.perf_counter() - began))
-        self._follow(request, reply)
-        return reply
-
-    def _follow(self, request: Request[Any], reply: Any) -> None:
-        """Remember what the server does not tell again."""
-        match request:
-            case SetSimSpeed():
-                self._speed = reply.percent
-            case SetControlSource(articulation=None):
-                self._source = reply.source
-            case SetTwist():
-                self._twists[request.articulation] = (reply.linear[0], reply.linear[1], reply.angular[2])
-            case RecordingStart():
-                self._recording, self._replaying = True, False  # the server ends the one for the other
-            case RecordingStop():
-                self._recording = False
-            case ReplayStart():
-                self._recording = False
-                self._replaying, self._replay = reply.total_frames > 0, (0, reply.total_frames)
-            case ReplayStop():
-                self._replaying = False
-            case _:
-                pass
-        if op_of(request).name == "configure_controller":
-            self._redescribe()
-
-    def set_points(self, viewer: Viewer, values: Mapping[str, Mapping[str, float]]) -> None:
-        """Set set-points by articulation and actuator. In live mode they are sent at once, the newest only.
-
-        Raises:
-            NotDriving: Somebody else has the controls.
-            KeyError: An articulation or actuator is unknown; nothing was set.
-            ValueError: A value is not a finite number; nothing was set.
-        """
-        found = {key: (self.client.articulations[key], given) for key, given in values.items()}
-        for art, given in found.values():
-            for name, value in given.items():
-                art.actuators[name]  # raises
-                if not np.isfinite(value):
-                    raise ValueError(f"{name}: {value} is not a set-point")
-        self.lease.use(viewer)
-        for key, (art, given) in found.items():
-            self._seed(key, art)
-            art.set_ctrl(given)
-            self._pending.add(key)
-        self._commanded.set()
-
-    def _seed(self, key: str, art: URLabArticulation) -> None:
-        """Before a first set-point, hold still: the others of the articulation are sent along with it."""
-        if key in self._seeded:
-            return
-        self._seeded.add(key)
-        if self.snapshot is None or key not in self.snapshot.per_articulation or art.ctrl_array.any():
-            return
-        state = self.snapshot.per_articulation[key]
-        for actuator in art.actuators.values():
-            at = actuator.ctrl_local
-            if art.controller is not None and actuator.joint is not None:
-                actuator.set_control(float(state.qpos[art.joints[actuator.joint].qpos_local_offset]))
-            elif state.ctrl is not None:
-                art.ctrl_array[at] = state.ctrl[at]
-
-    async def _command(self) -> None:
-        """Send set-points in live mode, one request at a time."""
-        while True:
-            await self._commanded.wait()
-            self._commanded.clear()
-            keys, self._pending = self._pending, set()
-            if self.client.step_mode is not StepMode.LIVE:
-                continue  # the next step takes them along
-            commands = {
-                key: ArticulationCommand(ctrl=self.client.articulations[key].ctrl_array.tolist())
-                for key in keys
-                if key in self.client.articulations
-            }
-            try:
-                await self.client.call(Step(per_articulation=commands))
-            except URLabError as error:
-                self.note("error", "console", "set-points", str(error))
-
-    async def step(self, viewer: Viewer, n_steps: int) -> dict[str, Any]:
-        """Step in direct mode, with the set-points and pictures of the cameras that are watched.
-
-        Raises:
-            NotDriving: Somebody else has the controls.
-            ValueError: The mode is another one.
-        """
-        if self.client.step_mode is not StepMode.DIRECT:
-            raise ValueError(f"stepping needs mode direct, not {self.client.step_mode}")
-        self.lease.use(viewer)
-        return await self._step(n_steps)
-
-    async def _step(self, n_steps: int) -> dict[str, Any]:
-        for key, art in self.client.articulations.items():
-            self._seed(key, art)
-        watched = {path.removeprefix("-/"): "latest" for path, feed in self._feeds.items() if feed.watched}
-        reply = await self.client.step(n_steps, include_cameras=watched or False)
-        if reply.replay is not None:
-            self._replay = (reply.replay.current_frame, reply.replay.total_frames)
-            if self._replaying and reply.replay.current_frame >= reply.replay.total_frames - 1:
-                self._running = False
-        return {"time": reply.time, "step": reply.step}
-
-    async def seek(self, viewer: Viewer, frame: int) -> tuple[int, int]:
-        """Go to a frame of the replay, and return the one reached and how many there are.
-
-        No op does that. A replay goes on by what is stepped, though, and begins where it is started: to go back it is
-        started again. The plugin's replay plays by itself and does not report its position.
-
-        Raises:
-            NotDriving: Somebody else has the controls.
-            ValueError: No replay runs, or the server does not say where it is.
-            URLabError: As the client raises.
-        """
-        if not self._replaying or self._replay is None or self.client.step_mode is not StepMode.DIRECT:
-            raise ValueError("no replay runs in mode direct")
-        self.lease.use(viewer)
-        at, total = self._replay
-        frame = min(max(frame, 0), total - 1)
-        if frame < at:
-            self._follow(ReplayStart(), await self.client.call(ReplayStart()))
-            at = 0
-        for _ in range(_SEEK_STEPS):
-            if at >= frame:
-                break
-            reply = await self.client.step(frame - at)
-            if reply.replay is None:
-                raise ValueError("this server does not say where its replay is")
-            at = reply.replay.current_frame
-            self._replay = at, total
-        self.tell()
-        return self._replay
-
-    async def run(self, viewer: Viewer, running: bool) -> None:
-        """Let physics run, or stop it, in whatever mode; everybody may stop it.
-
-        Raises:
-            NotDriving: It was to run, and somebody else has the controls.
-        """
-        if running:
-            self.lease.use(viewer)
-        if self.client.step_mode is StepMode.LIVE:
-            await self.do(viewer, SetPaused(paused=not running))
-        else:
-            self._running = running
-            self.note("call", viewer.name, "run" if running else "stop", "")
-            self._wake_runner.set()
-        self.tell()
-
-    async def _run_direct(self) -> None:
-        """In direct mode step along with the clock while that is wanted; what is missed is not made up for."""
-        while True:
-            if not self._running or self.client.step_mode is not StepMode.DIRECT:
-                self._wake_runner.clear()
-                await self._wake_runner.wait()
-                continue
-            began = time.monotonic()
-            try:
-                await self._step(max(1, round(_PERIOD_S / (self.world.timestep or _PERIOD_S))))
-            except (URLabError, KeyError) as error:
-                self._running = False
-                self.note("error", "console", "step", str(error))
-            await anyio.sleep(max(0.0, began + _PERIOD_S - time.monotonic()))
-
     # Cameras
+
+    def watched_cameras(self) -> list[str]:
+        """Return the cameras that somebody watches, by the names that `step` takes."""
+        return [path.removeprefix("-/") for path, feed in self._feeds.items() if feed.watched]
 
     def feed(self, path: str) -> Feed | None:
         """Return the pictures of the camera `ARTICULATION/CAMERA` (`-` for those of the scene), None without it."""

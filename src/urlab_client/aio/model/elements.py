@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from urlab_client._mujoco import control_counts, control_starts, force_counts
+from urlab_client._mujoco import acting_kind, control_counts, control_starts, force_counts, servo_damping
 from urlab_client.aio.model.articulation_state import MirroredArticulation
 from urlab_client.aio.model.layout import JOINT_TRANSMISSIONS, QPOS_WIDTH, QVEL_WIDTH
 from urlab_client.aio.model.numbers import finite, finite_array, is_array
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Actuator", "ArticulationElements", "Body", "Joint", "Sensor", "make_elements"]
 
+_UNSPECIFIC = {"motor", "general"}  # what servers say of a `<general>`
+
 
 class Actuator:
     """One actuator of an articulation.
@@ -30,12 +32,13 @@ class Actuator:
     Attributes:
         name: Short name, without the articulation's prefix.
         id: Global MuJoCo actuator id.
-        type: Authored kind; a plain string when the server names one this client does not know; None if unknown.
+        type: Kind: as authored, of a `<general>` the one that has its gain and bias, so that an affine one is a servo;
+            a plain string when the server names one this client does not know; None if unknown.
         joint: Short name of the driven joint, or None for other transmissions.
         ctrlrange: (low, high) of the control, or None if unlimited.
         forcerange: (low, high) of the force, or None if unlimited.
         kp: `gainprm[0]`, or None without a local model.
-        kv: `gainprm[1]`, or None without a local model.
+        kv: Damping of a servo, `-biasprm[2]`, of others `gainprm[1]`; None without a local model.
         ctrl_local: Slice of the articulation's `ctrl_array` that holds its inputs; length 1 for ordinary actuators.
     """
 
@@ -417,6 +420,8 @@ def _actuators(record: MirroredArticulation, model: mujoco.MjModel | None) -> li
     controls, starts, forces = control_counts(model), control_starts(model), force_counts(model)
     for name, i in record.layout.actuators.items():
         kind = types.get(name)
+        if kind in _UNSPECIFIC:
+            kind = acting_kind(model, i)
         driven = int(model.actuator_trnid[i][0]) if model.actuator_trntype[i] in JOINT_TRANSMISSIONS else -1
         width, first = int(controls[i]), int(starts[i])
         actuators.append(
@@ -431,7 +436,7 @@ def _actuators(record: MirroredArticulation, model: mujoco.MjModel | None) -> li
                 ctrlrange=_interval(model.actuator_ctrlrange[first]) if model.actuator_ctrllimited[first] else None,
                 forcerange=_interval(model.actuator_forcerange[i]) if model.actuator_forcelimited[i] else None,
                 kp=float(model.actuator_gainprm[i][0]),
-                kv=float(model.actuator_gainprm[i][1]),
+                kv=servo_damping(model, i),
             )
         )
         start += width

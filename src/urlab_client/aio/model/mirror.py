@@ -266,6 +266,13 @@ class Mirror:
         """Note that positions or velocities changed, so that derived quantities must be computed before use."""
         self._stale = True
 
+    def current_data(self) -> mujoco.MjData | None:
+        """Return the data with body poses and velocities computed for the present state, None without a model."""
+        if self._stale:
+            with self.lock:
+                self.derived()
+        return self.data
+
     def derived(self) -> tuple[mujoco.MjModel, mujoco.MjData] | None:
         """Return model and data with body poses and velocities computed for the present state. Call under the lock."""
         if self.model is None or self.data is None:
@@ -275,6 +282,7 @@ class Mirror:
 
             mujoco.mj_kinematics(self.model, self.data)
             mujoco.mj_comPos(self.model, self.data)
+            mujoco.mj_camlight(self.model, self.data)
             mujoco.mj_comVel(self.model, self.data)
             self._stale = False
         return self.model, self.data

@@ -38,7 +38,7 @@ async def take_steps(state: SimState, turn: Turn, n_steps: int, cameras: Cameras
     mode = state.mode
     if n_steps < (0 if mode is StepMode.PUPPET else 1):
         raise ValueError(_too_few(n_steps, mode))
-    pictures = _pictures(state, cameras, n_steps)
+    pictures = await _pictures(state, cameras, n_steps) if state.observers or cameras is not False else None
     if mode is StepMode.LIVE and not state.mode_assumed:
         return await _live_step(state, turn, pictures)
     request, carried = _puppet_step(state, n_steps) if mode is StepMode.PUPPET else _direct_step(state, n_steps)
@@ -161,14 +161,15 @@ def _learn_mode(state: SimState, request: Step, reply: StepOk, advanced: int) ->
         )
 
 
-def _pictures(state: SimState, cameras: Cameras, n_steps: int) -> StepPictures | None:
-    """Return the pictures that a step is to bring; None for none, as nearly always."""
-    if cameras is False and not state.observers:
-        return None
+async def _pictures(state: SimState, cameras: Cameras, n_steps: int) -> StepPictures | None:
+    """Return the pictures that a step is to bring, None for none, when observers have room for what it brings."""
+    if state.mode is not StepMode.LIVE:
+        for observer in state.observers:
+            await observer.ready()
     asked: bool | dict[str, str | None]
     asked = cameras if isinstance(cameras, bool) else {name: str(CameraTiming(how)) for name, how in cameras.items()}
-    for observer in state.observers:
-        asked = observer.wanted_pictures(asked, n_steps)
+    if state.observers:
+        asked = state.objects.with_cameras(asked, state.observed_cameras(n_steps))
     return StepPictures(state, asked) or None
 
 

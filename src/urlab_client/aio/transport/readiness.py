@@ -12,6 +12,7 @@ import socket
 import threading
 from collections.abc import Callable, Collection
 from typing import Any, ClassVar, Final, Protocol, cast
+from weakref import WeakValueDictionary
 
 import zmq
 
@@ -137,7 +138,8 @@ class _Watcher:
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
         self._lock = threading.Lock()
-        self._armed: dict[int, _Watched] = {}
+        # Weak: a client that nobody closed goes with its loop, before this thread sees that the loop is closed.
+        self._armed: WeakValueDictionary[int, _Watched] = WeakValueDictionary()
         self._users = 0
         self._ended = False
         self._rung = False

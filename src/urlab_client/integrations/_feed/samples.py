@@ -21,7 +21,10 @@ _FALLBACK_NS = 1_000_000
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """One state on its way to whoever keeps or shows it."""
+    """One state on its way to whoever keeps or shows it.
+
+    `waits` says that it is the reply to a step of ours, so that the next one can wait until there is room.
+    """
 
     scene: SceneMessages
     reply: StateReply | StateSnapshot
@@ -29,6 +32,7 @@ class State:
     nanoseconds: int
     restarts: bool
     wall_ns: int
+    waits: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +43,7 @@ class CameraPicture:
     frame: CameraFrame | Pixels
     nanoseconds: int | None
     wall_ns: int
+    waits: bool = False
 
     def pixels(self) -> Pixels:
         """Return the picture as an array, as `CameraSample.pixels` is."""

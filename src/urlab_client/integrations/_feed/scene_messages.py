@@ -11,10 +11,11 @@ import numpy as np
 from msgspec import Struct
 
 from urlab_client._mujoco import control_counts
+from urlab_client.aio.articulation import URLabArticulation
 from urlab_client.aio.cameras import URLabCameraView
-from urlab_client.aio.model.layout import FREE, ArticulationLayout
+from urlab_client.aio.client import URLabClient
+from urlab_client.aio.model.layout import FREE, ArticulationLayout, articulation_layouts
 from urlab_client.aio.model.mirror import model_names
-from urlab_client.aio.state.sim_state import SimState
 from urlab_client.integrations._feed.messages import (
     CameraCalibration,
     ContactMessage,
@@ -41,7 +42,7 @@ __all__ = [
     "to_metadata",
 ]
 
-_BALL = 1  # mjJNT_BALL
+_BALL, _SLIDE = 1, 2  # mjJNT_BALL, mjJNT_SLIDE
 # From MuJoCo's camera axes (x right, y up, looking along -z) to an image's (x right, y down, looking along z).
 _OPTICAL = np.array([0.0, 1.0, 0.0, 0.0])
 
@@ -50,12 +51,18 @@ _FREE_QVEL = ("vx", "vy", "vz", "wx", "wy", "wz")
 
 
 class SceneLayout(Struct, kw_only=True):
-    """Name of each value of an articulation, in the order of the message's arrays; empty without a local model."""
+    """Name of each value of an articulation, in the order of the message's arrays; empty without a local model.
+
+    `slides` are the names of slide joints, whose positions are metres, None where that is not known, and `sensors` the
+    kind of each sensor by name, as MJCF calls it (`accelerometer`).
+    """
 
     qpos: list[str] = []
     qvel: list[str] = []
     ctrl: list[str] = []
     act: list[str] = []
+    slides: list[str] | None = None
+    sensors: dict[str, str] = {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,18 +101,23 @@ class SceneMessages:
     cameras: dict[int, CameraLayout]
 
     @classmethod
-    def of(cls, state: SimState, cameras: list[tuple[str, URLabCameraView]]) -> SceneMessages:
+    def of(cls, client: URLabClient, cameras: list[tuple[str, URLabCameraView]]) -> SceneMessages:
         """Describe what the client knows."""
-        model = state.mirror.model
-        layouts = {key: record.layout for key, record in state.objects.records.items()}
+        model, arts = client.model, client.articulations
+        layouts = {key: ArticulationLayout() for key in arts}
+        if model is not None:
+            found = articulation_layouts(model, [art.compiled_prefix for art in arts.values()])
+            layouts = {key: found[art.compiled_prefix] for key, art in arts.items()}
         ids = _camera_ids(model)
         entities: dict[str, tuple[int, int] | None] = {}
         mocap: dict[str, int] = {}
-        for name, record in state.objects.entity_records.items():
-            offsets = record.qpos_offset, record.qvel_offset
+        for name, entity in client.entities.items():
+            if isinstance(entity, URLabArticulation):
+                continue
+            offsets = entity.qpos_offset, entity.qvel_offset
             entities[name] = None if offsets[0] is None or offsets[1] is None else (offsets[0], offsets[1])
-            if model is not None and record.body_id >= 0 and model.body_mocapid[record.body_id] >= 0:
-                mocap[name] = int(model.body_mocapid[record.body_id])
+            if model is not None and entity.body_id >= 0 and model.body_mocapid[entity.body_id] >= 0:
+                mocap[name] = int(model.body_mocapid[entity.body_id])
         return cls(
             model=model,
             layouts=layouts,
@@ -294,7 +306,18 @@ def _layout(model: mujoco.MjModel | None, layout: ArticulationLayout) -> SceneLa
     for name, actuator in layout.actuators.items():
         count = int(counts[actuator])
         ctrl += [name] if count == 1 else [f"{name}.{i}" for i in range(count)]
-    return SceneLayout(qpos=qpos, qvel=qvel, ctrl=ctrl, act=list(ctrl))
+    slides = [name for name, joint in layout.joints.items() if int(model.jnt_type[joint]) == _SLIDE]
+    kinds = sensor_kinds()
+    sensors = {name: kinds.get(int(model.sensor_type[sensor]), "") for name, sensor in layout.sensors.items()}
+    return SceneLayout(qpos=qpos, qvel=qvel, ctrl=ctrl, act=list(ctrl), slides=slides, sensors=sensors)
+
+
+def sensor_kinds() -> dict[int, str]:
+    """Return MJCF's word for each number in `model.sensor_type`."""
+    import mujoco  # noqa: PLC0415
+
+    members = mujoco.mjtSensor.__members__
+    return {int(member): name.removeprefix("mjSENS_").lower() for name, member in members.items()}
 
 
 def to_metadata(layout: SceneLayout) -> dict[str, str]:

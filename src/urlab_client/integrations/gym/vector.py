@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from collections.abc import Callable, Coroutine, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
+import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 from numpy.typing import NDArray
 
 from urlab_client.aio.client import URLabClient
-from urlab_client.aio.launch import SCHEME, with_model_options
+from urlab_client.aio.launch import SCHEME, with_model_options, with_start_timeout
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn
-from urlab_client.integrations.gym.episode import EnvEpisode
+from urlab_client.integrations.gym.episode import EnvEpisode, client_defaults, first_camera
 from urlab_client.integrations.gym.spaces import Observation, SpaceMode
-from urlab_client.integrations.gym.vectorized import Indices, Vectorized
+from urlab_client.integrations.gym.starts import ResetNoise, noise_of
+from urlab_client.integrations.gym.vectorized import Found, Indices, Vectorized, check_render_mode
 from urlab_client.protocol.errors import URLabError
 from urlab_client.sync._portal import Portal
 
@@ -27,21 +31,48 @@ __all__ = ["URLabVectorEnv"]
 T = TypeVar("T")
 
 
+def _processors() -> int:
+    """Return how many servers may start at once: each keeps a processor busy until it is up."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@dataclass(frozen=True)
+class _Rendered:
+    """That pictures are drawn, and of which camera; the first one for None."""
+
+    camera: str | None
+
+
 class _Session:
     """One environment: its client, and what is needed to start it again."""
 
-    def __init__(self, address: str, client_options: Mapping[str, Any], episode_options: Mapping[str, Any]) -> None:
+    def __init__(
+        self,
+        address: str,
+        starts: asyncio.Semaphore,
+        client_options: Mapping[str, Any],
+        episode_options: Mapping[str, Any],
+        rendered: _Rendered | None,
+    ) -> None:
         self.address = address
         self.restarts = -1
+        self.shown: tuple[str, ...] = ()
         self.episode: EnvEpisode | None = None
+        self._starts = starts
         self._client_options = client_options
         self._episode_options = episode_options
+        self._rendered = rendered
+        self._opening: asyncio.Task[None] | None = None
 
     async def reset(self, rng: np.random.Generator, keyframe: str | None, timeout: float) -> Observation:
-        """Start an episode; start the session first where there is none, which the deadline does not cover."""
-        episode = self.episode or await self.open()
+        """Start an episode. Where there is no session, one is started, which goes on when the deadline has passed."""
         async with asyncio.timeout(timeout):
-            return await episode.reset(rng, keyframe)
+            if self.episode is None:
+                opening = self._opening or self.reopen()
+                await asyncio.shield(opening)
+            if self.episode is None:
+                raise URLabError("The environment was closed.")
+            return await self.episode.reset(rng, keyframe)
 
     async def step(self, action: Any, timeout: float) -> Observation:
         """Act."""
@@ -50,23 +81,48 @@ class _Session:
         async with asyncio.timeout(timeout):
             return await self.episode.step(action)
 
+    def reopen(self) -> asyncio.Task[None]:
+        """Give up what there is, and begin to start a session in its place; whoever resets waits for that."""
+        if self._opening is None:
+            self._opening = asyncio.create_task(self._reopen(), name="urlab-environment")
+            self._opening.add_done_callback(self._opened)
+        return self._opening
+
     async def close(self) -> None:
         """Give the client up."""
+        if self._opening is not None:
+            self._opening.cancel()
+            await asyncio.wait((self._opening,))
+        await self._close_client()
+
+    async def open(self) -> None:
+        """Start the session when it is its turn."""
+        async with self._starts:
+            client = URLabClient(with_model_options(self.address), **self._client_options)
+            try:
+                await client.discover()
+                wanted = self._rendered
+                shown = () if wanted is None else (wanted.camera or first_camera(client),)
+                self.episode = EnvEpisode(client, rendered=shown, **self._episode_options)
+                self.shown = shown
+            except BaseException:
+                await client.close()
+                raise
+        self.restarts += 1
+
+    async def _reopen(self) -> None:
+        await self._close_client()
+        await self.open()
+
+    async def _close_client(self) -> None:
         episode, self.episode = self.episode, None
         if episode is not None:
             await episode.client.close()
 
-    async def open(self) -> EnvEpisode:
-        """Start the session."""
-        client = URLabClient(with_model_options(self.address), **self._client_options)
-        try:
-            await client.discover()
-            self.episode = EnvEpisode(client, **self._episode_options)
-        except BaseException:
-            await client.close()
-            raise
-        self.restarts += 1
-        return self.episode
+    def _opened(self, task: asyncio.Task[None]) -> None:
+        self._opening = None
+        if not task.cancelled():
+            task.exception()  # a reset that waits gets it; without one the next reset tries again
 
 
 class URLabVectorEnv(Vectorized):
@@ -75,7 +131,10 @@ class URLabVectorEnv(Vectorized):
     Every environment has a session, and with `sim://` a server process, of its own; requests of one step travel
     concurrently from one event loop in a background thread. `infos` carries `step_count`, `sim_time` and `restarts`
     as arrays, and `error` where something failed (see `Vectorized`). A failed or too slow environment loses its
-    client, and for `sim://` its server with it, and gets new ones at its next reset.
+    client, and for `sim://` its server with it. New ones are started meanwhile, and the environment is back with the
+    first reset that finds them ready within `step_timeout`; the others are never held up for longer than that.
+
+    As many servers start at once as there are processors, so that many come up one after another.
     """
 
     def __init__(
@@ -90,9 +149,13 @@ class URLabVectorEnv(Vectorized):
         max_episode_steps: int | None = None,
         cameras: Sequence[str] = (),
         n_substeps: int = 1,
-        reset_noise: float = 0.0,
+        reset_noise: float | ResetNoise = 0.0,
+        keyframe: str | None = None,
+        render_mode: Literal["rgb_array"] | None = None,
+        render_camera: str | None = None,
         autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
         step_timeout: float = 10.0,
+        start_timeout: float = 60.0,
         client_options: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
         """Start the sessions.
@@ -109,8 +172,12 @@ class URLabVectorEnv(Vectorized):
             cameras: See `URLabEnv`.
             n_substeps: See `URLabEnv`.
             reset_noise: See `URLabEnv`.
+            keyframe: See `URLabEnv`.
+            render_mode: None or `rgb_array`, with which every step draws a picture of each environment.
+            render_camera: Camera that `render` shows; the first one of the scene by default.
             autoreset_mode: `NEXT_STEP`, `SAME_STEP` or `DISABLED`.
             step_timeout: Seconds an environment may take for a step or reset.
+            start_timeout: Seconds a server may take to start, each counted from its own start.
             client_options: Further options of the clients.
 
         Raises:
@@ -125,19 +192,27 @@ class URLabVectorEnv(Vectorized):
             addresses = [addresses] * num_envs
         if num_envs not in (None, len(addresses)) or not addresses:
             raise ValueError(f"num_envs is {num_envs}, but there are {len(addresses)} addresses")
-        if step_timeout <= 0:
-            raise ValueError(f"step_timeout must be above 0 seconds, not {step_timeout}")
+        for name, seconds in (("step_timeout", step_timeout), ("start_timeout", start_timeout)):
+            if seconds <= 0:
+                raise ValueError(f"{name} must be above 0 seconds, not {seconds}")
         episode_options = {
             "space_mode": space_mode,
             "observations": observations,
             "cameras": tuple(cameras),
-            "rendered": (),
             "n_substeps": n_substeps,
-            "reset_noise": reset_noise,
+            "reset_noise": noise_of(reset_noise),
+            "keyframe": keyframe,
         }
         self._step_timeout = step_timeout
-        client_options = {"step_mode": "direct", **client_options}
-        self._sessions = [_Session(address, client_options, episode_options) for address in addresses]
+        self._addresses = tuple(addresses)
+        client_options = client_defaults(client_options)
+        check_render_mode(render_mode)
+        rendered = None if render_mode is None else _Rendered(render_camera)
+        starts = asyncio.Semaphore(_processors())
+        self._sessions = [
+            _Session(with_start_timeout(address, start_timeout), starts, client_options, episode_options, rendered)
+            for address in addresses
+        ]
         self._portal = Portal()
         try:
             first = self._portal.call(self._open_all)
@@ -153,8 +228,29 @@ class URLabVectorEnv(Vectorized):
             max_episode_steps=max_episode_steps,
             autoreset_mode=autoreset_mode,
         )
+        self.render_mode = render_mode
+        self._pictures: dict[int, NDArray[np.uint8]] = {}
         self._sim_time = np.zeros(self.num_envs)
         self._step_count = np.zeros(self.num_envs, dtype=np.int64)
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Return each environment's picture of the last reset or step, shape (H, W, 3), RGB; None without a mode.
+
+        An environment that failed shows its last picture, or black before its first.
+
+        Raises:
+            gymnasium.error.ResetNeeded: There was no reset yet.
+        """
+        if self.render_mode is None:
+            return None
+        for i, session in enumerate(self._sessions):
+            episode = session.episode
+            if episode is not None and session.shown and session.shown[0] in episode.frames:
+                self._pictures[i] = np.array(episode.frames[session.shown[0]][..., :3], dtype=np.uint8)
+        if not self._pictures:
+            raise gymnasium.error.ResetNeeded("call reset() before render()")
+        black = np.zeros_like(next(iter(self._pictures.values())))
+        return tuple(self._pictures.get(i, black) for i in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the clients, and the servers they started."""
@@ -162,29 +258,31 @@ class URLabVectorEnv(Vectorized):
 
     async def _open_all(self) -> EnvEpisode:
         found = await asyncio.gather(*(session.open() for session in self._sessions), return_exceptions=True)
-        for i, episode in enumerate(found):
-            if isinstance(episode, BaseException):
-                raise URLabError(f"Environment {i} at {self._sessions[i].address}: {episode}") from episode
+        for i, failure in enumerate(found):
+            if failure is not None:
+                raise URLabError(f"Environment {i} at {self._addresses[i]}: {failure}") from failure
         episodes = [session.episode for session in self._sessions if session.episode is not None]
         spaces = [(e.mapping.action_space, e.observation_space) for e in episodes]
         for i, pair in enumerate(spaces):
             if pair != spaces[0]:
-                raise ValueError(f"environment {i} at {self._sessions[i].address} has other spaces than environment 0")
+                raise ValueError(f"environment {i} at {self._addresses[i]} has other spaces than environment 0")
         return episodes[0]
 
     async def _close_all(self) -> None:
         await asyncio.gather(*(session.close() for session in self._sessions), return_exceptions=True)
 
-    def _reset_some(self, indices: Indices, keyframe: str | None) -> tuple[Observation, Mapping[int, Exception]]:
+    def _reset_some(self, indices: Indices, keyframe: str | None) -> Found:
         timeout = self._step_timeout
-        return self._gather(
-            {i: partial(self._sessions[i].reset, self._rngs[i], keyframe, timeout) for i in map(int, indices)}
-        )
+        calls = {i: partial(self._sessions[i].reset, self._rngs[i], keyframe, timeout) for i in map(int, indices)}
+        return self._found(self._portal.call(self._all, calls))
 
-    def _step_some(self, indices: Indices, actions: Any) -> tuple[Observation, Mapping[int, Exception]]:
+    def _reset_and_step(self, fresh: Indices, acting: Indices, actions: Any) -> tuple[Found, Found]:
         each = list(iterate(self.action_space, actions))
-        timeout = self._step_timeout
-        return self._gather({i: partial(self._sessions[i].step, each[i], timeout) for i in map(int, indices)})
+        timeout, sessions = self._step_timeout, self._sessions
+        resets = {i: partial(sessions[i].reset, self._rngs[i], self._keyframe, timeout) for i in map(int, fresh)}
+        steps = {i: partial(sessions[i].step, each[i], timeout) for i in map(int, acting)}
+        results = self._portal.call(self._all, {**resets, **steps})
+        return self._found({i: results[i] for i in resets}), self._found({i: results[i] for i in steps})
 
     def _clocks(self) -> dict[str, NDArray[Any]]:
         for i, session in enumerate(self._sessions):
@@ -194,10 +292,9 @@ class URLabVectorEnv(Vectorized):
         restarts = np.array([session.restarts for session in self._sessions], dtype=np.int64)
         return {"sim_time": self._sim_time.copy(), "step_count": self._step_count.copy(), "restarts": restarts}
 
-    def _gather(
-        self, calls: Mapping[int, Callable[[], Coroutine[Any, Any, Observation]]]
-    ) -> tuple[Observation, Mapping[int, Exception]]:
-        results = self._portal.call(self._all, calls)
+    def _found(self, results: Mapping[int, Observation | Exception]) -> Found:
+        if not results:
+            return None, {}
         errors = {i: result for i, result in results.items() if isinstance(result, Exception)}
         single = self.single_observation_space
         rows = [
@@ -211,17 +308,18 @@ class URLabVectorEnv(Vectorized):
         results: dict[int, T | Exception] = {}
         for i, result in zip(calls, found, strict=True):
             if isinstance(result, TimeoutError) and not isinstance(result, URLabError):
-                results[i] = TimeoutError(f"environment {i} did not answer within {self._step_timeout:g} s")
+                what = "did not answer" if self._sessions[i].episode else "is still being started"
+                results[i] = TimeoutError(f"environment {i} {what} within {self._step_timeout:g} s")
             elif isinstance(result, Exception):
-                result.add_note(f"environment {i} at {self._sessions[i].address}")
+                result.add_note(f"environment {i} at {self._addresses[i]}")
                 results[i] = result
             elif isinstance(result, BaseException):
                 raise result
             else:
                 results[i] = result
-        await asyncio.gather(
-            *(self._sessions[i].close() for i, result in results.items() if isinstance(result, Exception))
-        )
+        for i, result in results.items():
+            if isinstance(result, Exception):
+                self._sessions[i].reopen()
         return results
 
 

@@ -15,11 +15,13 @@ from numpy.typing import NDArray
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn, keyframe_option
 from urlab_client.integrations.gym.spaces import Observation, Space, SpaceMapping
 
-__all__ = ["Vectorized"]
+__all__ = ["Bools", "Floats", "Found", "Indices", "Vectorized", "check_render_mode"]
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
+Found = tuple[Observation, Mapping[int, Exception]]
+"""Observations of some environments in a batch, and what failed, by index."""
 
 
 class Vectorized(VectorEnv[Observation, Any, Any], ABC):
@@ -38,6 +40,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         autoreset_mode: What happens to environments whose episode ended.
     """
 
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012 - Gymnasium's
     mapping: SpaceMapping
     observation_space: Space
     action_space: Space
@@ -74,12 +77,12 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         self._rngs = [np.random.default_rng() for _ in range(num_envs)]
 
     @abstractmethod
-    def _reset_some(self, indices: Indices, keyframe: str | None) -> tuple[Observation, Mapping[int, Exception]]:
-        """Reset some environments; return their observations in a batch, and what failed by index."""
+    def _reset_some(self, indices: Indices, keyframe: str | None) -> Found:
+        """Reset some environments."""
 
     @abstractmethod
-    def _step_some(self, indices: Indices, actions: Any) -> tuple[Observation, Mapping[int, Exception]]:
-        """Step some environments, given the actions of all; return as `_reset_some` does."""
+    def _reset_and_step(self, fresh: Indices, acting: Indices, actions: Any) -> tuple[Found, Found]:
+        """Reset some environments into `_keyframe` and step others, given the actions of all."""
 
     @abstractmethod
     def _clocks(self) -> dict[str, NDArray[Any]]:
@@ -132,11 +135,12 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         fresh = np.flatnonzero(self._ended) if next_step else np.zeros(0, dtype=np.intp)
         acting = np.setdiff1d(np.arange(self.num_envs), fresh)
         before = self._copied()
-        errors: Mapping[int, Exception] = self._start(fresh) if len(fresh) else {}
+        started, moved = self._reset_and_step(fresh, acting, actions)
+        if len(fresh):
+            self._took(fresh, started)
         if len(acting):
-            found, failed = self._step_some(acting, actions)
-            _put(self._observations, acting, found)
-            errors = {**errors, **failed}
+            _put(self._observations, acting, moved[0])
+        errors = {**started[1], **moved[1]}
         self._elapsed[acting] += 1
         infos = self._infos(errors)
         stepped = np.zeros(self.num_envs, dtype=bool)
@@ -153,12 +157,16 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         return self._copied(), rewards, terminated, truncated, infos
 
     def _start(self, indices: Indices) -> Mapping[int, Exception]:
-        found, errors = self._reset_some(indices, self._keyframe)
-        _put(self._observations, indices, found)
+        found = self._reset_some(indices, self._keyframe)
+        self._took(indices, found)
+        return found[1]
+
+    def _took(self, indices: Indices, found: Found) -> None:
+        observations, errors = found
+        _put(self._observations, indices, observations)
         self._elapsed[indices] = 0
         self._ended[indices] = False
         self._ended[list(errors)] = True
-        return errors
 
     def _judge(self, before: Observation, actions: Any, stepped: Bools, infos: dict[str, Any]) -> tuple[Floats, Bools]:
         rewards = np.zeros(self.num_envs)
@@ -194,6 +202,16 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
 
     def _copied(self) -> Observation:
         return _map(np.copy, self._observations)
+
+
+def check_render_mode(render_mode: str | None) -> None:
+    """Refuse what is not a render mode.
+
+    Raises:
+        ValueError: It is neither None nor `rgb_array`.
+    """
+    if render_mode not in (None, "rgb_array"):
+        raise ValueError(f"render_mode must be None or 'rgb_array', not {render_mode!r}")
 
 
 def _errors_in(infos: dict[str, Any]) -> dict[int, Exception]:

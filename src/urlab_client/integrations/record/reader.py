@@ -27,6 +27,7 @@ from urlab_client.integrations._feed.messages import (
     RawImage,
     schema_name,
 )
+from urlab_client.integrations._feed.quantities import component_name, quantities
 from urlab_client.integrations._feed.scene_messages import SceneLayout, from_metadata
 from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.protocol.base import Floats
@@ -129,10 +130,14 @@ class Column:
     Attributes:
         names: Name of each value.
         values: Shape (samples, values); NaN where a sample has none.
+        quantities: What each value measures, with its unit: `angle (rad)`, `linear acceleration (m/s²)`.
+        labels: Names for people: as `names`, but `imu.x` where that has `imu.0`.
     """
 
     names: list[str]
     values: Floats
+    quantities: list[str]
+    labels: list[str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -467,4 +472,7 @@ def _column(builder: _Builder, name: str, rows: list[list[_Number]], order: dict
         **builder.names,
     }
     names = known.get(name, [])
-    return Column(names if len(names) == width else [str(i) for i in range(width)], values)
+    if len(names) != width:
+        names = [str(i) for i in range(width)]
+    labels = [component_name(layout, value) for value in names] if name == "sensors" else names
+    return Column(names, values, quantities(layout, name, names), labels)

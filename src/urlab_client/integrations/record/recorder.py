@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import os
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -19,6 +21,8 @@ from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
 
 __all__ = ["AsyncRecorder", "Recorder", "record"]
+
+log = logging.getLogger("urlab_client.record")
 
 _MIB = 1 << 20
 _LIVE_ITEMS = 10_000
@@ -64,13 +68,19 @@ class AsyncRecorder:
         """Whether writing has failed; leaving the block raises the reason."""
         return self._writer is not None and self._writer.error is not None
 
+    @property
+    def without_pictures(self) -> list[str]:
+        """Cameras to record that have no picture in the file up to now."""
+        there = frozenset[str]() if self._writer is None else self._writer.cameras
+        return [name for name in self._follower.cameras if name not in there]
+
     async def __aenter__(self) -> Self:
         if self._writer is not None:
             raise URLabError("A recorder records once.", hint="Call record() again.")
         self._follower.check()
         self._writer = WriterThread(self._path, self._options())
         await anyio.to_thread.run_sync(self._writer.open)
-        self._follower.start(self._writer.put)
+        self._follower.start(self._writer.put, room=self._writer.room, lost=self._writer.lose_frames)
         return self
 
     async def __aexit__(
@@ -88,6 +98,17 @@ class AsyncRecorder:
         except URLabError:
             if exc is None:
                 raise  # else it has been logged, and what ends the block matters more
+            return
+        stats = writer.stats
+        if missing := self.without_pictures:
+            log.warning(
+                "%s: no picture of %s came. A server without OpenGL sends none; its own log says so.",
+                self._path,
+                ", ".join(missing),
+            )
+        elif stats.dropped_states or stats.dropped_frames:
+            lost = f"{stats.dropped_states} states and {stats.dropped_frames} pictures"
+            warnings.warn(f"{self._path}: {lost} were lost, see /recording/gaps in it.", stacklevel=2)
 
     def finish(self) -> None:
         """Finish the file when the client's loop is gone already. Blocks."""
@@ -114,6 +135,11 @@ class Recorder(BlockingTwin[AsyncRecorder]):
         """Whether writing has failed; leaving the block raises the reason."""
         return self._aio.failed
 
+    @property
+    def without_pictures(self) -> list[str]:
+        """Cameras to record that have no picture in the file up to now."""
+        return self._aio.without_pictures
+
 
 @overload
 def record(
@@ -126,6 +152,7 @@ def record(
     jpeg_quality: int = ...,
     pose_hz: float = ...,
     contacts: bool = ...,
+    lossless: bool = ...,
     buffer_mib: float = ...,
     overwrite: bool = ...,
 ) -> AsyncRecorder: ...
@@ -140,6 +167,7 @@ def record(
     jpeg_quality: int = ...,
     pose_hz: float = ...,
     contacts: bool = ...,
+    lossless: bool = ...,
     buffer_mib: float = ...,
     overwrite: bool = ...,
 ) -> Recorder: ...
@@ -153,15 +181,17 @@ def record(
     jpeg_quality: int = 90,
     pose_hz: float = 50.0,
     contacts: bool = False,
+    lossless: bool = True,
     buffer_mib: float = 64.0,
     overwrite: bool = False,
 ) -> AsyncRecorder | Recorder:
     """Record what a client goes through into an MCAP file: a context manager, of the client's own flavour.
 
     In `direct` and `puppet` mode every reply of `step`, `reset` and `forward` is one state, whoever made the call; in
-    `live` mode every snapshot that the server publishes is, unless time stands still. A thread encodes and writes;
-    stepping never waits for it. When it falls behind by `buffer_mib`, states are dropped, and by half of that,
-    pictures; what was dropped is counted in `stats` and in the file.
+    `live` mode every snapshot that the server publishes is, unless time stands still. A thread encodes and writes. When
+    it falls behind by half of `buffer_mib`, a step in `direct` or `puppet` mode waits before it is sent, and nothing is
+    lost. In `live` mode, which cannot wait, and with `lossless=False` pictures are dropped then, and states when all of
+    `buffer_mib` waits. What was lost is counted in `stats` and in the file, and leaving the block warns of it.
 
     Args:
         client: A client after `discover()`, during play.
@@ -173,6 +203,7 @@ def record(
         jpeg_quality: 1 to 95.
         pose_hz: Sets of poses and joint states per second of simulation time, for 3D views; 0 for none.
         contacts: Keep contacts with each set of poses, computed from the state with the client's own model.
+        lossless: Let steps wait rather than drop anything, where nothing is live.
         buffer_mib: MiB that may wait to be written.
         overwrite: Replace a file that exists.
 
@@ -199,6 +230,7 @@ def record(
             buffer_bytes=round(buffer_mib * _MIB),
             flush_s=_FLUSH_S,
             overwrite=overwrite,
+            lossless=lossless,
             about={
                 "address": core.address,
                 "step_mode": str(core.step_mode),

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.integrations.record.reader import Column, Table
+from urlab_client.integrations.record.reader import Table
 
 __all__ = ["transitions"]
 
@@ -28,10 +28,10 @@ def transitions(table: Table) -> Table:
     if not keys:
         return table
     acted = np.flatnonzero((np.diff(table.episode) == 0) & (np.diff(table.sim_time) > 0))
-    columns = {key: Column(column.names, column.values[acted]) for key, column in table.columns.items()}
+    columns = {key: replace(column, values=column.values[acted]) for key, column in table.columns.items()}
     for key in keys:
         led = table.columns[key + _SET_POINTS]
-        columns[f"{key}/action"] = Column(led.names, led.values[acted + 1])
+        columns[f"{key}/action"] = replace(led, values=led.values[acted + 1])
     return _rows(replace(table, columns=columns), acted)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import io
 import logging
@@ -45,6 +46,7 @@ FORMAT = "1"
 """Version of what is in a recording."""
 
 _WAKE_S = 0.02  # in batches: a thread that wakes for each state would take the interpreter from who steps each time
+_STALL_S = 30.0
 _CHUNK_BYTES = 1 << 20
 _STATE_BYTES = 1 << 10  # what a state is taken to occupy besides its arrays
 
@@ -65,6 +67,7 @@ class WriterOptions:
         buffer_bytes: What may wait.
         flush_s: Seconds after which a chunk is written even if it is not full.
         overwrite: Whether the file may exist.
+        lossless: Whether what can wait for room does.
         about: Metadata.
     """
 
@@ -75,6 +78,7 @@ class WriterOptions:
     buffer_bytes: int
     flush_s: float
     overwrite: bool
+    lossless: bool
     about: Mapping[str, str]
 
 
@@ -85,7 +89,7 @@ class RecorderStats(Struct, kw_only=True, frozen=True):
         states: States written.
         frames: Pictures written.
         dropped_states: States that found the queue full, or came after a failure.
-        dropped_frames: Likewise pictures.
+        dropped_frames: Likewise pictures, and those that were due and that the server did not send.
         waiting_bytes: What waits to be written, about.
         file_bytes: Bytes written to the file.
     """
@@ -114,6 +118,7 @@ class WriterThread:
         # Each number has one writer, so no lock: the producer adds, the thread takes away.
         self._put_bytes = self._taken_bytes = 0
         self._dropped_states = self._dropped_frames = 0
+        self._stalled = False
         self._file: _McapFile | None = None
         self._sink: _Sink | None = None
         self._stop = threading.Event()
@@ -146,19 +151,48 @@ class WriterThread:
             file_bytes=file.written if file else 0,
         )
 
+    @property
+    def cameras(self) -> frozenset[str]:
+        """Names of the cameras that have a picture in the file."""
+        return frozenset(self._sink.cameras) if self._sink else frozenset()
+
     def put(self, item: State | CameraPicture) -> None:
-        """Queue an item, or drop it: pictures give way at half the queue's size, so that states find room."""
+        """Queue an item, or drop it: pictures give way at half the queue's size, so that states find room.
+
+        Without losses an item whose sender waits for room is always queued.
+        """
         size = _size(item)
         limit, waiting = self._options.buffer_bytes, self._put_bytes - self._taken_bytes
+        kept = self._options.lossless and item.waits and not self._stalled
         if isinstance(item, State):
-            if self.error is not None or waiting + size > limit:
+            if self.error is not None or (not kept and waiting + size > limit):
                 self._dropped_states += 1
                 return
-        elif self.error is not None or waiting + size > limit // 2:
+        elif self.error is not None or (not kept and waiting + size > limit // 2):
             self._dropped_frames += 1
             return
         self._put_bytes += size
         self._queue.append((item, size))
+
+    def lose_frames(self, count: int) -> None:
+        """Count pictures that never came; from the thread that calls `put`."""
+        self._dropped_frames += count
+
+    async def room(self) -> None:
+        """Wait until half of the queue is free. A disk that takes nothing for 30 s is waited for no longer."""
+        if not self._options.lossless or self._stalled:
+            return
+        half, taken, rest = self._options.buffer_bytes // 2, self._taken_bytes, _STALL_S
+        while self.error is None and self._put_bytes - self._taken_bytes > half:
+            await asyncio.sleep(_WAKE_S)
+            rest = _STALL_S if self._taken_bytes != taken else rest - _WAKE_S
+            taken = self._taken_bytes
+            if rest <= 0:
+                self._stalled = True
+                log.warning(
+                    "%s: nothing could be written for %g s: from now on states are dropped", self.path, _STALL_S
+                )
+                return
 
     def end(self) -> None:
         """Let the thread write what waits and finish the file, without waiting for that."""
@@ -259,6 +293,7 @@ class _Sink:
     options: WriterOptions
     states: int = 0
     frames: int = 0
+    cameras: set[str] = field(default_factory=set[str])
     _clock: SampleClock = field(default_factory=SampleClock)
     _schemas: dict[type[Struct], int] = field(default_factory=dict[type[Struct], int])
     _topics: dict[tuple[str, str], _Topic] = field(default_factory=dict[tuple[str, str], _Topic])
@@ -364,6 +399,7 @@ class _Sink:
         self._add(topic, picture_message(item, stamp, quality), now, item.wall_ns, metadata)
         self._add(f"{topic}/calibration", calibration(camera, stamp), now, item.wall_ns, {})
         self.frames += 1
+        self.cameras.add(camera.name)
 
     def _use(self, scene: SceneMessages) -> None:
         self._scene = scene

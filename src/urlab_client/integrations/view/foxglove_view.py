@@ -91,7 +91,10 @@ class _Foxglove:
                 message_backlog_size=_BACKLOG,
             )
         except RuntimeError as error:
-            raise URLabError(f"foxglove_view: port {self._port} of {self._host} cannot be used: {error}") from None
+            raise URLabError(
+                f"foxglove_view: port {self._port} of {self._host} cannot be used: {error}",
+                hint="Another program may hold it; port=0 (--port 0) takes any free one.",
+            ) from None
 
     def use(self, simulation: Simulation, scene: SceneMessages) -> None:
         """See `ViewBackend`."""

@@ -6,7 +6,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Final
 
-__all__ = ["BUNDLED_PREFIX", "bundled_models", "bundled_root"]
+from urlab_client.protocol.names import did_you_mean
+
+__all__ = ["BUNDLED_PREFIX", "bundled_models", "bundled_root", "unknown_model"]
 
 BUNDLED_PREFIX: Final = "bundled:"
 """How a saved level names a bundled model, whose path differs from machine to machine."""
@@ -21,3 +23,9 @@ def bundled_root() -> Path:
 def bundled_models() -> dict[str, Path]:
     """Return the bundled MJCF files by name, sorted: `arm`, `ball`, `floor`, `pallet`, `quadruped`."""
     return {file.stem: file for file in sorted(bundled_root().glob("*.xml"))}
+
+
+def unknown_model(name: str) -> str:
+    """Return what to say of a name that is neither a file nor a bundled robot."""
+    known = bundled_models()
+    return f"{name} is neither a file nor a bundled robot.{did_you_mean(name, known)} Bundled: {', '.join(known)}."

@@ -17,6 +17,7 @@ import hashlib
 import logging
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
@@ -220,7 +221,7 @@ class ContentRoot:
             raise Refusal("import_failed", f"no bundled model is called '{name}': use {', '.join(bundled)}")
         try:
             candidates = self._candidates(path, trusted=trusted)
-            file = next((candidate for candidate in candidates if candidate.is_file()), None)
+            file = next(filter(_is_file, candidates), None)
         except (OSError, ValueError) as error:  # too long, a null byte, a loop of links
             raise Refusal("import_failed", f"{path!r} is not a usable path: {error}") from None
         if file is not None:
@@ -281,6 +282,7 @@ class ContentRoot:
             sensors=compiled.sensors,
             cameras=compiled.cameras,
             n_bytes=compiled.n_bytes,
+            n_asset_bytes=compiled.n_asset_bytes,
             n_data_bytes=compiled.n_data_bytes,
             n_sensor_values=compiled.n_sensor_values,
         )
@@ -310,6 +312,14 @@ class ContentRoot:
             if stale.is_dir() and stale not in keep and not stale.name.startswith("."):
                 shutil.rmtree(stale, ignore_errors=True)
         return blueprint
+
+
+def _is_file(path: Path) -> bool:
+    """Whether there is such a file; unlike `Path.is_file` of Python 3.14, a path that cannot be one is an error."""
+    try:
+        return stat.S_ISREG(path.stat().st_mode)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
 
 
 def _warn_if_stale(known: Blueprint, source: str, text: bytes) -> None:

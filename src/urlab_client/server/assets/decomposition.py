@@ -13,14 +13,19 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ADVICE", "Part", "convex_parts", "is_available"]
+from urlab_client._installation import install_command
+
+__all__ = ["Part", "advice", "convex_parts", "is_available"]
 
 Part = tuple[NDArray[np.float64], NDArray[np.int32]]
 """Vertices, shape (n, 3), and triangles, shape (m, 3), of one convex part, in the frame of the file."""
 
-ADVICE: Final = "complex_mesh needs convex decomposition, which comes with pip install 'urlab-client[coacd]'"
-
 _REMEMBERED: Final = 64
+
+
+def advice() -> str:
+    """Return what to say where CoACD is missing."""
+    return f"complex_mesh needs convex decomposition; install it on the server: {install_command('coacd')}"
 
 
 def is_available() -> bool:
@@ -40,7 +45,7 @@ def convex_parts(file: Path, threshold: float) -> tuple[Part, ...]:
         OSError: The file cannot be read.
     """
     if not is_available():
-        raise ValueError(ADVICE)
+        raise ValueError(advice())
     digest = hashlib.sha256(file.read_bytes()).hexdigest()
     return _decompose(digest, min(max(threshold, 0.01), 1.0), str(file))
 

@@ -23,7 +23,7 @@ from urlab_client.server.assets.actors import ORIGIN, UNIT_SCALE, Actor, ActorKi
 from urlab_client.server.assets.blueprint import Blueprint, sanitized
 from urlab_client.server.assets.bundled_robots import BUNDLED_PREFIX
 from urlab_client.server.assets.content import ContentRoot
-from urlab_client.server.assets.decomposition import ADVICE, is_available
+from urlab_client.server.assets.decomposition import advice, is_available
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.system.atomic_write import write_atomic
 
@@ -302,7 +302,7 @@ def _check_mesh(mesh: Mesh, convert: ConversionSettings | None) -> None:
     if mesh.shape == "plane" and convert is not None and not convert.static:
         raise ValueError("a plane cannot move: its 'quick_convert' must be static")
     if convert is not None and convert.complex_mesh and not is_available():
-        raise ValueError(ADVICE)
+        raise ValueError(advice())
 
 
 def _check_parents(path: Path, actor: Actor, actors: Mapping[str, Actor]) -> None:

@@ -9,14 +9,13 @@ Positions are metres and rotations quaternions (x, y, z, w), both in MuJoCo's wo
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
-from pathlib import Path
-from typing import Final, Literal, NamedTuple
+from typing import NamedTuple
 
 from urlab_client.protocol.base import Quat, Vec3
 from urlab_client.protocol.rotation import IDENTITY, euler_to_quat, swap_frame
-from urlab_client.protocol.scene_types import ActorBounds, ActorHierarchyNode, BlueprintInfo
+from urlab_client.protocol.scene_types import ActorBounds, ActorHierarchyNode
 from urlab_client.server.assets.actors import (
     ORIGIN,
     UNIT_SCALE,
@@ -27,20 +26,18 @@ from urlab_client.server.assets.actors import (
     Mesh,
     scene_problem,
 )
-from urlab_client.server.assets.blueprint import PARENT_CLASS, Blueprint, sanitized
+from urlab_client.server.assets.blueprint import Blueprint
 from urlab_client.server.assets.content import ContentRoot
-from urlab_client.server.assets.decomposition import ADVICE, is_available
-from urlab_client.server.assets.level import LevelError, read_level, write_level
-from urlab_client.server.assets.package_names import level_package
 from urlab_client.server.compile.bounds import actor_bounds
 from urlab_client.server.compile.failure import CompileFailed
 from urlab_client.server.editor import checks
+from urlab_client.server.editor.blueprints import Blueprints
+from urlab_client.server.editor.level_actors import ActorNames, LevelActors, match_actor
+from urlab_client.server.editor.levels import Levels
+from urlab_client.server.editor.quick_convert import QuickConvert
 from urlab_client.server.refusal import Refusal
 
 __all__ = ["Actor", "ActorKind", "ActorNames", "ConversionSettings", "EditorWorld", "Light", "Mesh", "Placed"]
-ActorNames = Literal["model", "plugin"]
-
-UNTITLED: Final = "/Temp/Untitled_1"
 
 
 class Placed(NamedTuple):
@@ -64,7 +61,9 @@ class EditorWorld:
         content: The content root.
         pie_running: Whether a play session runs; whoever starts and stops it sets this. While it is true, the ops that
             look at the play world see the actors as of the last `freeze`, and levels cannot be replaced or saved.
-        selected: Name of the selected actor; empty without a selection.
+        levels: The level files; which one is open.
+        blueprints: What was imported.
+        quick_convert: Static meshes that become bodies.
     """
 
     def __init__(self, content: ContentRoot, *, actor_names: ActorNames = "model") -> None:
@@ -77,181 +76,31 @@ class EditorWorld:
         """
         self.content = content
         self.pie_running = False
-        self.selected = ""
-        self._naming = actor_names
-        self._actors: dict[str, Actor] = {}
-        self._package = UNTITLED
-        self._external: dict[str, Path] = {}
+        self._actors = LevelActors(actor_names)
+        self.levels = Levels(content, self._actors, lambda: self.pie_running)
+        self.blueprints = Blueprints(content, self._actors, self.levels)
+        self.quick_convert = QuickConvert(self._actors)
         self._frozen: tuple[Actor, ...] = ()
-
-    # Content
-
-    def import_xml(self, path: str, *, force_reimport: bool = False, trusted: bool = False) -> tuple[Blueprint, bool]:
-        """Import an MJCF file; see `ContentRoot.import_xml`. Actors of a blueprint imported again use it at next play.
-
-        Returns:
-            The blueprint, and whether it was imported now.
-
-        Raises:
-            Refusal: `missing_field`, `import_failed`.
-        """
-        blueprint, imported_now = self.content.import_xml(path, force_reimport=force_reimport, trusted=trusted)
-        self._refresh(blueprint)
-        return blueprint, imported_now
-
-    def import_uploaded(self, document: Path) -> Blueprint:
-        """Import a model that a client has sent; see `ContentRoot.import_uploaded`.
-
-        Raises:
-            Refusal: `import_failed`.
-        """
-        blueprint = self.content.import_uploaded(document)
-        self._refresh(blueprint)
-        return blueprint
-
-    def list_blueprints(self) -> list[BlueprintInfo]:
-        """Return the imported blueprints, sorted by short name."""
-        return [
-            BlueprintInfo(
-                class_path=item.class_path,
-                short_name=item.short_name,
-                package_path=item.package_path,
-                parent_class=PARENT_CLASS,
-            )
-            for item in sorted(self.content.blueprints.values(), key=lambda item: item.short_name)
-        ]
-
-    def destroy_asset(self, asset_path: str) -> bool:
-        """Delete a blueprint or a level and return whether there was one.
-
-        Args:
-            asset_path: Object path (`/Game/Levels/lab.lab`) or package path.
-
-        Raises:
-            Refusal: `missing_field`; `destroy_asset_failed` if actors of the open level use the blueprint, or the asset
-                cannot be deleted.
-        """
-        checks.require(asset_path, "asset_path")
-        package, dot, name = asset_path.rpartition(".")
-        if not dot:
-            package = asset_path
-        elif name != package.rpartition("/")[2]:
-            return False
-        try:
-            for blueprint in self.content.blueprints.values():
-                if blueprint.package_path == package:
-                    self._destroy_blueprint(blueprint)
-                    return True
-            return self._destroy_level(package)
-        except OSError as error:
-            raise Refusal("destroy_asset_failed", f"cannot delete {asset_path}: {error}") from None
-
-    # Levels
-
-    def create_level(self, name: str, *, force_overwrite: bool = False) -> str:
-        """Create an empty level, save it, make it the open one and return its path. It has no manager yet.
-
-        Raises:
-            Refusal: `missing_field`; `create_level_failed` if play runs, the name is unusable, the level exists, or it
-                cannot be written.
-        """
-        checks.require(name, "name")
-        code = "create_level_failed"
-        self._refuse_during_play(code)
-        package, file = self._locate_level(name, code)
-        if file.exists():
-            if not force_overwrite:
-                raise Refusal(code, f"{package} exists: load it, or pass force_overwrite to replace it")
-            if package in self._external:
-                raise Refusal(code, f"{package} is {file}, outside the content root: it is not overwritten")
-        try:
-            write_level(file, (), self.content)
-        except OSError as error:
-            raise Refusal(code, f"cannot write {file}: {error.strerror or error}") from None
-        self._open(package, {})
-        return package
-
-    def load_level(self, name: str) -> str:
-        """Open a level by name or path and return its path; unsaved edits of the open one are lost.
-
-        Raises:
-            Refusal: `missing_field`; `load_level_failed` if play runs, or the level is missing or unusable.
-        """
-        checks.require(name, "level_path")
-        code = "load_level_failed"
-        self._refuse_during_play(code)
-        package, file = self._locate_level(name, code)
-        if not file.is_file():
-            raise Refusal(code, f"there is no level {package} (no file {file})")
-        self._load(package, file, trusted=package in self._external)
-        return package
-
-    def load_level_file(self, path: Path) -> str:
-        """Open a level file that whoever runs the server named, and return the level's path.
-
-        It may lie anywhere; `save_level` then writes to that file. Models it names are imported from where it says.
-
-        Raises:
-            Refusal: `load_level_failed`.
-        """
-        code = "load_level_failed"
-        self._refuse_during_play(code)
-        file = path.resolve()
-        if file.is_relative_to(self.content.root) and file.suffix == ".json":
-            name = f"/Game/{file.relative_to(self.content.root).with_suffix('').as_posix()}"
-            package, file = self._locate_level(name, code)
-            self._load(package, file, trusted=True)
-            return package
-        package = f"/Game/Levels/{sanitized(file.stem)}"
-        self._load(package, file, trusted=True)
-        self._external[package] = file
-        return package
-
-    def save_level(self) -> str:
-        """Save the open level and return its path.
-
-        Raises:
-            Refusal: `save_level_failed` if play runs, the level never had a path, or it cannot be written.
-        """
-        code = "save_level_failed"
-        self._refuse_during_play(code)
-        if self._package == UNTITLED:
-            raise Refusal(code, "the open level has no name yet: create one with create_level first")
-        _, file = self._locate_level(self._package, code)
-        try:
-            write_level(file, self._actors.values(), self.content)
-        except OSError as error:
-            raise Refusal(code, f"cannot write {file}: {error.strerror or error}") from None
-        return self._package
-
-    def current_level(self) -> str:
-        """Return the path of the open level, also during play; `/Temp/Untitled_1` before one is created or loaded."""
-        return self._package
-
-    def shown_level(self) -> str:
-        """Return the path of the world that `snapshot` shows: in play the level's name has Unreal's prefix."""
-        if not self.pie_running:
-            return self._package
-        folder, _, name = self._package.rpartition("/")
-        return f"{folder}/UEDPIE_0_{name}"
 
     def authored(self) -> object:
         """Return something that compares equal for as long as no level, actor or blueprint was changed."""
-        return self._package, tuple(self._actors.values()), dict(self._external), dict(self.content.blueprints)
+        return self.levels.package, tuple(self._actors), dict(self.levels.external), dict(self.content.blueprints)
 
     # Actors
 
     def ensure_manager(self) -> tuple[Actor, bool]:
         """Return the level's manager, which play needs, and whether there was one already."""
-        for actor in self._actors.values():
-            if actor.kind is ActorKind.MANAGER:
-                return actor, True
-        return self._add(Actor(name=self._numbered("AMjManager"), label="", kind=ActorKind.MANAGER)), False
+        manager = self._actors.first(ActorKind.MANAGER)
+        if manager is not None:
+            return manager, True
+        return self._actors.add(
+            Actor(name=self._actors.numbered("AMjManager"), label="", kind=ActorKind.MANAGER)
+        ), False
 
     @property
     def has_manager(self) -> bool:
         """Whether the open level has a manager actor."""
-        return any(actor.kind is ActorKind.MANAGER for actor in self._actors.values())
+        return self._actors.first(ActorKind.MANAGER) is not None
 
     def spawn_actor(
         self,
@@ -279,11 +128,11 @@ class EditorWorld:
         """
         checks.require(blueprint, "blueprint")
         code = "spawn_failed"
-        found = self._blueprint(blueprint, code)
+        found = self.blueprints.blueprint(blueprint, code)
         checks.refuse_scale(scale, code)
         understood = checks.rotation(rotation_quat, rotation_euler, code)
         pose = checks.pose(location, understood if understood is not None else IDENTITY, code)
-        existing = self._of_class(actor_id, found.class_name, code)
+        existing = self._actors.of_class(actor_id, found.class_name, code)
         self._make_room(existing is None, found, code)
         return self._place(found, actor_id, existing, understood=understood or IDENTITY, pose=pose)
 
@@ -324,7 +173,7 @@ class EditorWorld:
         if count_x * count_y > most:
             raise Refusal("too_many_cells", f"{count_x} x {count_y} cells are more than the limit grid_cells, {most}")
         code = "spawn_failed"
-        found = self._blueprint(blueprint, code)
+        found = self.blueprints.blueprint(blueprint, code)
         checks.refuse_scale(scale, code)
         understood = checks.rotation(rotation_quat, rotation_euler, code) or IDENTITY
         cells: list[tuple[str, Actor | None, tuple[Vec3, Quat]]] = []
@@ -332,7 +181,7 @@ class EditorWorld:
             for i in range(count_x):
                 actor_id = f"{base_actor_id}_{i}_{j}"
                 location = (origin[0] + i * spacing[0], origin[1] + j * spacing[1], origin[2])
-                existing = self._of_class(actor_id, found.class_name, code)
+                existing = self._actors.of_class(actor_id, found.class_name, code)
                 cells.append((actor_id, existing, checks.pose(location, understood, code)))
         self._make_room(sum(existing is None for _, existing, _ in cells), found, code)
         return [
@@ -373,7 +222,9 @@ class EditorWorld:
         red, green, blue = (checks.float32(channel) for channel in color)
         light = Light(kind=name, intensity=checks.float32(intensity), color=(red, green, blue))
         draft = Actor(name="", label="", kind=ActorKind.LIGHT, actor_id=actor_id, light=light)
-        return self._add(replace(draft, name=self._numbered(draft.class_name), location=at, rotation=rotation))
+        return self._actors.add(
+            replace(draft, name=self._actors.numbered(draft.class_name), location=at, rotation=rotation)
+        )
 
     def destroy_actor(self, target: str) -> None:
         """Remove an actor from the level; actors attached to it stay where they are.
@@ -381,13 +232,7 @@ class EditorWorld:
         Raises:
             Refusal: `missing_field`, `destroy_failed`.
         """
-        actor = self._find(target, "destroy_failed")
-        del self._actors[actor.name]
-        for child in list(self._actors.values()):
-            if child.parent == actor.name:
-                self._actors[child.name] = replace(child, parent="")
-        if self.selected == actor.name:
-            self.selected = ""
+        self._actors.remove(self._actors.find(target, "destroy_failed"))
 
     def set_actor_transform(
         self,
@@ -409,14 +254,16 @@ class EditorWorld:
             Refusal: `missing_field`; `set_actor_transform_failed` for an unknown actor or an invalid pose.
         """
         code = "set_actor_transform_failed"
-        actor = self._find(target, code)
+        actor = self._actors.find(target, code)
         rotation = checks.rotation(rotation_quat, rotation_euler, code)
         at, turned = checks.pose(
             location if location is not None else actor.location,
             rotation if rotation is not None else actor.rotation,
             code,
         )
-        return self._put(replace(actor, location=at, rotation=turned if rotation is not None else actor.rotation))
+        return self._actors.put(
+            replace(actor, location=at, rotation=turned if rotation is not None else actor.rotation)
+        )
 
     def duplicate_actor(self, target: str, new_actor_id: str, *, location: Vec3 | None = None) -> Placed:
         """Place a copy of an actor, or move the actor of the same class that carries the new id.
@@ -430,28 +277,41 @@ class EditorWorld:
             Refusal: `missing_field`; `duplicate_failed` for an unknown actor, a manager, or an id of another class.
         """
         code = "duplicate_failed"
-        source = self._find(target, code)
+        source = self._actors.find(target, code)
         checks.require(new_actor_id, "new_actor_id")
         if source.kind in (ActorKind.MANAGER, ActorKind.REPLAY_MANAGER):
             raise Refusal(code, f"'{source.name}' is a {source.class_name}, of which a level has one")
         x, y, z = source.location
         at, rotation = checks.pose(location if location is not None else (x + 1.0, y, z), source.rotation, code)
-        existing = self._of_class(new_actor_id, source.class_name, code)
+        existing = self._actors.of_class(new_actor_id, source.class_name, code)
         self._make_room(existing is None, source.blueprint, code)
         if existing is not None:
-            copy = self._put(replace(existing, location=at, rotation=rotation, scale=source.scale))
+            copy = self._actors.put(replace(existing, location=at, rotation=rotation, scale=source.scale))
         else:
             name = (
-                self._articulation_name(source.blueprint)
+                self._actors.articulation_name(source.blueprint)
                 if source.blueprint is not None
-                else self._numbered(source.class_name)
+                else self._actors.numbered(source.class_name)
             )
-            copy = self._add(
+            copy = self._actors.add(
                 replace(source, name=name, label="", actor_id=new_actor_id, location=at, rotation=rotation, parent="")
             )
         return Placed(copy, rotation, existing is not None)
 
     # Looking
+
+    @property
+    def selected(self) -> str:
+        """Name of the selected actor; empty without a selection."""
+        return self._actors.selected
+
+    @selected.setter
+    def selected(self, name: str) -> None:
+        self._actors.selected = name
+
+    def actor(self, key: str, *, by_name: bool = False) -> Actor | None:
+        """Return the actor of the open level with an id, or with an object name; see `LevelActors.get`."""
+        return self._actors.get(key, by_name=by_name)
 
     def snapshot(self) -> list[Actor]:
         """Return every actor, of the play world while play runs."""
@@ -459,7 +319,7 @@ class EditorWorld:
 
     def list_actors(self) -> list[Actor]:
         """Return every actor of the open level, also during play."""
-        return list(self._actors.values())
+        return list(self._actors)
 
     def find_actors(
         self, *, class_filter: str = "", tag: str = "", name_prefix: str = "", in_pie: bool = False
@@ -480,7 +340,7 @@ class EditorWorld:
         classes = {wanted, wanted[1:]} if wanted[:1] in ("a", "u", "f") else {wanted}
         found = [
             actor
-            for actor in (self._frozen if in_play else self._actors.values())
+            for actor in (self._frozen if in_play else self._actors)
             if (not wanted or not classes.isdisjoint(name.casefold() for name in actor.class_chain))
             and (not tag or tag.casefold() in (own.casefold() for own in actor.tags))
             and actor.name.casefold().startswith(name_prefix.casefold())
@@ -494,7 +354,7 @@ class EditorWorld:
             Refusal: `missing_field`, `actor_hierarchy_failed`.
         """
         shown = self._shown()
-        return _node(_match(shown, target, "actor_hierarchy_failed"), shown)
+        return _node(match_actor(shown, target, "actor_hierarchy_failed"), shown)
 
     def get_actor_bounds(self, target: str, *, components_only: bool = False) -> ActorBounds:
         """Return the box around an actor at its authored pose.
@@ -507,7 +367,7 @@ class EditorWorld:
             Refusal: `missing_field`; `get_actor_bounds_failed` for an unknown actor or a model that does not compile.
         """
         code = "get_actor_bounds_failed"
-        actor = self._find(target, code)
+        actor = self._actors.find(target, code)
         try:
             corners = actor_bounds(actor, every_geom=components_only)
         except CompileFailed as error:
@@ -523,78 +383,13 @@ class EditorWorld:
         Raises:
             Refusal: `missing_field`, `select_failed`.
         """
-        actor = self._find(target, "select_failed")
-        self.selected = actor.name
+        actor = self._actors.find(target, "select_failed")
+        self._actors.selected = actor.name
         return actor
-
-    def actor(self, key: str, *, by_name: bool = False) -> Actor | None:
-        """Return the actor of the open level with an id, or with an object name; None if there is none.
-
-        Unlike the editing ops, which take either, ids kept as tags compare with letter case here.
-        """
-        if by_name:
-            return self._actors.get(key)
-        return next((actor for actor in self._actors.values() if key and actor.actor_id == key), None)
 
     def actor_path(self, actor: Actor) -> str:
         """Return an actor's full object path."""
-        return f"{self._package}.{self._package.rpartition('/')[2]}:PersistentLevel.{actor.name}"
-
-    # Quick Convert
-
-    def add_quick_convert(
-        self,
-        target: str,
-        *,
-        static: bool = False,
-        complex_mesh: bool = False,
-        coacd_threshold: float = 0.05,
-        driven_by_unreal: bool = False,
-        friction: Vec3 = UNIT_SCALE,
-    ) -> Actor:
-        """Make a static mesh actor a MuJoCo body from the next play on; a repeat replaces all settings.
-
-        Args:
-            target: Actor id or name.
-            static: No free joint.
-            complex_mesh: Several convex parts of a mesh file instead of one hull; needs CoACD.
-            coacd_threshold: Concavity that a part may keep.
-            driven_by_unreal: Mocap body.
-            friction: Sliding, torsional, rolling.
-
-        Raises:
-            Refusal: `missing_field`; `add_quick_convert_failed` for an unknown actor, one without a mesh, a plane that
-                is not static, a number that is not finite, or `complex_mesh` without CoACD.
-        """
-        code = "add_quick_convert_failed"
-        actor = self._find(target, code)
-        if actor.mesh is None:
-            raise Refusal(code, f"'{actor.name}' is a {actor.class_name} without a mesh of its own")
-        if complex_mesh and not is_available():
-            raise Refusal(code, ADVICE)
-        if actor.mesh.shape == "plane" and not static:
-            raise Refusal(code, f"'{actor.name}' is a plane, which cannot move: pass static")
-        checks.refuse_infinite((coacd_threshold, *friction), "coacd_threshold and friction", code)
-        settings = ConversionSettings(
-            static=static,
-            complex_mesh=complex_mesh,
-            coacd_threshold=checks.float32(coacd_threshold),
-            driven_by_unreal=driven_by_unreal,
-            friction=friction,
-        )
-        return self._put(replace(actor, quick_convert=settings))
-
-    def remove_quick_convert(self, target: str) -> Actor:
-        """Make a static mesh actor mere decoration again.
-
-        Raises:
-            Refusal: `missing_field`; `remove_quick_convert_failed` for an unknown actor or one without the settings.
-        """
-        code = "remove_quick_convert_failed"
-        actor = self._find(target, code)
-        if actor.quick_convert is None:
-            raise Refusal(code, f"'{actor.name}' has no Quick Convert settings")
-        return self._put(replace(actor, quick_convert=None))
+        return f"{self.levels.package}.{self.levels.package.rpartition('/')[2]}:PersistentLevel.{actor.name}"
 
     # Play
 
@@ -604,9 +399,9 @@ class EditorWorld:
         Returns:
             The actors in spawn order, and the replay manager that the plugin adds to every session.
         """
-        actors = tuple(self._actors.values())
+        actors = tuple(self._actors)
         if not any(actor.kind is ActorKind.REPLAY_MANAGER for actor in actors):
-            name = self._numbered("MjReplayManager")
+            name = self._actors.numbered("MjReplayManager")
             actors = (*actors, Actor(name=name, label=name, kind=ActorKind.REPLAY_MANAGER))
         self._frozen = actors
         return actors
@@ -621,22 +416,12 @@ class EditorWorld:
         if len(self._actors) + count > limits.actors:
             raise Refusal(code, f"a level has at most {limits.actors} actors (limit actors)")
         more = [Actor(name="", label="", kind=ActorKind.ARTICULATION, blueprint=blueprint)] * count
-        problem = scene_problem((*self._actors.values(), *more), limits)
+        problem = scene_problem((*self._actors, *more), limits)
         if problem:
             raise Refusal(code, problem)
 
     def _shown(self) -> Iterable[Actor]:
-        return self._frozen if self.pie_running else self._actors.values()
-
-    def _put(self, actor: Actor) -> Actor:
-        self._actors[actor.name] = actor
-        return actor
-
-    def _add(self, actor: Actor) -> Actor:
-        """Add an actor with a label of its own: the short class name, numbered from the second on."""
-        short = actor.class_name.removesuffix("_C")
-        labels = {other.label for other in self._actors.values()}
-        return self._put(replace(actor, label=next(label for label in _variants(short, "", 2) if label not in labels)))
+        return self._frozen if self.pie_running else self._actors
 
     def _place(
         self,
@@ -649,149 +434,12 @@ class EditorWorld:
     ) -> Placed:
         at, rotation = pose
         if existing is not None:
-            actor = self._put(replace(existing, location=at, rotation=rotation))
+            actor = self._actors.put(replace(existing, location=at, rotation=rotation))
         else:
-            name = self._articulation_name(blueprint)
+            name = self._actors.articulation_name(blueprint)
             draft = Actor(name=name, label="", kind=ActorKind.ARTICULATION, actor_id=actor_id, blueprint=blueprint)
-            actor = self._add(replace(draft, location=at, rotation=rotation))
+            actor = self._actors.add(replace(draft, location=at, rotation=rotation))
         return Placed(actor, understood, existing is not None)
-
-    def _articulation_name(self, blueprint: Blueprint) -> str:
-        if self._naming == "plugin":
-            return self._numbered(blueprint.class_name)
-        base = sanitized(blueprint.model_name) or blueprint.stem
-        return next(
-            name for name in _variants(base, "_", 1) if name not in self._actors and not self._clashes(name, blueprint)
-        )
-
-    def _clashes(self, name: str, blueprint: Blueprint) -> bool:
-        """Whether compiled names would repeat: `robot` with a body `1_base` beside `robot_1` with a body `base`."""
-        prefix = f"{name}_"
-        for other in self._actors.values():
-            if other.blueprint is None:
-                continue
-            if other.prefix.startswith(prefix):
-                outer, inner, rest = blueprint, other.blueprint, other.prefix.removeprefix(prefix)
-            elif prefix.startswith(other.prefix):
-                outer, inner, rest = other.blueprint, blueprint, prefix.removeprefix(other.prefix)
-            else:
-                continue
-            if any(
-                element.startswith(rest) and element.removeprefix(rest) in inner.element_names
-                for element in outer.element_names
-            ):
-                return True
-        return False
-
-    def _numbered(self, class_name: str) -> str:
-        return next(name for name in _numbers(class_name) if name not in self._actors)
-
-    def _find(self, target: str, code: str) -> Actor:
-        return _match(self._actors.values(), target, code)
-
-    def _of_class(self, actor_id: str, class_name: str, code: str) -> Actor | None:
-        """Return the actor that carries an id, which must be of the class; None for a new or empty id."""
-        if not actor_id:
-            return None
-        for actor in self._actors.values():
-            if actor.has_id(actor_id):
-                if actor.class_name != class_name:
-                    raise Refusal(
-                        code,
-                        f"id '{actor_id}' belongs to '{actor.name}', a {actor.class_name}, not a {class_name}: "
-                        "choose another id or destroy that actor",
-                    )
-                return actor
-        return None
-
-    def _blueprint(self, path: str, code: str) -> Blueprint:
-        found = self.content.find_blueprint(path)
-        if found is None:
-            known = ", ".join(item.package_path for item in self.content.blueprints.values()) or "none"
-            raise Refusal(code, f"no blueprint is called '{path}': import one with import_xml; there are: {known}")
-        return found
-
-    def _refresh(self, blueprint: Blueprint) -> None:
-        for actor in list(self._actors.values()):
-            if actor.blueprint is not None and actor.blueprint.stem == blueprint.stem:
-                self._put(replace(actor, blueprint=blueprint))
-
-    def _refuse_during_play(self, code: str) -> None:
-        if self.pie_running:
-            raise Refusal(code, "play is running: stop it first")
-
-    def _locate_level(self, name: str, code: str) -> tuple[str, Path]:
-        try:
-            package = level_package(name)
-        except ValueError as error:
-            raise Refusal(code, str(error)) from None
-        return package, self._external.get(package, self.content.level_file(package))
-
-    def _load(self, package: str, file: Path, *, trusted: bool) -> None:
-        try:
-            actors = read_level(file, self.content, trusted=trusted)
-        except LevelError as error:
-            raise Refusal("load_level_failed", str(error)) from None
-        self._open(package, actors)
-
-    def _open(self, package: str, actors: Mapping[str, Actor]) -> None:
-        self._package = package
-        self._actors = dict(actors)
-        self.selected = ""
-
-    def _destroy_blueprint(self, blueprint: Blueprint) -> None:
-        users = [
-            actor.name
-            for actor in self._actors.values()
-            if actor.blueprint is not None and actor.blueprint.stem == blueprint.stem
-        ]
-        if users:
-            raise Refusal(
-                "destroy_asset_failed",
-                f"{blueprint.package_path} is used by {', '.join(users[:5])}{' and others' if len(users) > 5 else ''}: "
-                "destroy the actors first",
-            )
-        self.content.remove_blueprint(blueprint.stem)
-
-    def _destroy_level(self, package: str) -> bool:
-        try:
-            known = level_package(package) == package
-        except ValueError:
-            return False
-        file = self._external.get(package, self.content.level_file(package))
-        if not known or not file.is_file():
-            return False
-        if package in self._external:
-            raise Refusal("destroy_asset_failed", f"{package} is {file}, outside the content root: delete it there")
-        file.unlink()
-        if package == self._package:
-            self._open(UNTITLED, {})
-        return True
-
-
-def _variants(stem: str, separator: str, first: int) -> Iterator[str]:
-    """Yield `stem`, then `stem` with the numbers from `first` on."""
-    yield stem
-    number = first
-    while True:
-        yield f"{stem}{separator}{number}"
-        number += 1
-
-
-def _numbers(stem: str) -> Iterator[str]:
-    number = 0
-    while True:
-        yield f"{stem}_{number}"
-        number += 1
-
-
-def _match(actors: Iterable[Actor], target: str, code: str) -> Actor:
-    """Return the first actor whose id or object name is `target`."""
-    checks.require(target, "target")
-    for actor in actors:
-        if actor.name == target or actor.has_id(target):
-            return actor
-    raise Refusal(code, f"no actor has the id or name '{target}'; list_actors names them")
 
 
 def _node(actor: Actor, actors: Iterable[Actor]) -> ActorHierarchyNode:

@@ -82,7 +82,7 @@ def find_actors(server: ServerCore, request: FindActors) -> FindActorsOk:
 @handles(ListBlueprints)
 def list_blueprints(server: ServerCore, request: ListBlueprints) -> ListBlueprintsOk:
     del request
-    return ListBlueprintsOk(blueprints=server.world.list_blueprints())
+    return ListBlueprintsOk(blueprints=server.world.blueprints.list_blueprints())
 
 
 @handles(GetActorBounds)
@@ -100,7 +100,7 @@ def select_actor(server: ServerCore, request: SelectActor) -> SelectActorOk:
 
 @handles(AddQuickConvert)
 def add_quick_convert(server: ServerCore, request: AddQuickConvert) -> AddQuickConvertOk:
-    actor = server.world.add_quick_convert(
+    actor = server.world.quick_convert.add(
         need(request, request.target, "target"),
         static=request.static,
         complex_mesh=request.complex_mesh,
@@ -120,5 +120,5 @@ def add_quick_convert(server: ServerCore, request: AddQuickConvert) -> AddQuickC
 
 @handles(RemoveQuickConvert)
 def remove_quick_convert(server: ServerCore, request: RemoveQuickConvert) -> RemoveQuickConvertOk:
-    actor = server.world.remove_quick_convert(need(request, request.target, "target"))
+    actor = server.world.quick_convert.remove(need(request, request.target, "target"))
     return RemoveQuickConvertOk(actor_name=actor.name, requires_pie_restart=server.world.pie_running)

@@ -49,7 +49,7 @@ from urlab_client.server.rpc.requests import need, usable
 
 @handles(ImportXml)
 def import_xml(server: ServerCore, request: ImportXml) -> ImportXmlOk:
-    blueprint, imported_now = server.world.import_xml(
+    blueprint, imported_now = server.world.blueprints.import_xml(
         need(request, request.path, "path"), force_reimport=request.force_reimport
     )
     return ImportXmlOk(
@@ -62,7 +62,7 @@ def import_xml(server: ServerCore, request: ImportXml) -> ImportXmlOk:
 @handles(CreateLevel)
 def create_level(server: ServerCore, request: CreateLevel) -> CreateLevelOk:
     name = need(request, request.name, "name")
-    created = server.world.create_level(name, force_overwrite=request.force_overwrite)
+    created = server.world.levels.create(name, force_overwrite=request.force_overwrite)
     server.drawings.clear(in_play=False)  # what is drawn into a level goes with it
     return CreateLevelOk(level_path=created)
 
@@ -76,7 +76,7 @@ class LoadLevelByName(LoadLevel, tag="load_level", kw_only=True):
 @handles(LoadLevelByName)
 def load_level(server: ServerCore, request: LoadLevelByName) -> LoadLevelOk:
     level = need(request, usable(request.name_or_path, "") or request.name, "level_path")
-    server.world.load_level(level)
+    server.world.levels.load(level)
     server.drawings.clear(in_play=False)
     # As the plugin: expanded, but otherwise as it was asked for, so an object path stays one.
     return LoadLevelOk(level_path=level if level.startswith("/") else f"/Game/Levels/{level}")
@@ -85,13 +85,13 @@ def load_level(server: ServerCore, request: LoadLevelByName) -> LoadLevelOk:
 @handles(SaveLevel)
 def save_level(server: ServerCore, request: SaveLevel) -> SaveLevelOk:
     del request
-    return SaveLevelOk(level_path=server.world.save_level())
+    return SaveLevelOk(level_path=server.world.levels.save())
 
 
 @handles(CurrentLevel)
 def current_level(server: ServerCore, request: CurrentLevel) -> CurrentLevelOk:
     del request
-    return CurrentLevelOk(level_path=server.world.current_level())
+    return CurrentLevelOk(level_path=server.world.levels.package)
 
 
 @handles(EnsureManager)
@@ -193,7 +193,7 @@ def remove_actor(server: ServerCore, request: RemoveActor) -> RemoveActorOk:
 @handles(DestroyAsset)
 def destroy_asset(server: ServerCore, request: DestroyAsset) -> DestroyAssetOk:
     path = need(request, request.asset_path, "asset_path")
-    return DestroyAssetOk(asset_path=path, was_found=server.world.destroy_asset(path))
+    return DestroyAssetOk(asset_path=path, was_found=server.world.blueprints.destroy_asset(path))
 
 
 @handles(SetActorTransform)
@@ -232,7 +232,7 @@ def snapshot(server: ServerCore, request: Snapshot) -> SnapshotOk:
     del request
     world = server.world
     rows = [_row(actor, compiled=world.pie_running) for actor in world.snapshot()]
-    return SnapshotOk(actors=rows, in_pie=world.pie_running, level_path=world.shown_level())
+    return SnapshotOk(actors=rows, in_pie=world.pie_running, level_path=world.levels.shown())
 
 
 def _row(actor: Actor, *, compiled: bool) -> SnapshotRow:

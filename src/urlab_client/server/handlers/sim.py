@@ -20,7 +20,7 @@ def begin_pie(server: ServerCore, request: BeginPie) -> BeginPieOk:
         if not server.world.has_manager:
             return BeginPieOk(
                 state=PIEState.TIMEOUT,
-                compile_error=f"level {server.world.current_level()} has no manager actor: call ensure_manager first",
+                compile_error=f"level {server.world.levels.package} has no manager actor: call ensure_manager first",
             )
         server.begin_play()
     state = play.wait(request.timeout_s)
@@ -36,7 +36,7 @@ def _open_level(server: ServerCore, path: str) -> None:
     world = server.world
     was_running, world.pie_running = world.pie_running, False
     try:
-        world.load_level(path)
+        world.levels.load(path)
     except BaseException:
         world.pie_running = was_running
         raise

@@ -35,7 +35,7 @@ def upload_model_chunk(server: ServerCore, request: UploadModelChunk) -> UploadM
 def upload_model_commit(server: ServerCore, request: UploadModelCommit) -> UploadModelCommitOk:
     with server.uploads.committed(request.upload_id) as (document, step_mode):
         try:
-            blueprint = server.world.import_uploaded(document)
+            blueprint = server.world.blueprints.import_uploaded(document)
         except Refusal as refusal:
             raise Refusal("import_failed", refusal.message) from None
     reply = UploadModelCommitOk(

@@ -13,7 +13,7 @@ from msgspec import NODEFAULT, Struct, inspect
 
 from urlab_client.server.rpc.coercion import INT32_MAX, INT32_MIN
 
-__all__ = ["collision_test_of", "holds_anything", "strict_array", "strict_struct", "type_info"]
+__all__ = ["collision_test_of", "strict_array", "strict_struct", "type_info"]
 
 
 # Inspecting the types took most of a server's start, and gives the same for every server.
@@ -28,7 +28,11 @@ def strict_array(kind: type, value: object) -> np.ndarray[Any, np.dtype[np.float
 
 @cache
 def strict_struct(struct: type[Struct]) -> type[Struct]:
-    """Derive a struct that refuses unknown fields and integers beyond 32 bits, here and in the structs it holds."""
+    """Derive a struct that refuses unknown fields and integers beyond 32 bits, here and in the structs it holds.
+
+    Raises:
+        TypeError: A field takes any value.
+    """
     hints = get_type_hints(struct, include_extras=True)
     changed: list[tuple[str, Any, Any]] = []
     for field in msgspec.structs.fields(struct):
@@ -62,6 +66,8 @@ _REWRITTEN: Final[frozenset[Any]] = frozenset((Annotated, Union, types.UnionType
 def _strict_annotation(annotation: Any) -> Any:
     if annotation is int:
         return Annotated[int, msgspec.Meta(ge=INT32_MIN, le=INT32_MAX)]
+    if annotation is Any:
+        raise TypeError("a field that takes any value is read field by field")
     if inspect.is_struct_type(annotation):
         return strict_struct(annotation)
     origin: Any = get_origin(annotation)
@@ -74,19 +80,6 @@ def _strict_annotation(annotation: Any) -> Any:
     if origin is Annotated:
         return Annotated[(strict[0], *arguments[1:])]
     return (Union if origin is types.UnionType else origin)[strict]
-
-
-def holds_anything(info: inspect.Type) -> bool:
-    """Whether a field takes any plain value, which only `_tidy` can make the plugin's view of."""
-    match info:
-        case inspect.Metadata(type=inner) | inspect.ListType(item_type=inner) | inspect.DictType(value_type=inner):
-            return holds_anything(inner)
-        case inspect.UnionType(types=members):
-            return any(map(holds_anything, members))
-        case inspect.StructType(fields=fields):
-            return any(holds_anything(field.type) for field in fields)
-        case _:
-            return isinstance(info, inspect.AnyType)
 
 
 def _collision_test(info: inspect.Type) -> Callable[[Any], bool] | None:

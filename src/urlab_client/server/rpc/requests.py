@@ -1,8 +1,12 @@
 """From the bytes of a request to a typed struct, by the plugin's rules of detection and coercion.
 
-For the dispatcher. A request that means exactly what it says, which is every request of a sane client, is decoded by
-msgspec in one go. Anything else is decoded to plain data and coerced field by field, as the plugin's engine does: names
-and numbers in odd spellings are understood, unusable values count as absent. Both ways agree where the first succeeds.
+For the dispatcher. A request is decoded to plain data and coerced field by field, as the plugin's engine does: names
+and numbers in odd spellings are understood, unusable values count as absent. A `step` that means exactly what it says
+is decoded by msgspec in one go, and so is a piece of an upload. Both ways agree where the second succeeds.
+
+What that saves, in processor time: field by field a bare `step` takes 6 us instead of 0.5, one with 12 set-points 18
+instead of 1.2, and a piece of an upload 4.5 ms a MiB instead of 0.1. The other ops come too seldom to be worth 0.8 ms
+each of the server's start.
 """
 
 from __future__ import annotations
@@ -23,10 +27,8 @@ from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.coercion import ABSENT, as_text, struct_converter
 from urlab_client.server.rpc.exact_structs import (
     collision_test_of,
-    holds_anything,
     strict_array,
     strict_struct,
-    type_info,
 )
 from urlab_client.server.rpc.plain_data import Plain, bad_request, decode_plain, fold_keys
 
@@ -79,6 +81,10 @@ def need(request: Request[Any], value: T, field: str) -> T:
     return value
 
 
+class _Nameless(Struct, tag_field="op", tag=""):
+    """Beside another struct in the decoder: alone, that one would take requests without an op."""
+
+
 class RequestReader:
     """Reads frames into requests. Has no state of its own, so any thread may use it."""
 
@@ -99,18 +105,18 @@ class RequestReader:
         self._limits = limits
         self._exact: dict[type, Op] = {}
         self._loose: dict[str, _LooseOp] = {}
-        strict: list[type[Request[Any]]] = []
+        strict: list[type[Struct]] = [_Nameless]
         for op in ops.values():
             struct = structs.get(op.name, op.request)
             if not issubclass(struct, op.request):
                 raise TypeError(f"{struct.__name__} does not derive from {op.request.__name__}")
             self._loose[op.name] = _LooseOp(op, struct)
-            if not holds_anything(type_info(struct)):
-                exact = cast("type[Request[Any]]", strict_struct(struct))
+            if op.hot:
+                exact = strict_struct(struct)
                 self._exact[exact] = op
                 strict.append(exact)
         with building():
-            self._decoder: msgspec.msgpack.Decoder[Request[Any]] = msgspec.msgpack.Decoder(
+            self._decoder: msgspec.msgpack.Decoder[Request[Any] | _Nameless] = msgspec.msgpack.Decoder(
                 Union[tuple(strict)],  # noqa: UP007 - a union of a run-time list
                 dec_hook=strict_array,
             )
@@ -124,6 +130,8 @@ class RequestReader:
         try:
             request = self._decoder.decode(frame)
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+            return self._read_loosely(frame)
+        if isinstance(request, _Nameless):
             return self._read_loosely(frame)
         kind = type(request)
         collides = collision_test_of(kind)

@@ -66,7 +66,7 @@ class PortInUse(OSError):
         super().__init__(
             errno.EADDRINUSE,
             f"{tcp(host)}:{port} is in use: end the program that holds it, "
-            f"or choose another {option} (0 picks a free one)",
+            f"or choose another {option} (0 picks a free one; on the command line --{option.replace('_', '-')} 0)",
         )
         self.host = host
         self.port = port
@@ -167,7 +167,7 @@ class RpcEndpoint:
             health: Told when requests cannot be served any more.
             host: IP address of the interface.
             port: TCP port; 0 picks a free one.
-            door: Who may connect; None for anybody who reaches the interface.
+            curve_keys: Who may connect; None for anybody who reaches the interface.
             request_bytes: Largest request that is answered with anything but its size.
 
         Raises:

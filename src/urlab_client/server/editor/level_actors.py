@@ -1,0 +1,167 @@
+"""The actors of the open level, by their names: looking them up, and names for new ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+from typing import Literal
+
+from urlab_client.server.assets.actors import Actor, ActorKind
+from urlab_client.server.assets.blueprint import Blueprint, sanitized
+from urlab_client.server.editor import checks
+from urlab_client.server.refusal import Refusal
+
+__all__ = ["ActorNames", "LevelActors", "match_actor"]
+
+ActorNames = Literal["model", "plugin"]
+
+
+class LevelActors:
+    """The actors of a level in spawn order, and which of them is selected.
+
+    Attributes:
+        selected: Name of the selected actor; empty without a selection.
+    """
+
+    def __init__(self, naming: ActorNames) -> None:
+        """Begin without actors.
+
+        Args:
+            naming: How articulations are named: `model` after the MJCF's model name, `plugin` as the plugin does.
+        """
+        self.selected = ""
+        self._naming = naming
+        self._actors: dict[str, Actor] = {}
+
+    def __iter__(self) -> Iterator[Actor]:
+        return iter(self._actors.values())
+
+    def __len__(self) -> int:
+        return len(self._actors)
+
+    def replace_all(self, actors: Mapping[str, Actor]) -> None:
+        """Hold these actors instead, by name; none is selected."""
+        self._actors = dict(actors)
+        self.selected = ""
+
+    def remove(self, actor: Actor) -> None:
+        """Remove an actor; actors attached to it stay where they are."""
+        del self._actors[actor.name]
+        for child in list(self):
+            if child.parent == actor.name:
+                self.put(replace(child, parent=""))
+        if self.selected == actor.name:
+            self.selected = ""
+
+    def put(self, actor: Actor) -> Actor:
+        """Take over an actor in place of the one of its name, and return it."""
+        self._actors[actor.name] = actor
+        return actor
+
+    def add(self, actor: Actor) -> Actor:
+        """Add an actor with a label of its own: the short class name, numbered from the second on."""
+        short = actor.class_name.removesuffix("_C")
+        labels = {other.label for other in self}
+        return self.put(replace(actor, label=next(label for label in _variants(short, "", 2) if label not in labels)))
+
+    def get(self, key: str, *, by_name: bool = False) -> Actor | None:
+        """Return the actor with an id, or with an object name; None if there is none.
+
+        Unlike the editing ops, which take either, ids kept as tags compare with letter case here.
+        """
+        if by_name:
+            return self._actors.get(key)
+        return next((actor for actor in self if key and actor.actor_id == key), None)
+
+    def first(self, kind: ActorKind) -> Actor | None:
+        """Return the first actor of a kind; None if there is none."""
+        return next((actor for actor in self if actor.kind is kind), None)
+
+    def users(self, blueprint: Blueprint) -> list[Actor]:
+        """Return the actors that are made from a blueprint."""
+        return [actor for actor in self if actor.blueprint is not None and actor.blueprint.stem == blueprint.stem]
+
+    def find(self, target: str, code: str) -> Actor:
+        """Return the actor with an id or name.
+
+        Raises:
+            Refusal: `missing_field`, or `code`.
+        """
+        return match_actor(self, target, code)
+
+    def of_class(self, actor_id: str, class_name: str, code: str) -> Actor | None:
+        """Return the actor that carries an id, which must be of the class; None for a new or empty id."""
+        if not actor_id:
+            return None
+        for actor in self:
+            if actor.has_id(actor_id):
+                if actor.class_name != class_name:
+                    raise Refusal(
+                        code,
+                        f"id '{actor_id}' belongs to '{actor.name}', a {actor.class_name}, not a {class_name}: "
+                        "choose another id or destroy that actor",
+                    )
+                return actor
+        return None
+
+    def refresh(self, blueprint: Blueprint) -> None:
+        """Give a blueprint that was imported again to the actors that use it."""
+        for actor in self.users(blueprint):
+            self.put(replace(actor, blueprint=blueprint))
+
+    def articulation_name(self, blueprint: Blueprint) -> str:
+        """Return a name for one more articulation of a blueprint."""
+        if self._naming == "plugin":
+            return self.numbered(blueprint.class_name)
+        base = sanitized(blueprint.model_name) or blueprint.stem
+        return next(
+            name for name in _variants(base, "_", 1) if name not in self._actors and not self._clashes(name, blueprint)
+        )
+
+    def numbered(self, class_name: str) -> str:
+        """Return the first free name of a class, numbered from 0."""
+        return next(name for name in _numbers(class_name) if name not in self._actors)
+
+    def _clashes(self, name: str, blueprint: Blueprint) -> bool:
+        """Whether compiled names would repeat: `robot` with a body `1_base` beside `robot_1` with a body `base`."""
+        prefix = f"{name}_"
+        for other in self:
+            if other.blueprint is None:
+                continue
+            if other.prefix.startswith(prefix):
+                outer, inner, rest = blueprint, other.blueprint, other.prefix.removeprefix(prefix)
+            elif prefix.startswith(other.prefix):
+                outer, inner, rest = other.blueprint, blueprint, prefix.removeprefix(other.prefix)
+            else:
+                continue
+            if any(
+                element.startswith(rest) and element.removeprefix(rest) in inner.element_names
+                for element in outer.element_names
+            ):
+                return True
+        return False
+
+
+def match_actor(actors: Iterable[Actor], target: str, code: str) -> Actor:
+    """Return the first actor whose id or object name is `target`."""
+    checks.require(target, "target")
+    for actor in actors:
+        if actor.name == target or actor.has_id(target):
+            return actor
+    raise Refusal(code, f"no actor has the id or name '{target}'; list_actors names them")
+
+
+def _variants(stem: str, separator: str, first: int) -> Iterator[str]:
+    """Yield `stem`, then `stem` with the numbers from `first` on."""
+    yield stem
+    number = first
+    while True:
+        yield f"{stem}{separator}{number}"
+        number += 1
+
+
+def _numbers(stem: str) -> Iterator[str]:
+    number = 0
+    while True:
+        yield f"{stem}_{number}"
+        number += 1

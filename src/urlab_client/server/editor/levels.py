@@ -1,0 +1,169 @@
+"""The levels of the content root: which one is open, and creating, loading, saving and deleting them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Final
+
+from urlab_client.server.assets.actors import Actor
+from urlab_client.server.assets.blueprint import sanitized
+from urlab_client.server.assets.content import ContentRoot
+from urlab_client.server.assets.level import LevelError, read_level, write_level
+from urlab_client.server.assets.package_names import level_package
+from urlab_client.server.editor import checks
+from urlab_client.server.editor.level_actors import LevelActors
+from urlab_client.server.refusal import Refusal
+
+__all__ = ["Levels"]
+
+UNTITLED: Final = "/Temp/Untitled_1"
+
+
+class Levels:
+    """The open level's file and those beside it. Levels cannot be replaced or saved during play.
+
+    Attributes:
+        package: Path of the open level, also during play; `/Temp/Untitled_1` before one is created or loaded.
+        external: Files of levels that lie outside the content root, by path of the level.
+    """
+
+    def __init__(self, content: ContentRoot, actors: LevelActors, playing: Callable[[], bool]) -> None:
+        """Begin with an empty, untitled level.
+
+        Args:
+            content: The content root.
+            actors: The actors of the open level.
+            playing: Whether a play session runs.
+        """
+        self._content = content
+        self._actors = actors
+        self._playing = playing
+        self.package = UNTITLED
+        self.external: dict[str, Path] = {}
+
+    def create(self, name: str, *, force_overwrite: bool = False) -> str:
+        """Create an empty level, save it, make it the open one and return its path. It has no manager yet.
+
+        Raises:
+            Refusal: `missing_field`; `create_level_failed` if play runs, the name is unusable, the level exists, or it
+                cannot be written.
+        """
+        checks.require(name, "name")
+        code = "create_level_failed"
+        self._refuse_during_play(code)
+        package, file = self._locate(name, code)
+        if file.exists():
+            if not force_overwrite:
+                raise Refusal(code, f"{package} exists: load it, or pass force_overwrite to replace it")
+            if package in self.external:
+                raise Refusal(code, f"{package} is {file}, outside the content root: it is not overwritten")
+        try:
+            write_level(file, (), self._content)
+        except OSError as error:
+            raise Refusal(code, f"cannot write {file}: {error.strerror or error}") from None
+        self._open(package, {})
+        return package
+
+    def load(self, name: str) -> str:
+        """Open a level by name or path and return its path; unsaved edits of the open one are lost.
+
+        Raises:
+            Refusal: `missing_field`; `load_level_failed` if play runs, or the level is missing or unusable.
+        """
+        checks.require(name, "level_path")
+        code = "load_level_failed"
+        self._refuse_during_play(code)
+        package, file = self._locate(name, code)
+        if not file.is_file():
+            raise Refusal(code, f"there is no level {package} (no file {file})")
+        self._read(package, file, trusted=package in self.external)
+        return package
+
+    def load_file(self, path: Path) -> str:
+        """Open a level file that whoever runs the server named, and return the level's path.
+
+        It may lie anywhere; `save_level` then writes to that file. Models it names are imported from where it says.
+
+        Raises:
+            Refusal: `load_level_failed`.
+        """
+        code = "load_level_failed"
+        self._refuse_during_play(code)
+        file = path.resolve()
+        if file.is_relative_to(self._content.root) and file.suffix == ".json":
+            name = f"/Game/{file.relative_to(self._content.root).with_suffix('').as_posix()}"
+            package, file = self._locate(name, code)
+            self._read(package, file, trusted=True)
+            return package
+        package = f"/Game/Levels/{sanitized(file.stem)}"
+        self._read(package, file, trusted=True)
+        self.external[package] = file
+        return package
+
+    def save(self) -> str:
+        """Save the open level and return its path.
+
+        Raises:
+            Refusal: `save_level_failed` if play runs, the level never had a path, or it cannot be written.
+        """
+        code = "save_level_failed"
+        self._refuse_during_play(code)
+        if self.package == UNTITLED:
+            raise Refusal(code, "the open level has no name yet: create one with create_level first")
+        _, file = self._locate(self.package, code)
+        try:
+            write_level(file, self._actors, self._content)
+        except OSError as error:
+            raise Refusal(code, f"cannot write {file}: {error.strerror or error}") from None
+        return self.package
+
+    def shown(self) -> str:
+        """Return the path of the world that `snapshot` shows: in play the level's name has Unreal's prefix."""
+        if not self._playing():
+            return self.package
+        folder, _, name = self.package.rpartition("/")
+        return f"{folder}/UEDPIE_0_{name}"
+
+    def destroy(self, package: str) -> bool:
+        """Delete a level and return whether there was one; instead of the open one an empty level is open then.
+
+        Raises:
+            Refusal: `destroy_asset_failed` for a file outside the content root.
+            OSError: It cannot be deleted.
+        """
+        try:
+            known = level_package(package) == package
+        except ValueError:
+            return False
+        file = self.external.get(package, self._content.level_file(package))
+        if not known or not file.is_file():
+            return False
+        if package in self.external:
+            raise Refusal("destroy_asset_failed", f"{package} is {file}, outside the content root: delete it there")
+        file.unlink()
+        if package == self.package:
+            self._open(UNTITLED, {})
+        return True
+
+    def _refuse_during_play(self, code: str) -> None:
+        if self._playing():
+            raise Refusal(code, "play is running: stop it first")
+
+    def _locate(self, name: str, code: str) -> tuple[str, Path]:
+        try:
+            package = level_package(name)
+        except ValueError as error:
+            raise Refusal(code, str(error)) from None
+        return package, self.external.get(package, self._content.level_file(package))
+
+    def _read(self, package: str, file: Path, *, trusted: bool) -> None:
+        try:
+            actors = read_level(file, self._content, trusted=trusted)
+        except LevelError as error:
+            raise Refusal("load_level_failed", str(error)) from None
+        self._open(package, actors)
+
+    def _open(self, package: str, actors: Mapping[str, Actor]) -> None:
+        self.package = package
+        self._actors.replace_all(actors)

@@ -1,0 +1,282 @@
+"""What viewers do to the simulation: ops, set-points, steps, replays. Those who change something need the lease."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Protocol
+
+import anyio
+import numpy as np
+from msgspec import structs
+
+from urlab_client.protocol.base import Effect, Request
+from urlab_client.protocol.codec import op_of
+from urlab_client.protocol.enums import StepMode
+from urlab_client.protocol.errors import URLabError
+from urlab_client.protocol.messages.recording import RecordingStart, RecordingStop, ReplayStart, ReplayStop
+from urlab_client.protocol.messages.runtime import SetControlSource, SetPaused, SetSimSpeed, SetTwist
+from urlab_client.protocol.messages.session import ArticulationCommand, Step
+from urlab_client.protocol.messages.streams import (
+    StateSnapshot,
+)
+from urlab_client.web.description import WorldDescription
+from urlab_client.web.driving_lease import DrivingLease, Viewer
+from urlab_client.web.ops import encode, perform
+
+if TYPE_CHECKING:
+    from urlab_client.aio import URLabArticulation, URLabClient
+
+__all__ = ["Console", "Controls"]
+
+_PERIOD_S = 1 / 60
+_SEEK_STEPS = 8  # recordings have about one frame a timestep
+
+
+class Console(Protocol):
+    """What the controls need of the session that all viewers share."""
+
+    client: URLabClient
+    lease: DrivingLease
+    snapshot: StateSnapshot | None
+    world: WorldDescription
+
+    def note(self, kind: str, who: str, what: str, text: str, ms: float | None = None) -> None:
+        """Add a line to the log."""
+        ...
+
+    def tell(self) -> None:
+        """Let everybody look again."""
+        ...
+
+    def redescribe(self) -> None:
+        """Describe the world anew."""
+        ...
+
+    def watched_cameras(self) -> list[str]:
+        """Return the cameras that somebody watches."""
+        ...
+
+
+class Controls:
+    """The controls of one console, and what the server does not tell again.
+
+    Attributes:
+        running: Whether direct mode is stepped along with the clock.
+        speed: Pacing of live mode that somebody set, percent.
+        source: Who drives the actuators, if somebody chose.
+        recording: Whether the server records.
+        replaying: Whether it plays a recording.
+        replay: Frame of the replay, and how many there are.
+        twists: Velocities that were asked for, by articulation: x, y, yaw.
+    """
+
+    def __init__(self, console: Console) -> None:
+        self.running = False
+        self.speed: float | None = None
+        self.source: str | None = None
+        self.recording = self.replaying = False
+        self.replay: tuple[int, int] | None = None
+        self.twists: dict[str, tuple[float, float, float]] = {}
+        self._console = console
+        self._client = console.client
+        self._lease = console.lease
+        self._wake_runner = asyncio.Event()
+        self._seeded: set[str] = set()
+        self._pending: set[str] = set()
+        self._commanded = asyncio.Event()
+
+    def begin_anew(self) -> None:
+        """Forget what belonged to the play before."""
+        self._seeded.clear()
+        self.twists.clear()
+        self.recording = self.replaying = False
+        self.replay = None
+
+    def commands(self, key: str) -> bool:
+        """Return whether somebody has commanded this articulation since play began."""
+        return key in self._seeded
+
+    async def do(self, viewer: Viewer, request: Request[Any]) -> object:
+        """Perform an op for a viewer.
+
+        Raises:
+            NotDriving: It changes something, and somebody else has the controls.
+            URLabError: As the client raises.
+        """
+        op = op_of(request)
+        if op.effect is not Effect.READ and not (isinstance(request, SetPaused) and request.paused):
+            self._lease.use(viewer)
+        began = time.perf_counter()
+        try:
+            reply = await perform(self._client, request)
+        except (URLabError, ValueError, TypeError, KeyError) as error:
+            self._console.note("error", viewer.name, op.name, str(error), 1e3 * (time.perf_counter() - began))
+            raise
+        if op.effect is not Effect.READ:
+            arguments = encode(structs.asdict(request)).decode()
+            self._console.note("call", viewer.name, op.name, arguments, 1e3 * (time.perf_counter() - began))
+        self._follow(request, reply)
+        return reply
+
+    def _follow(self, request: Request[Any], reply: Any) -> None:
+        """Remember what the server does not tell again."""
+        match request:
+            case SetSimSpeed():
+                self.speed = reply.percent
+            case SetControlSource(articulation=None):
+                self.source = reply.source
+            case SetTwist():
+                self.twists[request.articulation] = (reply.linear[0], reply.linear[1], reply.angular[2])
+            case RecordingStart():
+                self.recording, self.replaying = True, False  # the server ends the one for the other
+            case RecordingStop():
+                self.recording = False
+            case ReplayStart():
+                self.recording = False
+                self.replaying, self.replay = reply.total_frames > 0, (0, reply.total_frames)
+            case ReplayStop():
+                self.replaying = False
+            case _:
+                pass
+        if op_of(request).name == "configure_controller":
+            self._console.redescribe()
+
+    def set_points(self, viewer: Viewer, values: Mapping[str, Mapping[str, float]]) -> None:
+        """Set set-points by articulation and actuator. In live mode they are sent at once, the newest only.
+
+        Raises:
+            NotDriving: Somebody else has the controls.
+            KeyError: An articulation or actuator is unknown; nothing was set.
+            ValueError: A value is not a finite number; nothing was set.
+        """
+        found = {key: (self._client.articulations[key], given) for key, given in values.items()}
+        for art, given in found.values():
+            for name, value in given.items():
+                art.actuators[name]  # raises
+                if not np.isfinite(value):
+                    raise ValueError(f"{name}: {value} is not a set-point")
+        self._lease.use(viewer)
+        for key, (art, given) in found.items():
+            self._seed(key, art)
+            art.set_ctrl(given)
+            self._pending.add(key)
+        self._commanded.set()
+
+    def _seed(self, key: str, art: URLabArticulation) -> None:
+        """Before a first set-point, hold still: the others of the articulation are sent along with it."""
+        if key in self._seeded:
+            return
+        self._seeded.add(key)
+        if self._console.snapshot is None or key not in self._console.snapshot.per_articulation or art.ctrl_array.any():
+            return
+        state = self._console.snapshot.per_articulation[key]
+        for actuator in art.actuators.values():
+            at = actuator.ctrl_local
+            if art.controller is not None and actuator.joint is not None:
+                actuator.set_control(float(state.qpos[art.joints[actuator.joint].qpos_local_offset]))
+            elif state.ctrl is not None:
+                art.ctrl_array[at] = state.ctrl[at]
+
+    async def send_set_points(self) -> None:
+        """Send set-points in live mode, one request at a time."""
+        while True:
+            await self._commanded.wait()
+            self._commanded.clear()
+            keys, self._pending = self._pending, set()
+            if self._client.step_mode is not StepMode.LIVE:
+                continue  # the next step takes them along
+            commands = {
+                key: ArticulationCommand(ctrl=self._client.articulations[key].ctrl_array.tolist())
+                for key in keys
+                if key in self._client.articulations
+            }
+            try:
+                await self._client.call(Step(per_articulation=commands))
+            except URLabError as error:
+                self._console.note("error", "console", "set-points", str(error))
+
+    async def step(self, viewer: Viewer, n_steps: int) -> dict[str, Any]:
+        """Step in direct mode, with the set-points and pictures of the cameras that are watched.
+
+        Raises:
+            NotDriving: Somebody else has the controls.
+            ValueError: The mode is another one.
+        """
+        if self._client.step_mode is not StepMode.DIRECT:
+            raise ValueError(f"stepping needs mode direct, not {self._client.step_mode}")
+        self._lease.use(viewer)
+        return await self._step(n_steps)
+
+    async def _step(self, n_steps: int) -> dict[str, Any]:
+        for key, art in self._client.articulations.items():
+            self._seed(key, art)
+        watched = dict.fromkeys(self._console.watched_cameras(), "latest")
+        reply = await self._client.step(n_steps, include_cameras=watched or False)
+        if reply.replay is not None:
+            self.replay = (reply.replay.current_frame, reply.replay.total_frames)
+            if self.replaying and reply.replay.current_frame >= reply.replay.total_frames - 1:
+                self.running = False
+        return {"time": reply.time, "step": reply.step}
+
+    async def seek(self, viewer: Viewer, frame: int) -> tuple[int, int]:
+        """Go to a frame of the replay, and return the one reached and how many there are.
+
+        No op does that. A replay goes on by what is stepped, though, and begins where it is started: to go back it is
+        started again. The plugin's replay plays by itself and does not report its position.
+
+        Raises:
+            NotDriving: Somebody else has the controls.
+            ValueError: No replay runs, or the server does not say where it is.
+            URLabError: As the client raises.
+        """
+        if not self.replaying or self.replay is None or self._client.step_mode is not StepMode.DIRECT:
+            raise ValueError("no replay runs in mode direct")
+        self._lease.use(viewer)
+        at, total = self.replay
+        frame = min(max(frame, 0), total - 1)
+        if frame < at:
+            self._follow(ReplayStart(), await self._client.call(ReplayStart()))
+            at = 0
+        for _ in range(_SEEK_STEPS):
+            if at >= frame:
+                break
+            reply = await self._client.step(frame - at)
+            if reply.replay is None:
+                raise ValueError("this server does not say where its replay is")
+            at = reply.replay.current_frame
+            self.replay = at, total
+        self._console.tell()
+        return self.replay
+
+    async def run(self, viewer: Viewer, running: bool) -> None:
+        """Let physics run, or stop it, in whatever mode; everybody may stop it.
+
+        Raises:
+            NotDriving: It was to run, and somebody else has the controls.
+        """
+        if running:
+            self._lease.use(viewer)
+        if self._client.step_mode is StepMode.LIVE:
+            await self.do(viewer, SetPaused(paused=not running))
+        else:
+            self.running = running
+            self._console.note("call", viewer.name, "run" if running else "stop", "")
+            self._wake_runner.set()
+        self._console.tell()
+
+    async def keep_stepping(self) -> None:
+        """In direct mode step along with the clock while that is wanted; what is missed is not made up for."""
+        while True:
+            if not self.running or self._client.step_mode is not StepMode.DIRECT:
+                self._wake_runner.clear()
+                await self._wake_runner.wait()
+                continue
+            began = time.monotonic()
+            try:
+                await self._step(max(1, round(_PERIOD_S / (self._console.world.timestep or _PERIOD_S))))
+            except (URLabError, KeyError) as error:
+                self.running = False
+                self._console.note("error", "console", "step", str(error))
+            await anyio.sleep(max(0.0, began + _PERIOD_S - time.monotonic()))
