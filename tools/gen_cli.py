@@ -28,8 +28,7 @@ def render() -> dict[Path, str]:
     parser = _parser()
     lines = [HEADER, "| command | what it does |", "|---|---|"]
     briefs = {action.dest: action.help or "" for action in _subparsers(parser)}
-    for name in parser.commands:
-        lines.append(f"| [`urlab {name}`](#urlab-{name}) | {_cell(briefs[name])} |")
+    lines += [f"| [`urlab {name}`](#urlab-{name}) | {_cell(briefs[name])} |" for name in parser.commands]
     lines += ["", _text(parser.epilog or ""), ""]
     for name, command in parser.commands.items():
         lines += _section(f"urlab {name}", command, level=2)

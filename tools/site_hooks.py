@@ -61,7 +61,7 @@ def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: 
 
 
 def tabs(markdown: str) -> str:
-    """Return a page in which blocks under `<!-- tab: NAME -->` are tabs; those with text between them are not one set."""
+    """Return a page in which blocks under `<!-- tab: NAME -->` are tabs; text between two begins a new set."""
 
     def tab(found: re.Match[str]) -> str:
         start = markdown[: found.start()].rstrip()
