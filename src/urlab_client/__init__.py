@@ -128,6 +128,7 @@ if TYPE_CHECKING:
         StreamStats,
     )
     from urlab_client.protocol.names import UnknownName
+    from urlab_client.protocol.observer import ClientObserver
     from urlab_client.protocol.scene_types import (
         ActorBounds,
         ActorHierarchyNode,
@@ -178,6 +179,7 @@ _HOMES = (
     "urlab_client.protocol.enums",
     "urlab_client.protocol.errors",
     "urlab_client.protocol.names",
+    "urlab_client.protocol.observer",
     "urlab_client.protocol.client_types",
     "urlab_client.protocol.scene_types",
     "urlab_client.protocol.types",
@@ -240,6 +242,7 @@ __all__ = [
     "ClientClosed",
     "ClientConfig",
     "ClientEvent",
+    "ClientObserver",
     "ConcurrentReadError",
     "ConnectionLost",
     "Contact",

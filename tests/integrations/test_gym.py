@@ -15,7 +15,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import urlab_client
-from urlab_client.integrations.gym import TASKS, SpaceMapping, URLabEnv
+from urlab_client.integrations.gym import TASKS, ResetNoise, SpaceMapping, URLabEnv
 from urlab_client.server import SimulatedServer
 
 MakeEnv = Callable[..., URLabEnv]
@@ -174,7 +174,7 @@ def test_pictures_show_the_state_and_leave_physics_alone(make_env: MakeEnv) -> N
     plain = rollout(make_env(space_mode="dict"))
     seeing = make_env(space_mode="dict", cameras=["quadruped/side"], render_mode="rgb_array", render_camera="arm/wrist")
     start, _ = seeing.reset(seed=2)
-    assert start["cameras"]["quadruped/side"].shape == (48, 64, 4)
+    assert start["cameras"]["quadruped/side"].shape == (48, 64, 3)
     assert seeing.observation_space.contains(start)
     first = seeing.render()
     assert first is not None
@@ -261,3 +261,45 @@ def test_a_mapping_takes_batches(make_env: MakeEnv) -> None:
     found = mapping.set_points(np.arange(38.0).reshape(2, 19))
     assert np.array_equal(found["quadruped"], [np.arange(12.0), np.arange(19.0, 31.0)])
     assert found["arm"].shape == (2, 7)
+
+
+def test_noise_at_a_reset_stays_within_the_joints_ranges_and_knows_metres_from_radians(make_env: MakeEnv) -> None:
+    hinges = make_env(reset_noise=3.0)
+    model, layout = hinges.client.model, hinges.mapping.layout("arm")
+    assert model is not None
+    ranges = {name: model.jnt_range[i] for name, i in layout.joints.items()}
+    rest = {name: model.qpos0[model.jnt_qposadr[i]] for name, i in layout.joints.items()}
+    slides = [name for name, i in layout.joints.items() if model.jnt_type[i] == 2]
+    assert len(slides) == 2
+    moved = set()
+    for seed in range(5):
+        hinges.reset(seed=seed)
+        for name, position in hinges.articulations["arm"].get_qpos().items():
+            low, high = ranges[name]
+            assert low <= position <= high, name
+            assert bool(position == rest[name]) == (name in slides)
+    both = make_env(reset_noise=ResetNoise(hinge=0.1, slide=0.01))
+    for seed in range(5):
+        both.reset(seed=seed)
+        positions = both.articulations["arm"].get_qpos()
+        moved |= {name for name in slides if positions[name] != rest[name]}
+        assert all(abs(positions[name] - rest[name]) <= (0.01 if name in slides else 0.1) for name in positions)
+        assert all(ranges[name][0] <= positions[name] <= ranges[name][1] for name in slides)
+    assert moved == set(slides)
+    with pytest.raises(ValueError, match="reset_noise must be 0 or more, not -1 for slide"):
+        ResetNoise(slide=-1)
+
+
+def test_an_observed_picture_is_what_render_returns(make_env: MakeEnv) -> None:
+    camera = "quadruped/side"
+    env = make_env(space_mode="dict", cameras=[camera], render_mode="rgb_array", render_camera=camera)
+    observation, _ = env.reset(seed=0)
+    assert env.observation_space.contains(observation)
+    assert np.array_equal(observation["cameras"][camera], env.render())
+
+
+def test_a_keyframe_of_the_constructor_is_where_episodes_start(make_env: MakeEnv) -> None:
+    env = make_env(keyframe="arm_home")
+    for options in (None, {"keyframe": "arm_home"}):
+        env.reset(options=options)
+        assert env.articulations["arm"].get_qpos()["left_finger"] == pytest.approx(0.04)

@@ -138,6 +138,11 @@ def test_a_declaration_that_cannot_work_is_refused_by_file_and_key(old: str, new
     assert str(caught.value).startswith("walk.toml: ")
 
 
+def test_a_table_for_a_normaliser_gets_advice() -> None:
+    with pytest.raises(PolicyFileError, match=r"unknown field `normalizer`.*`offset` and `scale` of each term"):
+        parse_spec(WALK + "\n[normalizer]\nmean = [0.0]\n", "walk.toml")
+
+
 def test_files_that_are_not_there_are_named(tmp_path: Path) -> None:
     with pytest.raises(PolicyFileError, match=r"away.toml: cannot be read: No such file"):
         policies.load(tmp_path / "away.onnx")

@@ -311,3 +311,27 @@ def test_a_tasks_rewards_are_the_same_from_servers_and_batch(task_id: str, made:
     batch.reset(seed=0)
     for action in actions_of(wire, 3):
         assert np.array_equal(wire.step(action)[1], batch.step(action)[1])
+
+
+def test_servers_and_batch_render_each_environment(servers: list[str], made: list[Any]) -> None:
+    options: Any = {"render_mode": "rgb_array", "render_camera": "arm/overview", "keyframe": "home", "reset_noise": 0.3}
+    wire, batch = URLabVectorEnv(servers, **options), URLabBatchEnv("sim://arm", 2, **options)
+    made += [wire, batch]
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        wire.render()
+    for env in (wire, batch):
+        observations, _ = env.reset(seed=1)
+        assert observations[:, 7].tolist() == [0.04] * 2, "the keyframe of the constructor"
+        first = env.render()
+        env.step(actions_of(env, 1)[0])
+        second = env.render()
+        assert [picture.shape for picture in (*first, *second)] == [(480, 640, 3)] * 4
+        assert len({picture.tobytes() for picture in first}) == 2
+        assert all(np.ptp(picture) > 100 for picture in first)
+    drawn, again = (env.render()[0].astype(int) for env in (wire, batch))
+    assert np.abs(drawn - again).mean() < 20, "the same robot in the same pose, with and without shadows"
+    with pytest.raises(ValueError, match="no camera 'arm/nose'"):
+        URLabBatchEnv("sim://arm", 1, render_mode="rgb_array", render_camera="arm/nose").render()
+    for env in (URLabVectorEnv, URLabBatchEnv):
+        with pytest.raises(ValueError, match="render_mode"):
+            env("sim://arm", 1, render_mode="human")

@@ -20,7 +20,7 @@ from wire import Wire
 from urlab_client import ImportFailed, URLabTimeoutError
 from urlab_client._landlock import is_available
 from urlab_client.aio import URLabClient
-from urlab_client.server import Limits, ModelError, SimulatedServer, simulated
+from urlab_client.server import Limits, ModelError, SimulatedServer, open_server
 from urlab_client.server.assets import sandbox
 
 Serve = Callable[..., Wire]
@@ -264,6 +264,16 @@ def test_what_is_not_understood_is_refused(text: str, reason: str, wire: Wire, f
     assert reason in refusal(wire, model)
 
 
+def test_a_process_that_compiles_starts_without_a_word(
+    wire: Wire, folder: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    sandbox._child.close()
+    model = folder / "root" / "first.xml"
+    model.write_text(f"<mujoco>{BODY}</mujoco>")
+    assert wire.ask("import_xml", path=str(model))["imported_now"] is True
+    assert capfd.readouterr().err == ""
+
+
 def test_mujoco_s_own_leniency_is_understood(wire: Wire, folder: Path) -> None:
     model = folder / "root" / "lenient.xml"
     model.write_text(
@@ -279,7 +289,7 @@ def test_the_kernel_keeps_mujoco_from_files_that_a_check_missed(folder: Path, tm
     program = (
         "from urlab_client.server.assets import sandbox\n"
         "sandbox.check_references = lambda *arguments: None\n"
-        "sandbox._serve()\n"
+        "sandbox.serve()\n"
     )
     orders = b""
     for name, file in (("inside", "meshes/figure.obj"), ("outside", str(folder / "secret.obj"))):
@@ -330,7 +340,7 @@ def test_a_confined_process_opens_nothing_else(tmp_path: Path) -> None:
 def test_a_server_says_when_the_kernel_does_not_help(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(simulated, "is_available", lambda: False)
+    monkeypatch.setattr(open_server, "is_available", lambda: False)
     with caplog.at_level("INFO"), SimulatedServer():
         pass
     assert [(record.levelname, "no Landlock" in record.message) for record in caplog.records][:1] == [("INFO", True)]

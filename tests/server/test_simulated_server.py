@@ -27,7 +27,7 @@ from urlab_client.protocol.enums import CameraMode, StepMode
 from urlab_client.server import ControllerConfig, ModelError, PortInUse, SimulatedServer, bundled_models
 from urlab_client.server import core as core_module
 from urlab_client.server.compile.scene import compile_scene
-from urlab_client.server.editor.world import EditorWorld
+from urlab_client.server.editor.levels import Levels
 from urlab_client.server.limits import Limits
 
 Connect = Callable[[SimulatedServer], Wire]
@@ -252,18 +252,18 @@ def test_close_during_compilation(models: Path, connect: Connect, slow_compile: 
 def test_close_during_what_cannot_be_broken_off(
     models: Path, connect: Connect, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    gate = Gate(lambda: "/Game/Levels/x")
-    monkeypatch.setattr(EditorWorld, "current_level", gate)
+    gate = Gate(lambda *_, **__: "/Game/Levels/x")
+    monkeypatch.setattr(Levels, "create", gate)
     with caplog.at_level(logging.WARNING, "urlab_client.server"), SimulatedServer() as server:
         wire = connect(server)
         wire.hello()
-        reply = ask_later(wire, "current_level")
+        reply = ask_later(wire, "create_level", name="x")
         assert gate.entered.wait(60)
         server.close()
         assert not reply.done()
     assert "still running" in caplog.text
     gate.open.set()
-    assert reply.result(30)["op"] == "current_level_ok"
+    assert reply.result(30)["op"] == "create_level_ok"
 
 
 # Ports

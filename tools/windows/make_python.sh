@@ -58,7 +58,7 @@ fi
 # Under Wine the interpreter starts only where its output is a pipe.
 cat >"$target/winpy" <<EOF
 #!/usr/bin/env bash
-export WINEPREFIX=\${WINEPREFIX:-$target/prefix} WINEDEBUG=\${WINEDEBUG:--all} WINEARCH=win64 PYTHONDONTWRITEBYTECODE=1
+export WINEPREFIX=\${WINEPREFIX:-$target/prefix} WINEDEBUG=\${WINEDEBUG:--all} WINEARCH=win64 WINEDLLOVERRIDES=winedbg.exe=d PYTHONDONTWRITEBYTECODE=1
 set -o pipefail
 wine "$target/py/python.exe" "\$@" 2>&1 </dev/null | cat
 EOF

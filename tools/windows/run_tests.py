@@ -27,16 +27,19 @@ RESULT = re.compile(r"(tests/\S.*?)(?: (PASSED|FAILED|ERROR|SKIPPED)\b.*| \++ Ti
 STAYING = "import ctypes, time; ctypes.windll.user32.GetDesktopWindow(); time.sleep(1e6)"
 TEST_S = 200
 FILE_S = 1200
+ATTEMPTS = 4
+NOT_COLLECTED, NOTHING_LEFT, CRASHED = 2, 5, -1  # exit codes: the first two are pytest's
 
 
 @dataclasses.dataclass
 class Outcome:
-    """How the tests of a file ended."""
+    """How the tests of a file ended, and how often the interpreter did between them."""
 
     file: str
     results: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
     problems: list[str] = dataclasses.field(default_factory=list[str])
     seconds: float = 0.0
+    crashes: int = 0
 
     def count(self, *words: str) -> int:
         """Return how many tests ended in one of these ways."""
@@ -62,16 +65,18 @@ def run(file: str, interpreter: Path, prefix: Path, log: Path) -> Outcome:
     outcome = Outcome(file)
     started = time.monotonic()
     log.unlink(missing_ok=True)
-    while True:
-        found, code = run_rest(outcome, interpreter, prefix, log)
-        left = FILE_S - (time.monotonic() - started)
+    for _ in range(ATTEMPTS):
+        met, code = run_rest(outcome, interpreter, prefix, log)
         interrupted = [test for test, result in outcome.results.items() if not result]
-        for test in interrupted:
-            outcome.results[test] = "ERROR"
-        if code not in {0, 1, 5} and not (interrupted and found):
-            outcome.problems.append(f"the interpreter ended with {code}")
-        if not interrupted or left < 0:
+        outcome.results |= dict.fromkeys(interrupted, "ERROR")
+        if (code in {0, 1} and not interrupted) or (code == NOTHING_LEFT and not met):
             break
+        if code == NOT_COLLECTED or time.monotonic() - started > FILE_S:
+            outcome.problems.append(f"the interpreter ended with {code} before all tests had run")
+            break
+        outcome.crashes += not interrupted
+    else:
+        outcome.problems.append(f"the interpreter crashed {ATTEMPTS} times before all tests had run")
     outcome.seconds = time.monotonic() - started
     outcome.problems += [
         f"{result} {test}" for test, result in outcome.results.items() if result in {"FAILED", "ERROR"}
@@ -102,15 +107,16 @@ def run_rest(outcome: Outcome, interpreter: Path, prefix: Path, log: Path) -> tu
             log.open("a", buffering=1, encoding="utf-8") as lines,
         ):
             assert process.stdout is not None  # noqa: S101
-            met = 0
+            met, crashed = 0, False
             for line in process.stdout:
                 lines.write(line)
+                crashed = crashed or line.startswith("wine: Unhandled ")
                 if found := RESULT.fullmatch(line.rstrip().replace("\\", "/")):
                     test, result = found.groups()
                     if "::" in test:
                         met += 1
                         outcome.results[test] = result or ""
-        return met, process.returncode
+        return met, CRASHED if crashed else process.returncode
 
 
 def main() -> int:
@@ -144,6 +150,8 @@ def main() -> int:
                 outcomes.append(outcome)
                 counts = f"{outcome.count('PASSED')} passed, {linux[outcome.file]} on Linux"
                 print(f"{outcome.file}: {counts}, {outcome.seconds:.0f} s", flush=True)
+                if outcome.crashes:
+                    print(f"    the interpreter crashed {outcome.crashes} times outside tests", flush=True)
                 for problem in outcome.problems:
                     print(f"    {problem}", flush=True)
         while not prefixes.empty():

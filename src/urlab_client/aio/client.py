@@ -28,6 +28,7 @@ from urlab_client.aio.namespaces.scene import SceneNamespace
 from urlab_client.aio.namespaces.sim import SimNamespace
 from urlab_client.aio.namespaces.viewport import ViewportNamespace
 from urlab_client.aio.session import Session
+from urlab_client.aio.session_level import SESSION_LEVEL, SessionLevel
 from urlab_client.aio.state.connection_monitor import ConnectionMonitor
 from urlab_client.aio.state.discovery import Discovery
 from urlab_client.aio.state.recovery import resync
@@ -49,23 +50,13 @@ from urlab_client.protocol.messages.session import Meta as MetaRequest
 from urlab_client.protocol.messages.streams import ClientEvent, RowSample, StateSnapshot, StreamPolicy
 from urlab_client.protocol.topics import TopicKind
 
-__all__ = ["SESSION_LEVEL", "SessionLevel", "URLabClient"]
+__all__ = ["URLabClient"]
 
 log = logging.getLogger("urlab_client.client")
 
 R = TypeVar("R", bound=Reply)
 
 _REVERT_S = 1.0
-
-
-class SessionLevel(str):
-    """An observation level that stands for "as chosen in `discover()`"."""
-
-    __slots__ = ()
-
-
-SESSION_LEVEL = SessionLevel("standard")
-"""The level chosen in `discover()`, which is `standard` unless it was told otherwise."""
 
 
 class URLabClient(ClientState):
@@ -265,7 +256,7 @@ class URLabClient(ClientState):
         n_steps: int = 1,
         *,
         include_cameras: bool | Mapping[str, str | CameraTiming] = False,
-        observations: str | ObservationLevel = SESSION_LEVEL,
+        observations: str | ObservationLevel | SessionLevel = SESSION_LEVEL,
         timeout: Timeout = DEFAULT,
     ) -> StepOk:
         """Advance physics as the step mode says, and take over the state.
@@ -294,7 +285,7 @@ class URLabClient(ClientState):
             NoSession: `discover()` was not called, or was broken off; nothing was sent.
         """
         n_steps = operator.index(n_steps)  # a hot op: its request is not checked again before it is sent
-        level = None if isinstance(observations, SessionLevel) else ObservationLevel(observations)
+        level = None if observations is SESSION_LEVEL else ObservationLevel(observations)
         turn = self._session.turn(Step, timeout=timeout)
         if not turn.begin_at_once():  # which `async with` would take three coroutines for
             await turn.begin()

@@ -12,7 +12,9 @@ from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.transport.base import TransportStats
 from urlab_client.protocol.client_types import ClientConfig, ServerInfo
 from urlab_client.protocol.enums import StepMode
+from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.names import NameMap
+from urlab_client.protocol.observer import ClientObserver
 
 if TYPE_CHECKING:
     import mujoco
@@ -164,6 +166,34 @@ class ClientState:
     def recv_wall_time_ns(self) -> int:
         """This machine's UTC clock when the last reply arrived, nanoseconds."""
         return self._state.recv_wall_time_ns
+
+    def camera(self, name: str) -> URLabCameraView:
+        """Return a camera by `<articulation>/<camera>`, or by `<camera>` where that means one of them.
+
+        Raises:
+            KeyError: There is no such camera, or there are several.
+        """
+        objects = self._state.objects
+        view = objects.camera(name)
+        if view is None:
+            raise KeyError(f"there is no camera {objects.camera_name(name)!r}")
+        return view
+
+    def matches(self, snapshot: StateSnapshot) -> bool:
+        """Return whether a published state is of the world that the last handshake described, as far as it shows.
+
+        Right after play began anew, a stream may bring states of a world that `discover()` has not been told of.
+        """
+        return self._state.matches(snapshot)
+
+    def add_observer(self, observer: ClientObserver) -> None:
+        """Tell `observer` of each handshake and state from now on, until `remove_observer()`. Idempotent."""
+        if observer not in self._state.observers:
+            self._state.observers = (*self._state.observers, observer)
+
+    def remove_observer(self, observer: ClientObserver) -> None:
+        """Tell `observer` nothing more. Idempotent."""
+        self._state.observers = tuple(known for known in self._state.observers if known is not observer)
 
     @property
     def _data_lock(self) -> RLock:

@@ -10,8 +10,8 @@ from types import TracebackType
 from typing import Self, TypeVar
 
 from urlab_client.aio import client as aio
-from urlab_client.aio.client import SESSION_LEVEL, SessionLevel
 from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.session_level import SESSION_LEVEL, SessionLevel
 from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS
 from urlab_client.protocol.base import Reply, Request
 from urlab_client.protocol.client_types import Diagnosis, Resync
@@ -31,7 +31,7 @@ from urlab_client.sync.namespaces.sim import SimNamespace
 from urlab_client.sync.namespaces.viewport import ViewportNamespace
 from urlab_client.sync.streams import Stream
 
-__all__ = ["SESSION_LEVEL", "SessionLevel", "URLabClient"]
+__all__ = ["URLabClient"]
 
 R = TypeVar("R", bound=Reply)
 
@@ -189,7 +189,7 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
         n_steps: int = 1,
         *,
         include_cameras: bool | Mapping[str, str | CameraTiming] = False,
-        observations: str | ObservationLevel = SESSION_LEVEL,
+        observations: str | ObservationLevel | SessionLevel = SESSION_LEVEL,
         timeout: Timeout = DEFAULT,
     ) -> StepOk:
         """Advance physics as the step mode says, and take over the state.

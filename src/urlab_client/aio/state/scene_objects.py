@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from urlab_client.aio.articulation import URLabArticulation, URLabEntity
 from urlab_client.aio.cameras import URLabCameraView
@@ -100,6 +100,17 @@ class SceneObjects:
         if len(found) > 1:
             raise KeyError(f"camera {name!r} is ambiguous: it could mean {' or '.join(map(repr, found))}")
         return found[0]
+
+    def with_cameras(
+        self, asked: bool | dict[str, str | None], more: Mapping[str, str]
+    ) -> bool | dict[str, str | None]:
+        """Return the pictures that a step is to bring: what its caller asked for, and more that there are."""
+        if asked is True:
+            return True
+        chosen = dict(asked or {})
+        known = {id(self.camera(name)) for name in chosen} | {id(None)}
+        chosen |= {name: how for name, how in more.items() if id(self.camera(name)) not in known}
+        return chosen or False
 
     @property
     def hidden_cameras(self) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -17,10 +17,12 @@ from urlab_client.aio.launch import with_model_options
 from urlab_client.aio.model.layout import ArticulationLayout
 from urlab_client.aio.model.mirror import model_names
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn
-from urlab_client.integrations.gym.episode import fields_of
+from urlab_client.integrations.gym.episode import client_defaults, compiled_prefixes, fields_of
+from urlab_client.integrations.gym.pictures import BatchPictures
 from urlab_client.integrations.gym.spaces import Field, Observation, SpaceMapping, SpaceMode
+from urlab_client.integrations.gym.starts import ResetNoise, noise_of
 from urlab_client.integrations.gym.threaded_batch import ThreadedBatch
-from urlab_client.integrations.gym.vectorized import Floats, Found, Indices, Vectorized
+from urlab_client.integrations.gym.vectorized import Floats, Found, Indices, Vectorized, check_render_mode
 from urlab_client.protocol.enums import ControllerKind
 from urlab_client.protocol.errors import UnknownKeyframe, URLabError
 from urlab_client.server.physics.controllers import Controller, ControllerConfig, PassthroughController, PDController
@@ -36,8 +38,8 @@ class URLabBatchEnv(Vectorized):
 
     The scene is what a server compiles: it is fetched once, and the server is not needed any more. Observations,
     rewards and autoreset are those of `URLabVectorEnv`, bit for bit for the same seeds and actions, as long as no
-    wrench is applied; there are no cameras. Controllers act before each physics step, as they do on the server, with
-    the parameters they had when the scene was fetched.
+    wrench is applied; there are no cameras to observe. Controllers act before each physics step, as they do on the
+    server, with the parameters they had when the scene was fetched.
     """
 
     def __init__(
@@ -51,7 +53,10 @@ class URLabBatchEnv(Vectorized):
         termination_fn: TerminationFn | None = None,
         max_episode_steps: int | None = None,
         n_substeps: int = 1,
-        reset_noise: float = 0.0,
+        reset_noise: float | ResetNoise = 0.0,
+        keyframe: str | None = None,
+        render_mode: Literal["rgb_array"] | None = None,
+        render_camera: str | None = None,
         autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
         n_threads: int = 0,
         client_options: Mapping[str, Any] = MappingProxyType({}),
@@ -68,6 +73,9 @@ class URLabBatchEnv(Vectorized):
             max_episode_steps: See `URLabEnv`.
             n_substeps: See `URLabEnv`.
             reset_noise: See `URLabEnv`.
+            keyframe: See `URLabEnv`.
+            render_mode: None or `rgb_array`, with which `render` draws; steps cost the same.
+            render_camera: Camera that `render` shows, `ARTICULATION/CAMERA`; the first one of the scene by default.
             autoreset_mode: `NEXT_STEP`, `SAME_STEP` or `DISABLED`.
             n_threads: Threads that step, the caller's included; 0 for one per processor.
             client_options: Further options of the client that fetches the scene.
@@ -76,10 +84,12 @@ class URLabBatchEnv(Vectorized):
             URLabError: The scene cannot be fetched.
             ValueError: An option out of range.
         """
-        if num_envs < 1 or n_substeps < 1 or reset_noise < 0:
-            raise ValueError("num_envs and n_substeps are at least 1, and reset_noise is 0 or more")
-        model, keys, controllers = _fetch(with_model_options(address), {"step_mode": "direct", **client_options})
-        mapping = SpaceMapping(model, keys, fields_of(observations), space_mode)
+        if num_envs < 1 or n_substeps < 1:
+            raise ValueError("num_envs and n_substeps are at least 1")
+        noise = noise_of(reset_noise)
+        check_render_mode(render_mode)
+        model, prefixes, controllers = _fetch(with_model_options(address), client_defaults(client_options))
+        mapping = SpaceMapping(model, prefixes, fields_of(observations), space_mode)
         super().__init__(
             num_envs=num_envs,
             mapping=mapping,
@@ -90,14 +100,19 @@ class URLabBatchEnv(Vectorized):
             autoreset_mode=autoreset_mode,
         )
         self.model = model
+        self._prefixes = tuple(prefixes.values())
         self._n_substeps = n_substeps
-        self._noise = reset_noise
+        self._noise = noise
+        self._start_keyframe = keyframe
+        self.render_mode = render_mode
+        self._render_camera = render_camera
+        self._pictures: BatchPictures | None = None
         self._batch = (batch_class() or ThreadedBatch)(model, num_envs, n_threads)
         # Bound before the first call: a derived field is computed only where somebody looks at it.
         self._arrays = {name: self._batch.bind(name) for name in ("qpos", "qvel", "ctrl", "act", "sensordata", "time")}
         self._keyframes = {name: i for i, name in enumerate(model_names(model, "key"))}
         self._noisy = {
-            key: model.jnt_qposadr[[mapping.layout(key).joints[name] for name in mapping.joint_names(key, model)]]
+            key: np.array([mapping.layout(key).joints[name] for name in mapping.joint_names(key, model)], dtype=np.intp)
             for key in mapping.keys
         }
         self._sensors = {key: _sensor_addresses(model, mapping.layout(key)) for key in mapping.keys}
@@ -105,6 +120,27 @@ class URLabBatchEnv(Vectorized):
             key: _controller(model, mapping.layout(key), kind, params) for key, (kind, params) in controllers.items()
         }
         self._step_count = np.zeros(num_envs, dtype=np.int64)
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Return a picture of each copy as it is, shape (H, W, 3), RGB; None without a render mode.
+
+        All calls belong on one thread.
+
+        Raises:
+            ValueError: There is no such camera.
+            ImportError: Nothing here can draw.
+        """
+        if self.render_mode is None:
+            return None
+        if self._pictures is None:
+            self._pictures = BatchPictures(self.model, self._render_camera)
+        return tuple(self._pictures.draw(qpos) for qpos in self._arrays["qpos"])
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Free what drew."""
+        pictures, self._pictures = self._pictures, None
+        if pictures is not None:
+            pictures.close()
 
     def _reset_and_step(self, fresh: Indices, acting: Indices, actions: Any) -> tuple[Found, Found]:
         nothing: Found = (None, {})
@@ -114,13 +150,15 @@ class URLabBatchEnv(Vectorized):
         )
 
     def _reset_some(self, indices: Indices, keyframe: str | None) -> Found:
+        keyframe = self._start_keyframe if keyframe is None else keyframe
         self._batch.reset(indices, -1 if keyframe is None else self._keyframe_id(keyframe))
         if self._noise:
             qpos = self._arrays["qpos"]
             for i in map(int, indices):
                 for key in self.mapping.keys:
-                    address = self._noisy[key]
-                    qpos[i, address] += self._rngs[i].uniform(-self._noise, self._noise, len(address))
+                    joints = self._noisy[key]
+                    address = self.model.jnt_qposadr[joints]
+                    qpos[i, address] = self._noise.drawn(self._rngs[i], self.model, joints, qpos[i, address])
             self._batch.forward(indices)
         self._step_count[indices] = 0
         return self._observe(indices), {}
@@ -175,7 +213,7 @@ class URLabBatchEnv(Vectorized):
                 return self._arrays["sensordata"][:, sensors]
 
     def _keyframe_id(self, name: str) -> int:
-        found = [full for full in self._keyframes if full in {name, *(f"{key}_{name}" for key in self.mapping.keys)}]
+        found = [full for full in self._keyframes if full in {name, *(f"{prefix}_{name}" for prefix in self._prefixes)}]
         if len(found) != 1:
             raise UnknownKeyframe(
                 "unknown_keyframe", f"{name!r} does not name exactly one of {', '.join(self._keyframes) or 'none'}"
@@ -185,8 +223,8 @@ class URLabBatchEnv(Vectorized):
 
 def _fetch(
     address: str, client_options: Mapping[str, Any]
-) -> tuple[mujoco.MjModel, list[str], dict[str, tuple[str, dict[str, Any]]]]:
-    """Return a scene's model, its articulations, and the kind and parameters of those that have a controller."""
+) -> tuple[mujoco.MjModel, dict[str, str], dict[str, tuple[str, dict[str, Any]]]]:
+    """Return a scene's model, its articulations' compiled prefixes, and kind and parameters of the controllers."""
     with URLabClient(address, **client_options) as client:
         client.discover()
         model = client.model
@@ -194,7 +232,7 @@ def _fetch(
             raise URLabError(f"There is no articulation at {address}.", hint="Start play first.")
         attached = {key: articulation.controller for key, articulation in client.articulations.items()}
         controllers = {key: (str(found.kind), dict(found.params)) for key, found in attached.items() if found}
-        return model, list(client.articulations), controllers
+        return model, compiled_prefixes(client), controllers
 
 
 @dataclass(frozen=True)

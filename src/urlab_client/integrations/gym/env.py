@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client.aio.launch import with_model_options
-from urlab_client.integrations.gym.episode import EnvEpisode
+from urlab_client.integrations.gym.episode import EnvEpisode, client_defaults, first_camera
 from urlab_client.integrations.gym.spaces import Observation, SpaceMapping, SpaceMode
-from urlab_client.protocol.enums import CameraMode
+from urlab_client.integrations.gym.starts import ResetNoise
 from urlab_client.protocol.names import NameMap
 from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.articulation import URLabArticulation, URLabEntity
@@ -39,9 +39,9 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
     `env.unwrapped.articulations` for example.
 
     A reset puts the simulation into its initial state, or into the keyframe that `options={"keyframe": NAME}` names,
-    clears the set-points, and with `reset_noise` moves hinge and slide joints by uniform noise. The noise is all that
-    depends on the seed. Physics is deterministic: the same seed and actions give the same observations, bit for bit,
-    on the same build of MuJoCo.
+    clears the set-points, and with `reset_noise` moves joints by uniform noise, within their ranges. The noise is all
+    that depends on the seed. Physics is deterministic: the same seed and actions give the same observations, bit for
+    bit, on the same build of MuJoCo.
 
     `render_mode="rgb_array"` makes `render` return the frame of `render_camera`. It is drawn with each step, which
     costs time; images never change the physics.
@@ -67,7 +67,8 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         n_substeps: int = 1,
         render_mode: Literal["rgb_array"] | None = None,
         render_camera: str | None = None,
-        reset_noise: float = 0.0,
+        reset_noise: float | ResetNoise = 0.0,
+        keyframe: str | None = None,
         owns_client: bool = False,
     ) -> None:
         """Make an environment.
@@ -85,7 +86,9 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
             n_substeps: Physics steps per action.
             render_mode: None or `rgb_array`.
             render_camera: Camera that `render` shows; the first one of the scene by default.
-            reset_noise: Largest deviation of hinge and slide joints at a reset, radians or metres.
+            reset_noise: Largest deviation of joints at a reset: a `ResetNoise`, or radians for hinge joints alone. A
+                joint stays within its range.
+            keyframe: Where episodes start, unless `reset` names another one; the initial state by default.
             owns_client: Close the client with the environment.
 
         Raises:
@@ -99,7 +102,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
             raise ValueError(f"max_episode_steps must be at least 1 or None, not {max_episode_steps}")
         self.client = client
         self.render_mode = render_mode
-        self._rendered = () if render_mode is None else (render_camera or _first_camera(client),)
+        self._rendered = () if render_mode is None else (render_camera or first_camera(aio_of(client)),)
         self._episode = EnvEpisode(
             aio_of(client),
             space_mode=space_mode,
@@ -108,6 +111,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
             rendered=self._rendered,
             n_substeps=n_substeps,
             reset_noise=reset_noise,
+            keyframe=keyframe,
         )
         self.action_space = self.mapping.action_space
         self.observation_space = self._episode.observation_space
@@ -136,8 +140,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         Raises:
             URLabError: The server cannot be reached, or has no articulation.
         """
-        wanted: dict[str, Any] = {"step_mode": "direct", **client_options}
-        client = URLabClient(with_model_options(address), **wanted)
+        client = URLabClient(with_model_options(address), **client_defaults(client_options))
         try:
             client.discover()
             return cls(client, owns_client=True, **options)
@@ -232,15 +235,3 @@ def keyframe_option(options: dict[str, Any] | None) -> str | None:
     if unknown:
         raise ValueError(f"unknown reset options {', '.join(sorted(unknown))}; there is 'keyframe'")
     return None if options is None else options.get("keyframe")
-
-
-def _first_camera(client: URLabClient) -> str:
-    """Return the first camera that shows colours."""
-    for key, articulation in client.articulations.items():
-        for name, view in articulation.cameras.items():
-            if view.mode == CameraMode.REAL:
-                return f"{key}/{name}"
-    for name, view in client.global_cameras.items():
-        if view.mode == CameraMode.REAL:
-            return name
-    raise ValueError("the scene has no colour camera to render: add one to its MJCF, or use render_mode=None")

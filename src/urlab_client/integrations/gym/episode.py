@@ -11,12 +11,23 @@ from gymnasium import spaces
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
 from urlab_client.integrations.gym.spaces import LEVELS, Field, Observation, Space, SpaceMapping, SpaceMode, dict_space
+from urlab_client.integrations.gym.starts import ResetNoise, noise_of
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.enums import CameraMode, ObservationLevel, StepMode
 from urlab_client.protocol.errors import URLabError
+from urlab_client.protocol.messages.session import StepOk
 from urlab_client.protocol.pixels import Pixels
+from urlab_client.sync.client import URLabClient as BlockingClient
 
-__all__ = ["EnvEpisode"]
+__all__ = ["EnvEpisode", "client_defaults", "compiled_prefixes", "fields_of", "first_camera"]
+
+
+def client_defaults(options: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return options of a client with those that environments choose otherwise than clients do.
+
+    They step, and another MuJoCo than the server's is no reason to refuse work: the client warns of that.
+    """
+    return {"step_mode": "direct", "mujoco_version_check": False, **options}
 
 
 def fields_of(observations: str | Sequence[str]) -> tuple[Field, ...]:
@@ -53,7 +64,8 @@ class EnvEpisode:
         cameras: Sequence[str],
         rendered: Sequence[str],
         n_substeps: int,
-        reset_noise: float,
+        reset_noise: float | ResetNoise,
+        keyframe: str | None,
     ) -> None:
         """Describe the episodes of a client.
 
@@ -64,7 +76,8 @@ class EnvEpisode:
             cameras: Cameras whose frames come with each observation, `ARTICULATION/CAMERA` or a scene-level name.
             rendered: Further cameras whose frames are to be in `frames`.
             n_substeps: Physics steps per action.
-            reset_noise: Largest deviation of hinge and slide joints at a reset, radians or metres.
+            reset_noise: Largest deviation of joints at a reset; a number is for hinge joints, radians.
+            keyframe: Where episodes start, unless a reset names another one.
 
         Raises:
             URLabError: The client has no model, no articulation, or is in live mode.
@@ -73,8 +86,7 @@ class EnvEpisode:
         """
         if n_substeps < 1:
             raise ValueError(f"n_substeps must be at least 1, not {n_substeps}")
-        if not 0 <= reset_noise < np.inf:
-            raise ValueError(f"reset_noise must be 0 or more, not {reset_noise}")
+        noise = noise_of(reset_noise)
         model = client.model
         if model is None or not client.articulations:
             raise URLabError(
@@ -90,18 +102,21 @@ class EnvEpisode:
         self.frames: dict[str, Pixels] = {}
         self._model = model
         fields = fields_of(observations)
-        self.mapping = SpaceMapping(model, list(client.articulations), fields, space_mode)
+        self.mapping = SpaceMapping(model, compiled_prefixes(client), fields, space_mode)
+        self._sensors = {key: [*self.mapping.layout(key).sensors] for key in self.mapping.keys}
         minimal = set(fields) <= set(LEVELS["minimal"])
         self.observation_space = self._with_cameras(cameras)
         self._observed_cameras = tuple(cameras)
         self._level = ObservationLevel.MINIMAL if minimal else ObservationLevel.STANDARD
         self._cameras = {name: client_camera(client, name) for name in (*cameras, *rendered)}
         self._n_substeps = n_substeps
-        self._noise = reset_noise
+        self._noise = noise
+        self._keyframe = keyframe
 
     async def reset(self, rng: np.random.Generator, keyframe: str | None = None) -> Observation:
         """Reset the simulation and return the first observation; set-points become zero."""
         client = self.client
+        keyframe = self._keyframe if keyframe is None else keyframe
         for articulation in client.articulations.values():
             articulation.ctrl_array[:] = 0.0
         await client.reset(keyframe)
@@ -120,11 +135,11 @@ class EnvEpisode:
         """
         for key, values in self.mapping.set_points(action).items():
             self.client.articulations[key].ctrl_array[:] = values
-        await self.client.step(
+        reply = await self.client.step(
             self._n_substeps, include_cameras=dict.fromkeys(self._cameras, "sync") or False, observations=self._level
         )
         self._take_frames()
-        return self._observe()
+        return self._observe(reply)
 
     def _noisy_positions(self, rng: np.random.Generator) -> dict[str, dict[str, float]]:
         """Return the present joint positions with noise on them."""
@@ -132,9 +147,11 @@ class EnvEpisode:
         for key in self.mapping.keys:
             articulation = self.client.articulations[key]
             names = self.mapping.joint_names(key, self._model)
-            offsets = rng.uniform(-self._noise, self._noise, len(names))
+            joints = self.mapping.layout(key).joints
+            ids = np.array([joints[name] for name in names], dtype=np.intp)
             present = articulation.get_qpos()
-            positions[key] = {name: present[name] + float(offset) for name, offset in zip(names, offsets, strict=True)}
+            drawn = self._noise.drawn(rng, self._model, ids, np.array([present[name] for name in names]))
+            positions[key] = dict(zip(names, drawn.tolist(), strict=True))
         return positions
 
     async def _look(self, keyframe: str | None, overrides: Mapping[str, Mapping[str, float]] | None) -> None:
@@ -162,11 +179,27 @@ class EnvEpisode:
                 )
             self.frames[name] = frame
 
-    def _observe(self) -> Observation:
-        observation = self.mapping.observe(self._read)
+    def _observe(self, reply: StepOk | None = None) -> Observation:
+        """Return the present observation; what a step has just brought is taken from its reply."""
+        states = {} if reply is None else reply.per_articulation
+
+        def read(key: str, field: Field) -> Floats:
+            state = states.get(key)
+            value: Any = None if state is None else getattr(state, field)
+            if value is None:
+                return self._read(key, field)
+            return np.array([n for name in self._sensors[key] for n in value[name]]) if field == "sensors" else value
+
+        observation = self.mapping.observe(read)
         if self._observed_cameras:
-            observation["cameras"] = {name: self.frames[name] for name in self._observed_cameras}
+            observation["cameras"] = {name: self._shown(name) for name in self._observed_cameras}
         return observation
+
+    def _shown(self, name: str) -> Pixels:
+        frame = self.frames[name]
+        if self._cameras[name].mode != CameraMode.REAL:
+            return frame
+        return np.ascontiguousarray(frame[..., :3], dtype=np.uint8)
 
     def _with_cameras(self, cameras: Sequence[str]) -> Space:
         mapping = self.mapping
@@ -193,8 +226,13 @@ class EnvEpisode:
                 return articulation.act_array
             case "sensors":
                 readings = articulation.get_sensors()
-                found = [np.atleast_1d(readings[name]) for name in self.mapping.layout(key).sensors]
+                found = [np.atleast_1d(readings[name]) for name in self._sensors[key]]
                 return np.concatenate(found) if found else np.zeros(0)
+
+
+def compiled_prefixes(client: URLabClient | BlockingClient) -> dict[str, str]:
+    """Return what compiled names begin with, by articulation."""
+    return {key: articulation.compiled_prefix for key, articulation in client.articulations.items()}
 
 
 def client_camera(client: URLabClient, name: str) -> URLabCameraView:
@@ -209,9 +247,25 @@ def client_camera(client: URLabClient, name: str) -> URLabCameraView:
     return client.global_cameras[name]
 
 
+def first_camera(client: URLabClient) -> str:
+    """Return the first camera that shows colours.
+
+    Raises:
+        ValueError: There is none.
+    """
+    for key, articulation in client.articulations.items():
+        for name, view in articulation.cameras.items():
+            if view.mode == CameraMode.REAL:
+                return f"{key}/{name}"
+    for name, view in client.global_cameras.items():
+        if view.mode == CameraMode.REAL:
+            return name
+    raise ValueError("the scene has no colour camera to render: add one to its MJCF, or use render_mode=None")
+
+
 def camera_space(view: URLabCameraView) -> Space:
-    """Return the space of a camera's frames: metres for depth, else four bytes per pixel."""
+    """Return the space of a camera's pictures: depths in metres, RGB as `render` has it, RGBA of segmentations."""
     width, height = view.resolution
     if view.mode == CameraMode.DEPTH:
         return spaces.Box(0.0, np.inf, (height, width), dtype=np.float32)
-    return spaces.Box(0, 255, (height, width, 4), dtype=np.uint8)
+    return spaces.Box(0, 255, (height, width, 3 if view.mode == CameraMode.REAL else 4), dtype=np.uint8)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
@@ -55,9 +56,9 @@ class SpaceMapping:
     """
 
     def __init__(
-        self, model: mujoco.MjModel, keys: Sequence[str], fields: Sequence[Field], mode: SpaceMode = "flat"
+        self, model: mujoco.MjModel, prefixes: Mapping[str, str], fields: Sequence[Field], mode: SpaceMode = "flat"
     ) -> None:
-        """Map the articulations `keys` of a compiled scene.
+        """Map articulations of a compiled scene, by key to what their compiled names begin with.
 
         Raises:
             ValueError: An unknown field or mode, or nothing to observe.
@@ -67,12 +68,15 @@ class SpaceMapping:
             raise ValueError(f"observations must be one or more of {', '.join(FIELDS)}, not {list(fields)!r}")
         if mode not in get_args(SpaceMode):
             raise ValueError(f"space_mode must be 'flat' or 'dict', not {mode!r}")
-        self.keys = tuple(keys)
+        self.keys = tuple(prefixes)
         self.fields = tuple(fields)
         self.mode: SpaceMode = mode
-        layouts = articulation_layouts(model, list(keys))
-        self._parts = {key: _part(model, layouts[key]) for key in keys}
+        layouts = articulation_layouts(model, list(prefixes.values()))
+        self._parts = {key: _part(model, layouts[prefix]) for key, prefix in prefixes.items()}
         self._where = self._slices()
+        ends = list(itertools.accumulate(len(part.low) for part in self._parts.values()))
+        self._n_actions = ends[-1]
+        self._actions = {key: slice(a, b) for key, a, b in zip(self._parts, [0, *ends], ends, strict=False)}
         self.action_space = self._make_action_space()
         self.observation_space = self._make_observation_space()
 
@@ -96,10 +100,9 @@ class SpaceMapping:
             found = {key: np.asarray(action[key], dtype=np.float64) for key in self.keys}
         else:
             whole = np.asarray(action, dtype=np.float64)
-            ends = np.cumsum([len(part.low) for part in self._parts.values()])
-            if whole.ndim == 0 or whole.shape[-1] != ends[-1]:
-                raise ValueError(f"the action has shape {whole.shape}; its last axis must be {ends[-1]} long")
-            found = dict(zip(self.keys, np.split(whole, ends[:-1], axis=-1), strict=True))
+            if whole.ndim == 0 or whole.shape[-1] != self._n_actions:
+                raise ValueError(f"the action has shape {whole.shape}; its last axis must be {self._n_actions} long")
+            found = {key: whole[..., where] for key, where in self._actions.items()}
         for key, values in found.items():
             n_ctrl = len(self._parts[key].low)
             if values.ndim == 0 or values.shape[-1] != n_ctrl:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import asyncio
 import os
 from collections.abc import Callable, Coroutine, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
+import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
@@ -17,9 +19,10 @@ from numpy.typing import NDArray
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.launch import SCHEME, with_model_options, with_start_timeout
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn
-from urlab_client.integrations.gym.episode import EnvEpisode
+from urlab_client.integrations.gym.episode import EnvEpisode, client_defaults, first_camera
 from urlab_client.integrations.gym.spaces import Observation, SpaceMode
-from urlab_client.integrations.gym.vectorized import Found, Indices, Vectorized
+from urlab_client.integrations.gym.starts import ResetNoise, noise_of
+from urlab_client.integrations.gym.vectorized import Found, Indices, Vectorized, check_render_mode
 from urlab_client.protocol.errors import URLabError
 from urlab_client.sync._portal import Portal
 
@@ -33,6 +36,13 @@ def _processors() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+@dataclass(frozen=True)
+class _Rendered:
+    """That pictures are drawn, and of which camera; the first one for None."""
+
+    camera: str | None
+
+
 class _Session:
     """One environment: its client, and what is needed to start it again."""
 
@@ -42,13 +52,16 @@ class _Session:
         starts: asyncio.Semaphore,
         client_options: Mapping[str, Any],
         episode_options: Mapping[str, Any],
+        rendered: _Rendered | None,
     ) -> None:
         self.address = address
         self.restarts = -1
+        self.shown: tuple[str, ...] = ()
         self.episode: EnvEpisode | None = None
         self._starts = starts
         self._client_options = client_options
         self._episode_options = episode_options
+        self._rendered = rendered
         self._opening: asyncio.Task[None] | None = None
 
     async def reset(self, rng: np.random.Generator, keyframe: str | None, timeout: float) -> Observation:
@@ -88,7 +101,10 @@ class _Session:
             client = URLabClient(with_model_options(self.address), **self._client_options)
             try:
                 await client.discover()
-                self.episode = EnvEpisode(client, **self._episode_options)
+                wanted = self._rendered
+                shown = () if wanted is None else (wanted.camera or first_camera(client),)
+                self.episode = EnvEpisode(client, rendered=shown, **self._episode_options)
+                self.shown = shown
             except BaseException:
                 await client.close()
                 raise
@@ -133,7 +149,10 @@ class URLabVectorEnv(Vectorized):
         max_episode_steps: int | None = None,
         cameras: Sequence[str] = (),
         n_substeps: int = 1,
-        reset_noise: float = 0.0,
+        reset_noise: float | ResetNoise = 0.0,
+        keyframe: str | None = None,
+        render_mode: Literal["rgb_array"] | None = None,
+        render_camera: str | None = None,
         autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
         step_timeout: float = 10.0,
         start_timeout: float = 60.0,
@@ -153,6 +172,9 @@ class URLabVectorEnv(Vectorized):
             cameras: See `URLabEnv`.
             n_substeps: See `URLabEnv`.
             reset_noise: See `URLabEnv`.
+            keyframe: See `URLabEnv`.
+            render_mode: None or `rgb_array`, with which every step draws a picture of each environment.
+            render_camera: Camera that `render` shows; the first one of the scene by default.
             autoreset_mode: `NEXT_STEP`, `SAME_STEP` or `DISABLED`.
             step_timeout: Seconds an environment may take for a step or reset.
             start_timeout: Seconds a server may take to start, each counted from its own start.
@@ -177,16 +199,18 @@ class URLabVectorEnv(Vectorized):
             "space_mode": space_mode,
             "observations": observations,
             "cameras": tuple(cameras),
-            "rendered": (),
             "n_substeps": n_substeps,
-            "reset_noise": reset_noise,
+            "reset_noise": noise_of(reset_noise),
+            "keyframe": keyframe,
         }
         self._step_timeout = step_timeout
         self._addresses = tuple(addresses)
-        client_options = {"step_mode": "direct", **client_options}
+        client_options = client_defaults(client_options)
+        check_render_mode(render_mode)
+        rendered = None if render_mode is None else _Rendered(render_camera)
         starts = asyncio.Semaphore(_processors())
         self._sessions = [
-            _Session(with_start_timeout(address, start_timeout), starts, client_options, episode_options)
+            _Session(with_start_timeout(address, start_timeout), starts, client_options, episode_options, rendered)
             for address in addresses
         ]
         self._portal = Portal()
@@ -204,8 +228,29 @@ class URLabVectorEnv(Vectorized):
             max_episode_steps=max_episode_steps,
             autoreset_mode=autoreset_mode,
         )
+        self.render_mode = render_mode
+        self._pictures: dict[int, NDArray[np.uint8]] = {}
         self._sim_time = np.zeros(self.num_envs)
         self._step_count = np.zeros(self.num_envs, dtype=np.int64)
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Return each environment's picture of the last reset or step, shape (H, W, 3), RGB; None without a mode.
+
+        An environment that failed shows its last picture, or black before its first.
+
+        Raises:
+            gymnasium.error.ResetNeeded: There was no reset yet.
+        """
+        if self.render_mode is None:
+            return None
+        for i, session in enumerate(self._sessions):
+            episode = session.episode
+            if episode is not None and session.shown and session.shown[0] in episode.frames:
+                self._pictures[i] = np.array(episode.frames[session.shown[0]][..., :3], dtype=np.uint8)
+        if not self._pictures:
+            raise gymnasium.error.ResetNeeded("call reset() before render()")
+        black = np.zeros_like(next(iter(self._pictures.values())))
+        return tuple(self._pictures.get(i, black) for i in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the clients, and the servers they started."""

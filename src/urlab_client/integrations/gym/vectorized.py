@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn, keyframe_option
 from urlab_client.integrations.gym.spaces import Observation, Space, SpaceMapping
 
-__all__ = ["Bools", "Floats", "Found", "Indices", "Vectorized"]
+__all__ = ["Bools", "Floats", "Found", "Indices", "Vectorized", "check_render_mode"]
 
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
@@ -40,6 +40,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         autoreset_mode: What happens to environments whose episode ended.
     """
 
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012 - Gymnasium's
     mapping: SpaceMapping
     observation_space: Space
     action_space: Space
@@ -201,6 +202,16 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
 
     def _copied(self) -> Observation:
         return _map(np.copy, self._observations)
+
+
+def check_render_mode(render_mode: str | None) -> None:
+    """Refuse what is not a render mode.
+
+    Raises:
+        ValueError: It is neither None nor `rgb_array`.
+    """
+    if render_mode not in (None, "rgb_array"):
+        raise ValueError(f"render_mode must be None or 'rgb_array', not {render_mode!r}")
 
 
 def _errors_in(infos: dict[str, Any]) -> dict[int, Exception]:

@@ -378,6 +378,11 @@ def _advice(raw: dict[str, Any], problem: str, where: str) -> str | None:
             if term is None or "field" not in problem
             else f"Its keys are term, {', '.join(term.__struct_fields__)}."
         )
+    if not where and any(key in problem for key in ("normal", "obs_rms", "vec_norm")):
+        return (
+            "Observations are normalised by the `offset` and `scale` of each term, clip((value - offset) * scale): the "
+            "mean, and 1 / the standard deviation. Or export the normaliser as part of the network."
+        )
     table = _TABLES.get(where)
     return None if table is None or "field" not in problem else f"Its keys are {', '.join(table.__struct_fields__)}."
 

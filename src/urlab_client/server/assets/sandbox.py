@@ -90,7 +90,8 @@ class _Child:
 
     def _start(self) -> subprocess.Popen[bytes]:
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "urlab_client.server.assets.sandbox"],
+            # Not `-m`: importing the package imports this module, of which Python warns when it is to be run as well.
+            [sys.executable, "-c", "from urlab_client.server.assets import sandbox; sandbox.serve()"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             **APART,
@@ -146,7 +147,7 @@ def build_confined(file: Path, snapshot: Path, roots: tuple[Path, ...], limits: 
 # The child.
 
 
-def _serve() -> None:
+def serve() -> None:
     """Take orders from standard input until it ends."""
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what libraries print is not an answer
@@ -244,7 +245,3 @@ def _exceeded(compiled: Compiled, limits: Limits) -> str:
         if value > limit:
             return f"{what.format(value)}, more than the limit {name}, {limit}"
     return compiled.options_problem
-
-
-if __name__ == "__main__":
-    _serve()

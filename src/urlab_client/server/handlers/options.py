@@ -19,4 +19,4 @@ def set_sim_options(server: ServerCore, request: SetSimOptions) -> SetSimOptions
     options = need(request, request.options, "options")
     with running.engine.lock:
         echo = running.options.apply(running.scene.model, running.scene.data, options)
-    return SetSimOptionsOk(options=cast("SimOptions", echo))  # the same fields in the order of the wire
+    return SetSimOptionsOk(options=cast("SimOptions", echo))  # its fields, in the order of the wire

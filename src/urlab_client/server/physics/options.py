@@ -7,14 +7,13 @@ time, spoil the state or keep the solver busy for good: the server may have othe
 from __future__ import annotations
 
 import os
-from typing import Any, Final
+from typing import Any, Final, get_type_hints
 
 import mujoco
 import numpy as np
-from msgspec import Struct
+from msgspec import Struct, defstruct
 
 from urlab_client._mujoco import set_threads, thread_limit
-from urlab_client.protocol.base import Vec3
 from urlab_client.protocol.dialects import ALPHA, Dialect
 from urlab_client.protocol.types import SimOptions
 from urlab_client.server.assets.option_ranges import option_problem
@@ -22,7 +21,7 @@ from urlab_client.server.limits import Limits
 from urlab_client.server.physics.controllers import float32
 from urlab_client.server.refusal import Refusal
 
-__all__ = ["OptionOverrides", "OptionsInForce"]
+__all__ = ["OptionOverrides"]
 
 CHOICES: Final = {
     "integrator": {
@@ -50,61 +49,22 @@ SCALARS: Final = (
     "sleep_tolerance",
 )
 SCALED: Final = ("gravity", "wind")
-IN_ORDER: Final = (
-    "timestep",
-    "gravity",
-    "wind",
-    "magnetic",
-    "density",
-    "viscosity",
-    "impratio",
-    "tolerance",
-    "iterations",
-    "ls_iterations",
-    "integrator",
-    "cone",
-    "solver",
-    "noslip_iterations",
-    "noslip_tolerance",
-    "ccd_iterations",
-    "ccd_tolerance",
-    "enable_multiccd",
-    "enable_sleep",
-    "sleep_tolerance",
-)
+THREADS: Final = ("num_worker_threads", "max_worker_threads")
+MASKS: Final = ("disableflags", "enableflags")
+IN_ORDER: Final = tuple(name for name in SimOptions.__struct_fields__ if name not in (*THREADS, *MASKS))
 """The remembered options in the order in which a request's are looked at: an unknown name stops at its place."""
+
+IN_REPLY: Final = (IN_ORDER[0], *THREADS, *IN_ORDER[1:], *MASKS)
+"""All options in the order of the reply."""
+
+_TYPES: Final = get_type_hints(SimOptions)
+OptionsInForce = defstruct(
+    "OptionsInForce", [(name, _TYPES[name], None) for name in IN_REPLY], omit_defaults=True, module=__name__
+)
+"""The fields of `SimOptions` in that order."""
 
 SLEEP: Final = int(mujoco.mjtEnableBit.mjENBL_SLEEP)
 NO_MULTICCD: Final = int(mujoco.mjtDisableBit.mjDSBL_MULTICCD)
-
-
-class OptionsInForce(Struct, omit_defaults=True):
-    """The fields of `SimOptions` in the order of the reply; a derived struct would keep the other order."""
-
-    timestep: float | None = None
-    num_worker_threads: int | None = None
-    max_worker_threads: int | None = None
-    gravity: Vec3 | None = None
-    wind: Vec3 | None = None
-    magnetic: Vec3 | None = None
-    density: float | None = None
-    viscosity: float | None = None
-    impratio: float | None = None
-    tolerance: float | None = None
-    iterations: int | None = None
-    ls_iterations: int | None = None
-    integrator: str | None = None
-    cone: str | None = None
-    solver: str | None = None
-    noslip_iterations: int | None = None
-    noslip_tolerance: float | None = None
-    ccd_iterations: int | None = None
-    ccd_tolerance: float | None = None
-    enable_multiccd: bool | None = None
-    enable_sleep: bool | None = None
-    sleep_tolerance: float | None = None
-    disableflags: int | None = None
-    enableflags: int | None = None
 
 
 class OptionOverrides:
@@ -128,7 +88,7 @@ class OptionOverrides:
         self._kept: dict[str, Any] = {"integrator": int(model.opt.integrator), "sleep_tolerance": self._number(1e-4)}
         self._threads = 0
 
-    def apply(self, model: mujoco.MjModel, data: mujoco.MjData, options: SimOptions) -> OptionsInForce:
+    def apply(self, model: mujoco.MjModel, data: mujoco.MjData, options: SimOptions) -> Struct:
         """Take over the options that are not None, write all remembered ones and return what is in force.
 
         Raises:
@@ -143,7 +103,7 @@ class OptionOverrides:
         for name, value in given:
             self._kept[name] = self._stored(name, value)
         opt, kept = model.opt, self._kept
-        for name in ("disableflags", "enableflags"):
+        for name in MASKS:
             mask = getattr(options, name)
             if mask is not None:
                 setattr(opt, name, mask)
@@ -168,33 +128,17 @@ class OptionOverrides:
             set_threads(data, threads)
             self._threads = threads
 
-    def _in_force(self, model: mujoco.MjModel) -> OptionsInForce:
+    def _in_force(self, model: mujoco.MjModel) -> Struct:
         opt = model.opt
+        computed: dict[str, object] = {
+            "num_worker_threads": self._threads,
+            "max_worker_threads": thread_limit(_cores()),
+            "enable_multiccd": not opt.disableflags & NO_MULTICCD,
+            "enable_sleep": bool(opt.enableflags & SLEEP),
+            **{name: self._choice(name, getattr(opt, name)) for name in CHOICES},
+        }
         return OptionsInForce(
-            timestep=opt.timestep,
-            num_worker_threads=self._threads,
-            max_worker_threads=thread_limit(_cores()),
-            gravity=_vec3(opt.gravity),
-            wind=_vec3(opt.wind),
-            magnetic=_vec3(opt.magnetic),
-            density=opt.density,
-            viscosity=opt.viscosity,
-            impratio=opt.impratio,
-            tolerance=opt.tolerance,
-            iterations=opt.iterations,
-            ls_iterations=opt.ls_iterations,
-            integrator=self._choice("integrator", opt.integrator),
-            cone=self._choice("cone", opt.cone),
-            solver=self._choice("solver", opt.solver),
-            noslip_iterations=opt.noslip_iterations,
-            noslip_tolerance=opt.noslip_tolerance,
-            ccd_iterations=opt.ccd_iterations,
-            ccd_tolerance=opt.ccd_tolerance,
-            enable_multiccd=not opt.disableflags & NO_MULTICCD,
-            enable_sleep=bool(opt.enableflags & SLEEP),
-            sleep_tolerance=opt.sleep_tolerance,
-            disableflags=opt.disableflags,
-            enableflags=opt.enableflags,
+            **{name: computed[name] if name in computed else _plain(getattr(opt, name)) for name in IN_REPLY}
         )
 
     def _stored(self, name: str, value: Any) -> Any:
@@ -220,8 +164,8 @@ class OptionOverrides:
         return text if self._dialect.options_float32 else MJCF_SPELLING.get(text, text)
 
 
-def _vec3(values: np.ndarray[Any, np.dtype[np.float64]]) -> Vec3:
-    return (float(values[0]), float(values[1]), float(values[2]))
+def _plain(value: object) -> object:
+    return value.tolist() if isinstance(value, np.ndarray) else value
 
 
 def _switched(mask: int, bit: int, on: bool) -> int:

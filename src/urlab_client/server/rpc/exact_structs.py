@@ -13,7 +13,7 @@ from msgspec import NODEFAULT, Struct, inspect
 
 from urlab_client.server.rpc.coercion import INT32_MAX, INT32_MIN
 
-__all__ = ["collision_test_of", "holds_anything", "strict_array", "strict_struct", "type_info"]
+__all__ = ["collision_test_of", "longest_string", "strict_array", "strict_struct", "string_measures_of", "type_info"]
 
 
 # Inspecting the types took most of a server's start, and gives the same for every server.
@@ -28,7 +28,11 @@ def strict_array(kind: type, value: object) -> np.ndarray[Any, np.dtype[np.float
 
 @cache
 def strict_struct(struct: type[Struct]) -> type[Struct]:
-    """Derive a struct that refuses unknown fields and integers beyond 32 bits, here and in the structs it holds."""
+    """Derive a struct that refuses unknown fields and integers beyond 32 bits, here and in the structs it holds.
+
+    Raises:
+        TypeError: A field takes any value.
+    """
     hints = get_type_hints(struct, include_extras=True)
     changed: list[tuple[str, Any, Any]] = []
     for field in msgspec.structs.fields(struct):
@@ -62,6 +66,8 @@ _REWRITTEN: Final[frozenset[Any]] = frozenset((Annotated, Union, types.UnionType
 def _strict_annotation(annotation: Any) -> Any:
     if annotation is int:
         return Annotated[int, msgspec.Meta(ge=INT32_MIN, le=INT32_MAX)]
+    if annotation is Any:
+        raise TypeError("a field that takes any value is read field by field")
     if inspect.is_struct_type(annotation):
         return strict_struct(annotation)
     origin: Any = get_origin(annotation)
@@ -74,19 +80,6 @@ def _strict_annotation(annotation: Any) -> Any:
     if origin is Annotated:
         return Annotated[(strict[0], *arguments[1:])]
     return (Union if origin is types.UnionType else origin)[strict]
-
-
-def holds_anything(info: inspect.Type) -> bool:
-    """Whether a field takes any plain value, which only `_tidy` can make the plugin's view of."""
-    match info:
-        case inspect.Metadata(type=inner) | inspect.ListType(item_type=inner) | inspect.DictType(value_type=inner):
-            return holds_anything(inner)
-        case inspect.UnionType(types=members):
-            return any(map(holds_anything, members))
-        case inspect.StructType(fields=fields):
-            return any(holds_anything(field.type) for field in fields)
-        case _:
-            return isinstance(info, inspect.AnyType)
 
 
 def _collision_test(info: inspect.Type) -> Callable[[Any], bool] | None:
@@ -133,3 +126,70 @@ def _struct_collision_test(tests: list[tuple[str, Callable[[Any], bool]]]) -> Ca
         return False
 
     return collides
+
+
+def longest_string(value: object) -> int:
+    """Return the length of the longest string in a value of a request, whatever it is."""
+    match value:
+        case str():
+            return len(value)
+        case dict():
+            items = cast("dict[object, object]", value)
+            return max((max(longest_string(key), longest_string(item)) for key, item in items.items()), default=0)
+        case list() | tuple():
+            return max(map(longest_string, cast("list[object]", value)), default=0)
+        case Struct():
+            return max((longest_string(getattr(value, name)) for name in value.__struct_fields__), default=0)
+        case _:
+            return 0
+
+
+@cache
+def string_measures_of(kind: type[Struct]) -> tuple[tuple[str, Callable[[Any], int]], ...]:
+    """Return how to find the longest string in each field that can hold one, for values of exactly this type.
+
+    What holds numbers alone, as nearly all of a step of many robots, is not looked at.
+    """
+    fields = msgspec.structs.fields(kind)
+    return tuple((f.name, measure) for f in fields if (measure := _string_measure(type_info(f.type))) is not None)
+
+
+def _string_measure(info: inspect.Type) -> Callable[[Any], int] | None:  # noqa: PLR0911
+    match info:
+        case inspect.Metadata(type=inner):
+            return _string_measure(inner)
+        case inspect.UnionType(types=members):
+            present = [member for member in members if not isinstance(member, inspect.NoneType)]
+            if len(present) == 1:
+                return _optional_measure(_string_measure(present[0]))
+            return longest_string if any(_string_measure(member) is not None for member in present) else None
+        case inspect.DictType(value_type=item):
+            return _dict_measure(_string_measure(item))
+        case inspect.ListType(item_type=item) | inspect.VarTupleType(item_type=item):
+            measure = _string_measure(item)
+            return None if measure is None else lambda values: max(map(measure, values), default=0)
+        case inspect.StructType(cls=cls):
+            return _struct_measure(cls)
+        case inspect.FloatType() | inspect.IntType() | inspect.BoolType() | inspect.NoneType() | inspect.CustomType():
+            return None
+        case _:
+            return longest_string
+
+
+def _optional_measure(measure: Callable[[Any], int] | None) -> Callable[[Any], int] | None:
+    return None if measure is None else lambda value: 0 if value is None else measure(value)
+
+
+def _dict_measure(of_items: Callable[[Any], int] | None) -> Callable[[Any], int]:
+    def measure(value: dict[str, Any]) -> int:
+        of_keys = max(map(len, value), default=0)
+        return of_keys if of_items is None else max(of_keys, max(map(of_items, value.values()), default=0))
+
+    return measure
+
+
+def _struct_measure(kind: type[Struct]) -> Callable[[Any], int]:
+    def measure(value: Struct) -> int:
+        return max((of_field(getattr(value, name)) for name, of_field in string_measures_of(kind)), default=0)
+
+    return measure

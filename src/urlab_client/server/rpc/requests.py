@@ -1,8 +1,12 @@
 """From the bytes of a request to a typed struct, by the plugin's rules of detection and coercion.
 
-For the dispatcher. A request that means exactly what it says, which is every request of a sane client, is decoded by
-msgspec in one go. Anything else is decoded to plain data and coerced field by field, as the plugin's engine does: names
-and numbers in odd spellings are understood, unusable values count as absent. Both ways agree where the first succeeds.
+For the dispatcher. A request is decoded to plain data and coerced field by field, as the plugin's engine does: names
+and numbers in odd spellings are understood, unusable values count as absent. A `step` that means exactly what it says
+is decoded by msgspec in one go, and so is a piece of an upload. Both ways agree where the second succeeds.
+
+What that saves, in processor time: field by field a bare `step` takes 6 us instead of 0.5, one with 12 set-points 18
+instead of 1.2, and a piece of an upload 4.5 ms a MiB instead of 0.1. The other ops come too seldom to be worth 0.8 ms
+each of the server's start.
 """
 
 from __future__ import annotations
@@ -10,7 +14,7 @@ from __future__ import annotations
 import types
 from collections.abc import Callable, Mapping
 from functools import cached_property
-from typing import Any, Final, TypeVar, Union, cast
+from typing import Any, Final, TypeVar, Union
 
 import msgspec
 from msgspec import UNSET, Struct
@@ -23,10 +27,10 @@ from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.coercion import ABSENT, as_text, struct_converter
 from urlab_client.server.rpc.exact_structs import (
     collision_test_of,
-    holds_anything,
+    longest_string,
     strict_array,
     strict_struct,
-    type_info,
+    string_measures_of,
 )
 from urlab_client.server.rpc.plain_data import Plain, bad_request, decode_plain, fold_keys
 
@@ -79,6 +83,10 @@ def need(request: Request[Any], value: T, field: str) -> T:
     return value
 
 
+class _Nameless(Struct, tag_field="op", tag=""):
+    """Beside another struct in the decoder: alone, that one would take requests without an op."""
+
+
 class RequestReader:
     """Reads frames into requests. Has no state of its own, so any thread may use it."""
 
@@ -99,18 +107,18 @@ class RequestReader:
         self._limits = limits
         self._exact: dict[type, Op] = {}
         self._loose: dict[str, _LooseOp] = {}
-        strict: list[type[Request[Any]]] = []
+        strict: list[type[Struct]] = [_Nameless]
         for op in ops.values():
             struct = structs.get(op.name, op.request)
             if not issubclass(struct, op.request):
                 raise TypeError(f"{struct.__name__} does not derive from {op.request.__name__}")
             self._loose[op.name] = _LooseOp(op, struct)
-            if not holds_anything(type_info(struct)):
-                exact = cast("type[Request[Any]]", strict_struct(struct))
+            if op.hot:
+                exact = strict_struct(struct)
                 self._exact[exact] = op
                 strict.append(exact)
         with building():
-            self._decoder: msgspec.msgpack.Decoder[Request[Any]] = msgspec.msgpack.Decoder(
+            self._decoder: msgspec.msgpack.Decoder[Request[Any] | _Nameless] = msgspec.msgpack.Decoder(
                 Union[tuple(strict)],  # noqa: UP007 - a union of a run-time list
                 dec_hook=strict_array,
             )
@@ -125,21 +133,25 @@ class RequestReader:
             request = self._decoder.decode(frame)
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
             return self._read_loosely(frame)
+        if isinstance(request, _Nameless):
+            return self._read_loosely(frame)
         kind = type(request)
         collides = collision_test_of(kind)
         if len(frame) > self._limits.request_bytes or (collides is not None and collides(request)):
             return self._read_loosely(frame)
         op = self._exact[kind]
-        self._check_strings(op, request, frame)
+        self._check_strings(op, request, frame, exact=True)
         return Incoming(op.name, op, request.session_id, request)
 
-    def _check_strings(self, op: Op, request: Request[Any], frame: bytes) -> None:
+    def _check_strings(self, op: Op, request: Request[Any], frame: bytes, *, exact: bool) -> None:
         most = self._limits.string_chars
         if len(frame) <= most:  # which spares nearly every request the search
             return
-        for field in msgspec.structs.fields(request):
-            longest = _longest(getattr(request, field.name))
+        anything = ((name, longest_string) for name in request.__struct_fields__)
+        for name, measure in string_measures_of(type(request)) if exact else anything:
+            longest = measure(getattr(request, name))
             if longest > most:
+                field = next(field for field in msgspec.structs.fields(request) if field.name == name)
                 raise bad_request(
                     f"{op.name}: field '{field.encode_name}' holds a string of {longest} characters, more than the "
                     f"limit string_chars, {most}"
@@ -160,24 +172,8 @@ class RequestReader:
             return Incoming(name, session_id=_session_id(fields))
         missing = tuple(field for field in loose.declared if field.lower() not in fields)
         request = loose.convert(fields)
-        self._check_strings(loose.op, request, frame)
+        self._check_strings(loose.op, request, frame, exact=False)
         return Incoming(name, loose.op, _session_id(fields), request, missing)
-
-
-def _longest(value: object) -> int:
-    """Return the length of the longest string in a value of a request."""
-    match value:
-        case str():
-            return len(value)
-        case dict():
-            items = cast("dict[object, object]", value)
-            return max((max(_longest(key), _longest(item)) for key, item in items.items()), default=0)
-        case list() | tuple():
-            return max(map(_longest, cast("list[object]", value)), default=0)
-        case Struct():
-            return max((_longest(getattr(value, name)) for name in value.__struct_fields__), default=0)
-        case _:
-            return 0
 
 
 def _session_id(fields: Mapping[str, Plain]) -> str:
