@@ -19,10 +19,14 @@ __all__ = [
     "Pose",
     "SceneDescription",
     "SensorDescription",
+    "SetPointMeaning",
 ]
 
 JointKind = Literal["free", "ball", "slide", "hinge"]
 """What a joint allows: all of six degrees of freedom, three rotations, one translation, one rotation."""
+
+SetPointMeaning = Literal["force", "position", "velocity", ""]
+"""What an actuator does with a set-point: make a force of it, or pull towards it; empty where that is not known."""
 
 
 class Pose(Struct, frozen=True, kw_only=True):
@@ -76,7 +80,7 @@ class ActuatorDescription(Struct, frozen=True, kw_only=True):
     name: str
     kind: str | None
     joint: str | None
-    takes: Literal["force", "position", "velocity", ""]
+    takes: SetPointMeaning
     unit: str
     limits: tuple[float, float] | None
     force_limits: tuple[float, float] | None

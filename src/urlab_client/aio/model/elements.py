@@ -14,7 +14,13 @@ from urlab_client.aio.model.layout import JOINT_TRANSMISSIONS, QPOS_WIDTH, QVEL_
 from urlab_client.aio.model.numbers import finite, finite_array, is_array
 from urlab_client.aio.model.units import JOINT_KINDS, joint_unit, sensor_kind, sensor_unit, set_point_meaning
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.descriptions import ActuatorDescription, JointDescription, JointKind, SensorDescription
+from urlab_client.protocol.descriptions import (
+    ActuatorDescription,
+    JointDescription,
+    JointKind,
+    SensorDescription,
+    SetPointMeaning,
+)
 from urlab_client.protocol.enums import ActuatorType, OutOfRange, known
 from urlab_client.protocol.names import NameMap
 
@@ -148,7 +154,10 @@ class Actuator:
     def describe(self) -> ActuatorDescription:
         """Return what it is and what it is told."""
         record, model = self._record, self._record.mirror.model
-        takes, unit = ("", "") if model is None else set_point_meaning(model, self.id)
+        takes: SetPointMeaning = ""
+        unit = ""
+        if model is not None:
+            takes, unit = set_point_meaning(model, self.id)
         if record.takes_positions:
             takes, unit = "position", "" if model is None or self.joint is None else _unit_of(record, model, self.joint)
         low, high = (float(bounds[self.ctrl_local.start]) for bounds in record.ranges())

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from urlab_client.aio.model.layout import JOINT_TRANSMISSIONS
-from urlab_client.protocol.descriptions import JointKind
+from urlab_client.protocol.descriptions import JointKind, SetPointMeaning
 
 if TYPE_CHECKING:
     import mujoco
@@ -72,7 +72,7 @@ def sensor_unit(model: mujoco.MjModel, sensor: int) -> str:
     return _SENSOR_UNITS.get(what, "")
 
 
-def set_point_meaning(model: mujoco.MjModel, actuator: int) -> tuple[Literal["force", "position", "velocity", ""], str]:
+def set_point_meaning(model: mujoco.MjModel, actuator: int) -> tuple[SetPointMeaning, str]:
     """Return what a set-point of an actuator means, from its gain and bias, and the unit where it is known.
 
     An actuator with affine bias pulls towards its set-point: a servo of position or velocity. One without bias makes a
@@ -90,7 +90,7 @@ def set_point_meaning(model: mujoco.MjModel, actuator: int) -> tuple[Literal["fo
     if int(model.actuator_biastype[actuator]) == mujoco.mjtBias.mjBIAS_AFFINE.value:
         if bias[1]:
             integrates = int(model.actuator_dyntype[actuator]) == mujoco.mjtDyn.mjDYN_INTEGRATOR.value
-            word = "velocity" if integrates else "position"
+            word: SetPointMeaning = "velocity" if integrates else "position"
         else:
             word = "velocity" if bias[2] else ""
         scaled = bool(word) and gain[0] == -(bias[1] or bias[2])
