@@ -82,6 +82,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "aio": (
         "event_loop",
         "deadline",
+        "session_level",
         "mutex",
         "stream_buffer",
         "transport",
@@ -95,6 +96,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "model",
         "controllers",
         "cameras",
+        "motion",
         "articulation",
         "state",
         "explain",
@@ -210,6 +212,58 @@ def test_imports_point_one_way() -> None:
 
 def test_imports_inside_the_large_layers_point_one_way() -> None:
     assert room_violations(PACKAGE) == []
+
+
+# What stands on the client uses its public API alone.
+ON_THE_CLIENT = ("integrations", "cluster", "web", "cli")
+# Public by the reference all the same.
+PUBLIC_ALL_THE_SAME = frozenset({"_data_lock"})
+
+
+def private_names(package: Path) -> set[str]:
+    """Return the private attributes that the objects of both clients have."""
+    trees = (
+        ast.parse(file.read_text("utf-8")) for flavour in ("aio", "sync") for file in (package / flavour).rglob("*.py")
+    )
+    return {
+        node.attr if isinstance(node, ast.Attribute) else node.name
+        for tree in trees
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        or (isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store))
+        if (node.attr if isinstance(node, ast.Attribute) else node.name).startswith("_")
+    }
+
+
+def private_uses(package: Path) -> list[str]:
+    """Return where code that stands on the client reaches into one of its objects."""
+    private = private_names(package) - PUBLIC_ALL_THE_SAME
+    found: list[str] = []
+    for file in sorted(file for layer in ON_THE_CLIENT for file in (package / layer).rglob("*.py")):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"), str(file))):
+            if not isinstance(node, ast.Attribute) or node.attr not in private or node.attr.startswith("__"):
+                continue
+            if not (isinstance(node.value, ast.Name) and node.value.id in {"self", "cls"}):
+                found.append(f"{file.relative_to(package.parent).as_posix()}:{node.lineno}: {ast.unparse(node)}")
+    return found
+
+
+def test_what_stands_on_the_client_uses_its_public_attributes() -> None:
+    assert private_uses(PACKAGE) == []
+
+
+def test_a_private_attribute_of_the_client_is_found(tmp_path: Path) -> None:
+    package = tmp_path / "urlab_client"
+    for file, source in {
+        "aio/client.py": "class C:\n    def __init__(self):\n        self._state = 1\n    def _keep(self): ...\n",
+        "web/a.py": "def f(self, client):\n    client._keep()\n    return client._data_lock, self.client._state\n",
+    }.items():
+        (package / file).parent.mkdir(parents=True)
+        (package / file).write_text(source)
+    assert private_uses(package) == [
+        "urlab_client/web/a.py:2: client._keep",
+        "urlab_client/web/a.py:3: self.client._state",
+    ]
 
 
 def test_every_room_with_a_place_exists() -> None:

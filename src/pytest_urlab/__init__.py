@@ -84,7 +84,11 @@ def urlab_faults(urlab_server: SimulatedServer) -> Faults:
 
 @pytest.fixture
 def _urlab_client_options(urlab_server: SimulatedServer, _urlab_mark: pytest.Mark) -> dict[str, Any]:
-    return {"step_mode": _urlab_mark.kwargs.get("step_mode", "auto"), **urlab_server.client_options()}
+    return {
+        "step_mode": _urlab_mark.kwargs.get("step_mode", "auto"),
+        "mujoco_version_check": False,
+        **urlab_server.client_options(),
+    }
 
 
 @pytest.fixture

@@ -63,6 +63,7 @@ if TYPE_CHECKING:
         NotInEditor,
         NotMocapBody,
         NotReady,
+        NotSettled,
         NoTwistController,
         NoViewport,
         NoWorld,
@@ -128,6 +129,7 @@ if TYPE_CHECKING:
         StreamStats,
     )
     from urlab_client.protocol.names import UnknownName
+    from urlab_client.protocol.observer import ClientObserver
     from urlab_client.protocol.scene_types import (
         ActorBounds,
         ActorHierarchyNode,
@@ -178,6 +180,7 @@ _HOMES = (
     "urlab_client.protocol.enums",
     "urlab_client.protocol.errors",
     "urlab_client.protocol.names",
+    "urlab_client.protocol.observer",
     "urlab_client.protocol.client_types",
     "urlab_client.protocol.scene_types",
     "urlab_client.protocol.types",
@@ -240,6 +243,7 @@ __all__ = [
     "ClientClosed",
     "ClientConfig",
     "ClientEvent",
+    "ClientObserver",
     "ConcurrentReadError",
     "ConnectionLost",
     "Contact",
@@ -288,6 +292,7 @@ __all__ = [
     "NotInEditor",
     "NotMocapBody",
     "NotReady",
+    "NotSettled",
     "ObservationLevel",
     "OutcomeUnknown",
     "PIEStartResult",

@@ -30,6 +30,7 @@ __all__ = [
     "acting_kind",
     "actuator_count",
     "actuator_kind",
+    "asset_bytes",
     "batch_class",
     "check_copy",
     "control_counts",
@@ -358,6 +359,18 @@ def batch_class() -> Any:
         return importlib.import_module("mujoco.batch").Batch
     except ImportError:
         return None
+
+
+def asset_bytes(model: mujoco.MjModel) -> int:
+    """Return how many bytes of a model are meshes and textures, which `merge_assets` shares.
+
+    Before 3.17 nothing is shared, and this is 0.
+    """
+    import mujoco  # noqa: PLC0415
+
+    if not hasattr(mujoco.MjSpec, "dedup_assets"):
+        return 0
+    return sum(getattr(model, name).nbytes for name in dir(model) if name.startswith(("mesh_", "tex_")))
 
 
 def merge_assets(spec: mujoco.MjSpec, folders: Iterable[Path]) -> None:

@@ -246,6 +246,8 @@ async def test_observation_levels(connect: Any, serve: Any) -> None:
         assert all(actuator.force is not None for actuator in robot.actuators.values())
         reply = await client.step()
         assert reply.per_articulation[robot.prefix].sensors is None, "one step's level must not outlive it"
+        reply = await client.step(observations="standard")
+        assert reply.per_articulation[robot.prefix].sensors is not None, "a level that is named is not the default"
         with pytest.raises(ValueError, match="everything"):
             await client.step(observations="everything")
 

@@ -277,7 +277,7 @@ def test_noise_at_a_reset_stays_within_the_joints_ranges_and_knows_metres_from_r
         for name, position in hinges.articulations["arm"].get_qpos().items():
             low, high = ranges[name]
             assert low <= position <= high, name
-            assert (position == rest[name]) is (name in slides)
+            assert bool(position == rest[name]) == (name in slides)
     both = make_env(reset_noise=ResetNoise(hinge=0.1, slide=0.01))
     for seed in range(5):
         both.reset(seed=seed)

@@ -14,6 +14,7 @@ import pytest
 import urlab_client
 import urlab_client.aio
 from urlab_client import enums
+from urlab_client.aio.session_level import SESSION_LEVEL
 
 ROWS = tomllib.loads((Path(__file__).parent / "rows.toml").read_text(encoding="utf-8"))
 FLAVOURS = {"aio": urlab_client.aio, "sync": urlab_client}
@@ -66,7 +67,8 @@ def test_member(flavour: str, owner: str, row: str) -> None:
         if default is UNSTATED or owner == "URLabArticulation":
             continue
         assert (actual.default is inspect.Parameter.empty) == (default is REQUIRED), parameter
-        assert default is REQUIRED or actual.default == default, parameter
+        stands_for = actual.default.value if actual.default is SESSION_LEVEL else actual.default
+        assert default is REQUIRED or stands_for == default, parameter
     extra = [n for n in parameters if n not in {n for n, _, _ in wanted}]
     assert all(parameters[n].kind is inspect.Parameter.KEYWORD_ONLY for n in extra), extra
 
@@ -95,3 +97,9 @@ def test_errors() -> None:
     assert isinstance(pie, urlab_client.URLabRPCError)
     assert (pie.state, pie.message) == (enums.PIEState.TIMEOUT, "log")
     assert issubclass(urlab_client.URLabVersionMismatch, urlab_client.URLabError)
+
+
+@pytest.mark.parametrize("flavour", FLAVOURS)
+def test_the_signature_of_step_tells_its_level(flavour: str) -> None:
+    signature = inspect.signature(FLAVOURS[flavour].URLabClient.step)
+    assert repr(signature.parameters["observations"].default) == "'standard' or as chosen in discover()"

@@ -12,6 +12,7 @@ import logging
 import os
 import signal
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from importlib import import_module
 
@@ -22,6 +23,8 @@ from urlab_client.integrations._extras import MissingExtra
 from urlab_client.protocol.errors import URLabError
 
 __all__ = ["main"]
+
+logger = logging.getLogger("urlab_client.cli")
 
 _COMMANDS = (
     "serve",
@@ -64,7 +67,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     handler = _StderrHandler(name)
     logging.getLogger("urlab_client").addHandler(handler)
     try:
-        return run(arguments)
+        with warnings.catch_warnings():
+            # What users are to know, as that there is another MuJoCo here, is a line like any other.
+            warnings.simplefilter("default", UserWarning)
+            warnings.showwarning = _log_warning
+            return run(arguments)
     except KeyboardInterrupt:
         return _INTERRUPTED
     except (CommandError, MissingExtra, URLabError, OSError) as error:
@@ -103,6 +110,10 @@ def _parser(*commands: str) -> Parser:
     for name in commands or _COMMANDS:
         import_module(f"{__name__}.{name.replace('-', '_')}").add_parser(subparsers)
     return parser
+
+
+def _log_warning(message: Warning | str, *_: object) -> None:
+    logger.warning("%s", message)
 
 
 class _Version(argparse.Action):  # argparse's own needs the version in advance, and reading it takes a while

@@ -124,6 +124,8 @@ class ServerArguments(argparse.Namespace):
 def make_client(flavour: Callable[..., C], address: str, arguments: ServerArguments, **options: Any) -> C:
     """Return a client of one of the two classes for the server that the arguments name.
 
+    Another MuJoCo than the server's is no reason to refuse work: the client warns and compiles the model here.
+
     Raises:
         CommandError: The address or an option is malformed.
     """
@@ -140,7 +142,7 @@ def make_client(flavour: Callable[..., C], address: str, arguments: ServerArgume
             state_port=arguments.state_port,
             server_key=arguments.server_key,
             client_key=arguments.client_key,
-            **options,
+            **{"mujoco_version_check": False, **options},
         )
     except ValueError as error:
         raise CommandError(str(error)) from None

@@ -90,7 +90,6 @@ async def _diagnose(arguments: DoctorArguments) -> Diagnosis:
         step_mode=arguments.step_mode,
         # Promoting the server would mend what is to be found.
         auto_promote_step_mode=False,
-        mujoco_version_check=False,
         rcv_timeout_ms=round(arguments.timeout * 1000),
     )
     async with client:

@@ -16,7 +16,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, cast
 
 from urlab_client._windows import read_aside
-from urlab_client.cli._arguments import Commands, image_size, index, port
+from urlab_client.cli._arguments import Commands, count, image_size, index, port
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._mujoco import import_mujoco
 from urlab_client.protocol.controller_text import ControllerText
@@ -75,6 +75,7 @@ class ServeArguments(argparse.Namespace):
     camera_size: tuple[int, int] | None
     render_quality: Literal["auto", "fast", "high"]
     mjcf_options: bool
+    scene_mib: int | None
     actor_names: Literal["model", "plugin"]
     dialect: Literal["alpha", "beta"]
     instance_id: str
@@ -199,6 +200,12 @@ def add_parser(commands: Commands) -> None:
         metavar="ACTOR=KIND",
         help="attach a controller: ACTOR=pd[,kp=N][,kv=N][,torque_limit=N] or ACTOR=passthrough, '*' for all actors; "
         "repeatable",
+    )
+    physics.add_argument(
+        "--scene-mib",
+        type=count,
+        metavar="N",
+        help="memory that all models of a level and their simulation may take, MiB (default 1024)",
     )
     physics.add_argument(
         "--mjcf-options",
@@ -339,6 +346,7 @@ def _watch_input(events: _Events) -> None:
 
 
 def _server(arguments: ServeArguments, saved_dir: Path) -> SimulatedServer:
+    from urlab_client.server.limits import Limits  # noqa: PLC0415
     from urlab_client.server.physics.controllers import ControllerConfig  # noqa: PLC0415
     from urlab_client.server.simulated import SimulatedServer  # noqa: PLC0415
 
@@ -363,6 +371,7 @@ def _server(arguments: ServeArguments, saved_dir: Path) -> SimulatedServer:
             camera_size=arguments.camera_size,
             render_quality=arguments.render_quality,
             mjcf_options=arguments.mjcf_options,
+            limits=Limits() if arguments.scene_mib is None else Limits(scene_bytes=arguments.scene_mib * 2**20),
             actor_names=arguments.actor_names,
             shm_dir=arguments.shm_dir,
             dialect=arguments.dialect,

@@ -10,8 +10,11 @@ from typing import TYPE_CHECKING, Any
 from urlab_client.aio import client_state as aio
 from urlab_client.aio.transport.base import TransportStats
 from urlab_client.protocol.client_types import ClientConfig, ServerInfo
+from urlab_client.protocol.descriptions import SceneDescription
 from urlab_client.protocol.enums import StepMode
+from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.names import NameMap
+from urlab_client.protocol.observer import ClientObserver
 from urlab_client.sync._facade import Facade
 from urlab_client.sync.articulation import URLabArticulation, URLabEntity
 from urlab_client.sync.cameras import URLabCameraView
@@ -157,6 +160,36 @@ class ClientState(Facade, twin=aio.ClientState):
     def recv_wall_time_ns(self) -> int:
         """This machine's UTC clock when the last reply arrived, nanoseconds."""
         return self._aio.recv_wall_time_ns
+
+    def describe(self) -> SceneDescription:
+        """Return everything that moves, as of the last reply: robots, other bodies, cameras of the scene.
+
+        Sends nothing. `msgspec.json.encode` and `msgspec.to_builtins` take the result as it is.
+        """
+        return self._aio.describe()
+
+    def camera(self, name: str) -> URLabCameraView:
+        """Return a camera by `<articulation>/<camera>`, or by `<camera>` where that means one of them.
+
+        Raises:
+            KeyError: There is no such camera, or there are several.
+        """
+        return self._wrap(URLabCameraView, self._aio.camera(name))
+
+    def matches(self, snapshot: StateSnapshot) -> bool:
+        """Return whether a published state is of the world that the last handshake described, as far as it shows.
+
+        Right after play began anew, a stream may bring states of a world that `discover()` has not been told of.
+        """
+        return self._aio.matches(snapshot)
+
+    def add_observer(self, observer: ClientObserver) -> None:
+        """Tell `observer` of each handshake and state from now on, until `remove_observer()`. Idempotent."""
+        self._aio.add_observer(observer)
+
+    def remove_observer(self, observer: ClientObserver) -> None:
+        """Tell `observer` nothing more. Idempotent."""
+        self._aio.remove_observer(observer)
 
     @property
     def _data_lock(self) -> RLock:

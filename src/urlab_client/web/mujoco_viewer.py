@@ -124,8 +124,8 @@ class MujocoViewer:
         if model is None or files() is None:
             return None
         if self._shown is None or self._shown.model is not model:
-            keys = list(self._client.articulations)
-            self._shown = await anyio.to_thread.run_sync(_prepare, model, keys)
+            prefixes = {key: art.compiled_prefix for key, art in self._client.articulations.items()}
+            self._shown = await anyio.to_thread.run_sync(_prepare, model, prefixes)
             self._written = None
         return self._shown
 
@@ -171,12 +171,13 @@ class MujocoViewer:
         )
 
 
-def _prepare(model: mujoco.MjModel, keys: list[str]) -> Shown:
+def _prepare(model: mujoco.MjModel, prefixes: Mapping[str, str]) -> Shown:
     import mujoco  # noqa: PLC0415
 
     bundle: bytes = _payload().serialize_model_bundle(model)
     camera = mujoco.MjvCamera()
     mujoco.mjv_defaultFreeCamera(model, camera)
-    addresses = {key: layout.qpos_adr for key, layout in articulation_layouts(model, keys).items()}
+    layouts = articulation_layouts(model, list(prefixes.values()))
+    addresses = {key: layouts[prefix].qpos_adr for key, prefix in prefixes.items()}
     flags = [int(flag) for flag in mujoco.MjvScene(model, maxgeom=1).flags]  # shadows, reflections, sky
     return Shown(model, mujoco.MjData(model), bundle, zlib.crc32(bundle), addresses, camera, flags)

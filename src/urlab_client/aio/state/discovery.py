@@ -132,6 +132,7 @@ class Discovery:
             state.publishers.events.publish(PlayStarted(articulations=list(state.objects.articulations)))
         if state.on_adopted is not None:
             state.on_adopted()
+        state.tell_of_handshake()
         if not hello.manager_present:
             state.mode = StepMode.LIVE
         elif self._promote and state.wanted_mode is not StepMode.AUTO:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import logging
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from urlab_client.aio.articulation import URLabArticulation, URLabEntity
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.live.publishers import Publishers
 from urlab_client.aio.model.articulation_state import MirroredArticulation, MirroredEntity
 from urlab_client.aio.model.mirror import Mirror
+from urlab_client.aio.motion import Motion
 from urlab_client.aio.session import Session
 from urlab_client.aio.state.handshake import Examined
 from urlab_client.protocol.enums import CameraMode
@@ -38,7 +39,7 @@ class SceneObjects:
         entity_records: What is mirrored of the plain entities, by name.
     """
 
-    def __init__(self, session: Session, publishers: Publishers, mirror: Mirror) -> None:
+    def __init__(self, session: Session, publishers: Publishers, mirror: Mirror, motion: Motion) -> None:
         self.articulations: NameMap[URLabArticulation] = NameMap(kind="articulation")
         self.articulations_by_id: dict[str, URLabArticulation] = {}
         self.entities: NameMap[URLabEntity] = NameMap(kind="entity")
@@ -48,6 +49,7 @@ class SceneObjects:
         self._session = session
         self._publishers = publishers
         self._mirror = mirror
+        self._motion = motion
 
     def bind(self, hello: HelloOk, examined: Examined) -> None:
         """Take over what a handshake lists."""
@@ -101,6 +103,17 @@ class SceneObjects:
             raise KeyError(f"camera {name!r} is ambiguous: it could mean {' or '.join(map(repr, found))}")
         return found[0]
 
+    def with_cameras(
+        self, asked: bool | dict[str, str | None], more: Mapping[str, str]
+    ) -> bool | dict[str, str | None]:
+        """Return the pictures that a step is to bring: what its caller asked for, and more that there are."""
+        if asked is True:
+            return True
+        chosen = dict(asked or {})
+        known = {id(self.camera(name)) for name in chosen} | {id(None)}
+        chosen |= {name: how for name, how in more.items() if id(self.camera(name)) not in known}
+        return chosen or False
+
     @property
     def hidden_cameras(self) -> bool:
         """Whether the scene may have cameras that the handshake does not list."""
@@ -144,7 +157,9 @@ class SceneObjects:
                 record = self.records[key] = MirroredArticulation(self._mirror, info, layout)
             else:
                 record.bind(info, layout)
-            wrappers[key] = self.articulations.get(key) or URLabArticulation(record, self._session, self._publishers)
+            wrappers[key] = self.articulations.get(key) or URLabArticulation(
+                record, self._session, self._publishers, self._motion
+            )
             found = _ENGINE_NAME.fullmatch(info.compiled_prefix)
             for alias in {info.actor_id, info.compiled_prefix, found["stem"] if found else ""} - {"", key}:
                 aliases.setdefault(alias, []).append(key)

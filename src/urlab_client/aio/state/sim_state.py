@@ -9,7 +9,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -18,11 +18,12 @@ from urlab_client.aio.live.live_state import LatestPicture, LiveState
 from urlab_client.aio.live.publishers import Publishers
 from urlab_client.aio.model.articulation_state import MirroredArticulation, MirroredEntity
 from urlab_client.aio.model.mirror import Mirror, write_options
+from urlab_client.aio.motion import Motion
 from urlab_client.aio.session import Session
 from urlab_client.aio.state.pending_outcomes import PendingOutcomes
 from urlab_client.aio.state.scene_objects import SceneObjects
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.enums import CameraMode, StepMode
+from urlab_client.protocol.enums import CameraMode, CameraTiming, StepMode
 from urlab_client.protocol.errors import (
     NoActiveManager,
     NoSession,
@@ -40,11 +41,12 @@ from urlab_client.protocol.messages.session import (
     StepOk,
 )
 from urlab_client.protocol.messages.streams import PlayEnded, SessionLost, SessionOpened, StateSnapshot
+from urlab_client.protocol.observer import ClientObserver
 from urlab_client.protocol.pixels import Pixels, decode_camera
 from urlab_client.protocol.sim_options import check_sim_options
 from urlab_client.protocol.types import SimOptions
 
-__all__ = ["SimState", "StateObserver"]
+__all__ = ["SimState"]
 
 log = logging.getLogger("urlab_client.client")
 
@@ -58,22 +60,6 @@ _Parts = tuple[
     list[tuple[URLabCameraView, Pixels, CameraFrame]],
 ]
 """The parts of a state that fits, each with what it is about."""
-
-
-class StateObserver(Protocol):
-    """Looks on while the client works. Called on the event loop, so it must be quick; it must not raise."""
-
-    def on_state(self, reply: StateReply | StateSnapshot) -> None:
-        """Take note of a state that was taken over. Its arrays go on to the caller of `step()`: copy what is kept."""
-        ...
-
-    def wanted_pictures(self, asked: bool | dict[str, str | None], n_steps: int) -> bool | dict[str, str | None]:
-        """Return the pictures that the next step is to bring: what its caller asked for, and more."""
-        ...
-
-    async def ready(self) -> None:
-        """Return when a further state may come: a step in `direct` or `puppet` mode waits for that. Must end."""
-        ...
 
 
 class SimState:
@@ -96,13 +82,14 @@ class SimState:
         on_adopted: Told of each handshake taken over, and of the end of play.
         pending: Requests whose replies were lost.
         stopping: Whether this client is ending play, so that its end is not news.
-        observers: Told of each state taken over, such as recorders.
+        observers: Who looks on, such as recorders.
     """
 
     def __init__(
         self,
         session: Session,
         publishers: Publishers,
+        motion: Motion,
         *,
         wanted_mode: StepMode,
         live_pictures: bool,
@@ -110,7 +97,7 @@ class SimState:
         self.session = session
         self.publishers = publishers
         self.mirror = Mirror()
-        self.objects = SceneObjects(session, publishers, self.mirror)
+        self.objects = SceneObjects(session, publishers, self.mirror, motion)
         self.wanted_mode = wanted_mode
         self._mode = StepMode.LIVE
         self.mode_assumed = False
@@ -133,7 +120,7 @@ class SimState:
         self.pending = PendingOutcomes()
         self.on_adopted: Callable[[], None] | None = None
         self.stopping = False
-        self.observers: list[StateObserver] = []
+        self.observers: tuple[ClientObserver, ...] = ()  # replaced, never changed: from any thread
 
     @property
     def mode(self) -> StepMode:
@@ -153,6 +140,24 @@ class SimState:
                 receiver.start()
             else:
                 receiver.stop()
+
+    def tell_of_handshake(self) -> None:
+        """Let the observers know that a handshake was taken over."""
+        for observer in self.observers:
+            try:
+                observer.on_handshake()
+            except Exception:
+                log.exception("%r failed on a handshake", observer)
+
+    def observed_cameras(self, n_steps: int) -> dict[str, str]:
+        """Return the pictures that the observers want of the next step: camera to `sync` or `latest`."""
+        wanted: dict[str, str] = {}
+        for observer in self.observers:
+            try:
+                wanted |= {name: str(CameraTiming(how)) for name, how in observer.step_cameras(n_steps).items()}
+            except Exception:
+                log.exception("%r failed to say which pictures it wants", observer)
+        return wanted
 
     def assume_mode(self, mode: StepMode) -> None:
         """Go by a step mode until a reply shows which one is in force: no op tells it without changing it."""
@@ -300,7 +305,10 @@ class SimState:
         if own and isinstance(reply, StateReply) and not (self.live or self.session.features.publishes_steps):
             own.publish(reply)
         for observer in self.observers:
-            observer.on_state(reply)
+            try:
+                observer.on_state(reply)
+            except Exception:
+                log.exception("%r failed on a state", observer)
 
     def _check_perturbation(self, drag: Perturbation, op: str) -> None:
         model = self.mirror.model

@@ -164,12 +164,12 @@ def _learn_mode(state: SimState, request: Step, reply: StepOk, advanced: int) ->
 async def _pictures(state: SimState, cameras: Cameras, n_steps: int) -> StepPictures | None:
     """Return the pictures that a step is to bring, None for none, when observers have room for what it brings."""
     if state.mode is not StepMode.LIVE:
-        for observer in tuple(state.observers):
+        for observer in state.observers:
             await observer.ready()
     asked: bool | dict[str, str | None]
     asked = cameras if isinstance(cameras, bool) else {name: str(CameraTiming(how)) for name, how in cameras.items()}
-    for observer in state.observers:
-        asked = observer.wanted_pictures(asked, n_steps)
+    if state.observers:
+        asked = state.objects.with_cameras(asked, state.observed_cameras(n_steps))
     return StepPictures(state, asked) or None
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import copy
 import logging
-from collections.abc import Awaitable, Callable, Coroutine, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -13,14 +13,14 @@ from msgspec import Struct
 
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
-from urlab_client.aio.state.sim_state import SimState
 from urlab_client.integrations._feed.samples import CameraPicture, Schedule, State
 from urlab_client.integrations._feed.scene_messages import CameraLayout, SceneMessages
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import ClientClosed, StreamOverflow, URLabError
-from urlab_client.protocol.messages.session import HelloOk, ResetOk, StateReply, StepOk
+from urlab_client.protocol.messages.session import ResetOk, StateReply, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.names import did_you_mean
+from urlab_client.protocol.observer import ClientObserver
 
 __all__ = ["Follower"]
 
@@ -31,7 +31,7 @@ _NS = 1_000_000_000
 S = TypeVar("S", bound=Struct)
 
 
-class Follower:
+class Follower(ClientObserver):
     """Hands on what a client goes through: by replies in `direct` and `puppet` mode, by the streams in `live` mode.
 
     Args:
@@ -59,7 +59,6 @@ class Follower:
         if isinstance(cameras, str) and cameras != "all":
             raise ValueError(f"cameras must be a sequence of names or 'all', not {cameras!r}")
         self._client = client
-        self._state: SimState = client._state  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
         self._name = name
         self._wanted_cameras = cameras if isinstance(cameras, str) else tuple(cameras)
         self._camera_ns = round(_NS / camera_hz)
@@ -70,7 +69,7 @@ class Follower:
         self._room: Callable[[], Awaitable[None]] | None = None
         self._lost: Callable[[int], None] | None = None
         self._scene: SceneMessages | None = None
-        self._described: HelloOk | None = None
+        self._described: object = None
         self._due_at: int | None = None
         self._tasks: set[asyncio.Task[None]] = set()
         self._camera_tasks: list[asyncio.Task[None]] = []
@@ -83,11 +82,11 @@ class Follower:
             URLabError: Nothing is known yet, or the local model is missing.
             KeyError: An unknown camera.
         """
-        if self._state.hello is None:
+        if not self._client.urlab_version:
             raise URLabError(
                 f"{self._name}: what there is to see is not known yet.", hint="Call discover() first, during play."
             )
-        if self._needs_model is not None and self._state.mirror.model is None:
+        if self._needs_model is not None and self._client.model is None:
             raise URLabError(
                 f"{self._name}: poses are computed with the local model, which this client does not have.",
                 hint=f"Call discover() during play, with local_model=True{self._needs_model}.",
@@ -117,8 +116,8 @@ class Follower:
             lost: Told how many pictures that were due a step did not bring.
         """
         self._put, self._room, self._lost = put, room, lost
-        self._state.observers.append(self)
-        if self._state.mode is StepMode.LIVE:
+        self._client.add_observer(self)
+        if self._client.step_mode is StepMode.LIVE:
             self._listen()
 
     def detach(self) -> None:
@@ -128,8 +127,7 @@ class Follower:
 
     def forget(self) -> None:
         """Hand on nothing more, when the client's loop is gone already. Idempotent."""
-        if self in self._state.observers:
-            self._state.observers.remove(self)
+        self._client.remove_observer(self)
         self._put = None
 
     async def ended(self) -> None:
@@ -138,37 +136,32 @@ class Follower:
 
     # What the client calls
 
-    def on_state(self, reply: StateReply | StateSnapshot) -> None:
-        """Take a state over; see `StateObserver`."""
-        live = self._state.mode is StepMode.LIVE
+    def on_state(self, state: StateReply | StateSnapshot) -> None:
+        """See the base class."""
+        live = self._client.step_mode is StepMode.LIVE
         if live is not self._live:
             if live:
                 self._listen()
             else:
                 self._ignore()
         if not live:
-            self._hand_on(_detached(reply))
+            self._hand_on(_detached(state))
 
-    def wanted_pictures(self, asked: bool | dict[str, str | None], n_steps: int) -> bool | dict[str, str | None]:
-        """Add the cameras to a step when their next picture is due; see `StateObserver`."""
-        state = self._state
-        if state.mode is StepMode.LIVE or not self._wanted_cameras:
-            return asked
-        timestep = 0.0 if state.mirror.model is None else state.mirror.model.opt.timestep
-        then = round((state.sim_time + max(n_steps, 1) * timestep) * _NS)
+    def step_cameras(self, n_steps: int) -> Mapping[str, str]:
+        """See the base class; the cameras are wanted when their next picture is due."""
+        client = self._client
+        if client.step_mode is StepMode.LIVE or not self._wanted_cameras:
+            return {}
+        timestep = 0.0 if client.model is None else client.model.opt.timestep
+        then = round((client.sim_time + max(n_steps, 1) * timestep) * _NS)
         # The period counts as used only once the step was taken: it may be refused, or never answered.
         self._due_at = then if self._pictures.is_due(then) else None
-        if asked is True or self._due_at is None:
-            return asked
-        chosen = dict(asked or {})
-        known = {id(state.objects.camera(name)) for name in chosen}
-        for view, camera in self._current().cameras.items():
-            if view not in known:
-                chosen[camera.name] = "sync"
-        return chosen or False
+        if self._due_at is None:
+            return {}
+        return {camera.name: "sync" for camera in self._current().cameras.values()}
 
     async def ready(self) -> None:
-        """Wait until there is room; see `StateObserver`."""
+        """Wait until there is room; see the base class."""
         if self._put is not None and self._room is not None:
             await self._room()
 
@@ -176,28 +169,31 @@ class Follower:
 
     def _current(self) -> SceneMessages:
         """Return the scene, described anew when there was another handshake."""
-        hello = self._state.hello
-        if self._scene is None or hello is not self._described:
+        described = self._client.articulations  # another map with each handshake
+        if self._scene is None or described is not self._described:
             if self._scene is not None and (unknown := self._unknown_cameras()):
                 log.warning("%s: the new scene has %s", self._name, unknown)
-            self._described = hello
-            self._scene = SceneMessages.of(self._state, self._views())
+            self._described = described
+            self._scene = SceneMessages.of(self._client, self._views())
             if self._live:
                 self._follow_cameras(self._scene)
         return self._scene
 
     def _every_camera(self) -> dict[str, URLabCameraView]:
-        arts = self._state.objects.articulations
+        arts = self._client.articulations
         own = {f"{key}/{name}": view for key, art in arts.items() for name, view in art.cameras.items()}
-        return own | dict(self._state.objects.global_cameras)
+        return own | dict(self._client.global_cameras)
+
+    def _camera(self, name: str) -> URLabCameraView | None:
+        try:
+            return self._client.camera(name)
+        except KeyError:
+            return None
 
     def _unknown_cameras(self) -> str:
         """Say which cameras are not there; nothing if all are."""
-        missing = (
-            []
-            if self._wanted_cameras == "all"
-            else [n for n in self._wanted_cameras if not self._state.objects.camera(n)]
-        )
+        wanted = () if self._wanted_cameras == "all" else self._wanted_cameras
+        missing = [name for name in wanted if self._camera(name) is None]
         there = ", ".join(self._every_camera()) or "none"
         if not missing:
             return ""
@@ -208,25 +204,25 @@ class Follower:
         every = self._every_camera()
         if self._wanted_cameras == "all":
             return list(every.items())
-        wanted = {id(self._state.objects.camera(name)) for name in self._wanted_cameras}
+        wanted = {id(self._camera(name)) for name in self._wanted_cameras}
         return [(name, view) for name, view in every.items() if id(view) in wanted]
 
     def _hand_on(self, reply: StateReply | StateSnapshot) -> None:
         put = self._put
         if put is None:
             return
-        state, scene = self._state, self._current()
+        client, scene = self._client, self._current()
         clock, wall = reply.sim_time, reply.wall_time
         nanoseconds = round(reply.time * _NS) if clock is None else clock.sec * _NS + clock.nsec
-        wall_ns = state.recv_wall_time_ns if wall is None else wall.sec * _NS + wall.nsec
-        set_points = {key: record.ctrl.tolist() for key, record in state.objects.records.items()}
+        wall_ns = client.recv_wall_time_ns if wall is None else wall.sec * _NS + wall.nsec
+        set_points = {key: art.ctrl_array.tolist() for key, art in client.articulations.items()}
         put(State(scene, reply, set_points, nanoseconds, isinstance(reply, ResetOk), wall_ns, not self._live))
         if isinstance(reply, StepOk) and self._due_at is not None:
             self._pictures.done(self._due_at)
             self._due_at = None
             missing = len(scene.cameras)
             for name, frame in (reply.cameras or {}).items():
-                camera = scene.cameras.get(id(state.objects.camera(name)))
+                camera = scene.cameras.get(id(self._camera(name)))
                 if camera is not None:
                     missing -= 1
                     put(CameraPicture(camera, frame, nanoseconds, wall_ns, waits=True))
@@ -275,8 +271,8 @@ class Follower:
                 except ClientClosed:
                     return
                 # While paused the same state comes with every tick, and another server's comes before its handshake.
-                fresh = self._state.mode is StepMode.LIVE and snapshot.time != last
-                if fresh and self._state.matches(snapshot):
+                fresh = self._client.step_mode is StepMode.LIVE and snapshot.time != last
+                if fresh and self._client.matches(snapshot):
                     last = snapshot.time
                     self._hand_on(snapshot)
 
@@ -288,7 +284,7 @@ class Follower:
                     sample = await frames.receive(timeout=None)
                 except ClientClosed:
                     return
-                nanoseconds = round((self._state.sim_time if sample.sim_time is None else sample.sim_time) * _NS)
+                nanoseconds = round((self._client.sim_time if sample.sim_time is None else sample.sim_time) * _NS)
                 if self._put is not None and schedule.due(nanoseconds):
                     self._put(CameraPicture(camera, sample.pixels, nanoseconds, sample.recv_wall_time_ns))
 

@@ -11,10 +11,11 @@ import numpy as np
 from msgspec import Struct
 
 from urlab_client._mujoco import control_counts
+from urlab_client.aio.articulation import URLabArticulation
 from urlab_client.aio.cameras import URLabCameraView
-from urlab_client.aio.model.layout import FREE, ArticulationLayout
+from urlab_client.aio.client import URLabClient
+from urlab_client.aio.model.layout import FREE, ArticulationLayout, articulation_layouts
 from urlab_client.aio.model.mirror import model_names
-from urlab_client.aio.state.sim_state import SimState
 from urlab_client.integrations._feed.messages import (
     CameraCalibration,
     ContactMessage,
@@ -100,18 +101,23 @@ class SceneMessages:
     cameras: dict[int, CameraLayout]
 
     @classmethod
-    def of(cls, state: SimState, cameras: list[tuple[str, URLabCameraView]]) -> SceneMessages:
+    def of(cls, client: URLabClient, cameras: list[tuple[str, URLabCameraView]]) -> SceneMessages:
         """Describe what the client knows."""
-        model = state.mirror.model
-        layouts = {key: record.layout for key, record in state.objects.records.items()}
+        model, arts = client.model, client.articulations
+        layouts = {key: ArticulationLayout() for key in arts}
+        if model is not None:
+            found = articulation_layouts(model, [art.compiled_prefix for art in arts.values()])
+            layouts = {key: found[art.compiled_prefix] for key, art in arts.items()}
         ids = _camera_ids(model)
         entities: dict[str, tuple[int, int] | None] = {}
         mocap: dict[str, int] = {}
-        for name, record in state.objects.entity_records.items():
-            offsets = record.qpos_offset, record.qvel_offset
+        for name, entity in client.entities.items():
+            if isinstance(entity, URLabArticulation):
+                continue
+            offsets = entity.qpos_offset, entity.qvel_offset
             entities[name] = None if offsets[0] is None or offsets[1] is None else (offsets[0], offsets[1])
-            if model is not None and record.body_id >= 0 and model.body_mocapid[record.body_id] >= 0:
-                mocap[name] = int(model.body_mocapid[record.body_id])
+            if model is not None and entity.body_id >= 0 and model.body_mocapid[entity.body_id] >= 0:
+                mocap[name] = int(model.body_mocapid[entity.body_id])
         return cls(
             model=model,
             layouts=layouts,

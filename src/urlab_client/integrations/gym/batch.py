@@ -17,7 +17,7 @@ from urlab_client.aio.launch import with_model_options
 from urlab_client.aio.model.layout import ArticulationLayout
 from urlab_client.aio.model.mirror import model_names
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn
-from urlab_client.integrations.gym.episode import fields_of
+from urlab_client.integrations.gym.episode import client_defaults, compiled_prefixes, fields_of
 from urlab_client.integrations.gym.pictures import BatchPictures
 from urlab_client.integrations.gym.spaces import Field, Observation, SpaceMapping, SpaceMode
 from urlab_client.integrations.gym.starts import ResetNoise, noise_of
@@ -88,8 +88,8 @@ class URLabBatchEnv(Vectorized):
             raise ValueError("num_envs and n_substeps are at least 1")
         noise = noise_of(reset_noise)
         check_render_mode(render_mode)
-        model, keys, controllers = _fetch(with_model_options(address), {"step_mode": "direct", **client_options})
-        mapping = SpaceMapping(model, keys, fields_of(observations), space_mode)
+        model, prefixes, controllers = _fetch(with_model_options(address), client_defaults(client_options))
+        mapping = SpaceMapping(model, prefixes, fields_of(observations), space_mode)
         super().__init__(
             num_envs=num_envs,
             mapping=mapping,
@@ -100,6 +100,7 @@ class URLabBatchEnv(Vectorized):
             autoreset_mode=autoreset_mode,
         )
         self.model = model
+        self._prefixes = tuple(prefixes.values())
         self._n_substeps = n_substeps
         self._noise = noise
         self._start_keyframe = keyframe
@@ -212,7 +213,7 @@ class URLabBatchEnv(Vectorized):
                 return self._arrays["sensordata"][:, sensors]
 
     def _keyframe_id(self, name: str) -> int:
-        found = [full for full in self._keyframes if full in {name, *(f"{key}_{name}" for key in self.mapping.keys)}]
+        found = [full for full in self._keyframes if full in {name, *(f"{prefix}_{name}" for prefix in self._prefixes)}]
         if len(found) != 1:
             raise UnknownKeyframe(
                 "unknown_keyframe", f"{name!r} does not name exactly one of {', '.join(self._keyframes) or 'none'}"
@@ -222,8 +223,8 @@ class URLabBatchEnv(Vectorized):
 
 def _fetch(
     address: str, client_options: Mapping[str, Any]
-) -> tuple[mujoco.MjModel, list[str], dict[str, tuple[str, dict[str, Any]]]]:
-    """Return a scene's model, its articulations, and the kind and parameters of those that have a controller."""
+) -> tuple[mujoco.MjModel, dict[str, str], dict[str, tuple[str, dict[str, Any]]]]:
+    """Return a scene's model, its articulations' compiled prefixes, and kind and parameters of the controllers."""
     with URLabClient(address, **client_options) as client:
         client.discover()
         model = client.model
@@ -231,7 +232,7 @@ def _fetch(
             raise URLabError(f"There is no articulation at {address}.", hint="Start play first.")
         attached = {key: articulation.controller for key, articulation in client.articulations.items()}
         controllers = {key: (str(found.kind), dict(found.params)) for key, found in attached.items() if found}
-        return model, list(client.articulations), controllers
+        return model, compiled_prefixes(client), controllers
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client.aio.launch import with_model_options
-from urlab_client.integrations.gym.episode import EnvEpisode, first_camera
+from urlab_client.integrations.gym.episode import EnvEpisode, client_defaults, first_camera
 from urlab_client.integrations.gym.spaces import Observation, SpaceMapping, SpaceMode
 from urlab_client.integrations.gym.starts import ResetNoise
 from urlab_client.protocol.names import NameMap
@@ -140,8 +140,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         Raises:
             URLabError: The server cannot be reached, or has no articulation.
         """
-        wanted: dict[str, Any] = {"step_mode": "direct", **client_options}
-        client = URLabClient(with_model_options(address), **wanted)
+        client = URLabClient(with_model_options(address), **client_defaults(client_options))
         try:
             client.discover()
             return cls(client, owns_client=True, **options)

@@ -17,8 +17,17 @@ from urlab_client.protocol.enums import CameraMode, ObservationLevel, StepMode
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import StepOk
 from urlab_client.protocol.pixels import Pixels
+from urlab_client.sync.client import URLabClient as BlockingClient
 
-__all__ = ["EnvEpisode", "first_camera"]
+__all__ = ["EnvEpisode", "client_defaults", "compiled_prefixes", "fields_of", "first_camera"]
+
+
+def client_defaults(options: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return options of a client with those that environments choose otherwise than clients do.
+
+    They step, and another MuJoCo than the server's is no reason to refuse work: the client warns of that.
+    """
+    return {"step_mode": "direct", "mujoco_version_check": False, **options}
 
 
 def fields_of(observations: str | Sequence[str]) -> tuple[Field, ...]:
@@ -93,7 +102,7 @@ class EnvEpisode:
         self.frames: dict[str, Pixels] = {}
         self._model = model
         fields = fields_of(observations)
-        self.mapping = SpaceMapping(model, list(client.articulations), fields, space_mode)
+        self.mapping = SpaceMapping(model, compiled_prefixes(client), fields, space_mode)
         self._sensors = {key: [*self.mapping.layout(key).sensors] for key in self.mapping.keys}
         minimal = set(fields) <= set(LEVELS["minimal"])
         self.observation_space = self._with_cameras(cameras)
@@ -219,6 +228,11 @@ class EnvEpisode:
                 readings = articulation.get_sensors()
                 found = [np.atleast_1d(readings[name]) for name in self._sensors[key]]
                 return np.concatenate(found) if found else np.zeros(0)
+
+
+def compiled_prefixes(client: URLabClient | BlockingClient) -> dict[str, str]:
+    """Return what compiled names begin with, by articulation."""
+    return {key: articulation.compiled_prefix for key, articulation in client.articulations.items()}
 
 
 def client_camera(client: URLabClient, name: str) -> URLabCameraView:

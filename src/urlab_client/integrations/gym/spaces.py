@@ -56,9 +56,9 @@ class SpaceMapping:
     """
 
     def __init__(
-        self, model: mujoco.MjModel, keys: Sequence[str], fields: Sequence[Field], mode: SpaceMode = "flat"
+        self, model: mujoco.MjModel, prefixes: Mapping[str, str], fields: Sequence[Field], mode: SpaceMode = "flat"
     ) -> None:
-        """Map the articulations `keys` of a compiled scene.
+        """Map articulations of a compiled scene, by key to what their compiled names begin with.
 
         Raises:
             ValueError: An unknown field or mode, or nothing to observe.
@@ -68,11 +68,11 @@ class SpaceMapping:
             raise ValueError(f"observations must be one or more of {', '.join(FIELDS)}, not {list(fields)!r}")
         if mode not in get_args(SpaceMode):
             raise ValueError(f"space_mode must be 'flat' or 'dict', not {mode!r}")
-        self.keys = tuple(keys)
+        self.keys = tuple(prefixes)
         self.fields = tuple(fields)
         self.mode: SpaceMode = mode
-        layouts = articulation_layouts(model, list(keys))
-        self._parts = {key: _part(model, layouts[key]) for key in keys}
+        layouts = articulation_layouts(model, list(prefixes.values()))
+        self._parts = {key: _part(model, layouts[prefix]) for key, prefix in prefixes.items()}
         self._where = self._slices()
         ends = list(itertools.accumulate(len(part.low) for part in self._parts.values()))
         self._n_actions = ends[-1]

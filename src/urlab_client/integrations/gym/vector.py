@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.launch import SCHEME, with_model_options, with_start_timeout
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn
-from urlab_client.integrations.gym.episode import EnvEpisode, first_camera
+from urlab_client.integrations.gym.episode import EnvEpisode, client_defaults, first_camera
 from urlab_client.integrations.gym.spaces import Observation, SpaceMode
 from urlab_client.integrations.gym.starts import ResetNoise, noise_of
 from urlab_client.integrations.gym.vectorized import Found, Indices, Vectorized, check_render_mode
@@ -205,7 +205,7 @@ class URLabVectorEnv(Vectorized):
         }
         self._step_timeout = step_timeout
         self._addresses = tuple(addresses)
-        client_options = {"step_mode": "direct", **client_options}
+        client_options = client_defaults(client_options)
         check_render_mode(render_mode)
         rendered = None if render_mode is None else _Rendered(render_camera)
         starts = asyncio.Semaphore(_processors())

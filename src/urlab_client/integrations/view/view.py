@@ -184,9 +184,9 @@ class AsyncView:
         scene = self._follower.check()
         self._opened = True
         await anyio.to_thread.run_sync(self._backend.open)
-        state = self._client._state  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
-        with state.mirror.lock:
-            data = state.mirror.data
+        client = self._client
+        with client._data_lock:  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]  # public by the reference
+            data = client.data
             qpos, qvel = (np.zeros(0), np.zeros(0)) if data is None else (data.qpos.copy(), data.qvel.copy())
         self._states.append(_Start(scene, qpos, qvel, round(self._client.sim_time * _NS), self._client.step_count))
         self._thread.start()

@@ -173,11 +173,13 @@ class Actor:
 def scene_problem(actors: Iterable[Actor], limits: Limits) -> str:
     """Return which limit of a level these actors exceed together, or nothing."""
     blueprints = [actor.blueprint for actor in actors if actor.blueprint is not None]
-    n_bytes = sum(blueprint.n_bytes + blueprint.n_data_bytes for blueprint in blueprints)
+    n_bytes = sum(blueprint.n_bytes - blueprint.n_asset_bytes + blueprint.n_data_bytes for blueprint in blueprints)
+    shared = {blueprint.folder: blueprint.n_asset_bytes for blueprint in blueprints}
+    n_bytes += sum(shared.values())
     if n_bytes > limits.scene_bytes:
         return (
             f"the models of the level take {n_bytes} bytes together, more than the limit scene_bytes, "
-            f"{limits.scene_bytes}"
+            f"{limits.scene_bytes} (urlab serve --scene-mib, sim://MODEL?scene-mib=N)"
         )
     n_values = sum(blueprint.n_sensor_values for blueprint in blueprints)
     if n_values > limits.sensor_values:

@@ -52,6 +52,7 @@ class BlueprintRecord(msgspec.Struct, frozen=True, kw_only=True):
     sensors: tuple[str, ...]
     cameras: tuple[str, ...]
     n_bytes: int = 0
+    n_asset_bytes: int = 0
     n_data_bytes: int = 0
     n_sensor_values: int = 0
 
@@ -78,6 +79,7 @@ class Blueprint:
         sensors: Sensor names in compiled order.
         cameras: Camera names in compiled order.
         n_bytes: Memory of the compiled model; this and what follows is 0 where an older import did not note it.
+        n_asset_bytes: How much of its compiled size all robots of its kind share.
         n_data_bytes: Memory of its simulation, without an arena of MuJoCo's own choice.
         n_sensor_values: Numbers that its sensors give.
     """
@@ -95,6 +97,7 @@ class Blueprint:
     sensors: tuple[str, ...]
     cameras: tuple[str, ...]
     n_bytes: int = 0
+    n_asset_bytes: int = 0
     n_data_bytes: int = 0
     n_sensor_values: int = 0
 
@@ -173,6 +176,7 @@ def from_record(folder: Path, record: BlueprintRecord) -> Blueprint:
         sensors=record.sensors,
         cameras=record.cameras,
         n_bytes=record.n_bytes,
+        n_asset_bytes=record.n_asset_bytes,
         n_data_bytes=record.n_data_bytes,
         n_sensor_values=record.n_sensor_values,
     )
@@ -193,6 +197,7 @@ def to_record(blueprint: Blueprint) -> BlueprintRecord:
         sensors=blueprint.sensors,
         cameras=blueprint.cameras,
         n_bytes=blueprint.n_bytes,
+        n_asset_bytes=blueprint.n_asset_bytes,
         n_data_bytes=blueprint.n_data_bytes,
         n_sensor_values=blueprint.n_sensor_values,
     )

@@ -282,6 +282,7 @@ class ContentRoot:
             sensors=compiled.sensors,
             cameras=compiled.cameras,
             n_bytes=compiled.n_bytes,
+            n_asset_bytes=compiled.n_asset_bytes,
             n_data_bytes=compiled.n_data_bytes,
             n_sensor_values=compiled.n_sensor_values,
         )

@@ -17,7 +17,7 @@ from typing import Any, Final
 import msgspec
 import mujoco
 
-from urlab_client._mujoco import actuator_count, actuator_kind, check_copy, write_model
+from urlab_client._mujoco import actuator_count, actuator_kind, asset_bytes, check_copy, write_model
 from urlab_client.server.assets.option_ranges import options_problem
 from urlab_client.server.limits import Limits
 
@@ -40,6 +40,7 @@ class Compiled(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         messages: MuJoCo's warnings.
         n_bytes: Size of the compiled model.
+        n_asset_bytes: How much of that are meshes and textures, which all robots of a kind share.
         n_data_bytes: Memory of its simulation, without an arena of MuJoCo's own choice.
         n_arena_bytes: Memory of its arena.
         n_sensor_values: Numbers that its sensors give.
@@ -55,6 +56,7 @@ class Compiled(msgspec.Struct, frozen=True, kw_only=True):
     cameras: tuple[str, ...]
     messages: tuple[str, ...]
     n_bytes: int
+    n_asset_bytes: int
     n_data_bytes: int
     n_arena_bytes: int
     n_sensor_values: int
@@ -92,6 +94,7 @@ def build_snapshot(file: Path, snapshot: Path, limits: Limits) -> tuple[Compiled
         cameras=_names(model.ncam, model.camera),
         messages=tuple(dict.fromkeys(messages)),
         n_bytes=mujoco.mj_sizeModel(model),
+        n_asset_bytes=asset_bytes(model),
         n_data_bytes=data.nbuffer + max(prepared.memory, 0),
         n_arena_bytes=data.narena,
         n_sensor_values=model.nsensordata,

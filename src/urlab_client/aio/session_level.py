@@ -1,0 +1,23 @@
+"""The default of `step(observations=…)`: what `discover()` chose."""
+
+from __future__ import annotations
+
+import enum
+from typing import Final
+
+from urlab_client.protocol.enums import ObservationLevel
+
+__all__ = ["SESSION_LEVEL", "SessionLevel"]
+
+
+class SessionLevel(enum.Enum):
+    """Type of `SESSION_LEVEL`. Its value is the level of a session that was opened without naming one."""
+
+    SESSION_LEVEL = ObservationLevel.STANDARD
+
+    def __repr__(self) -> str:  # as help() and inspect.signature() show the default
+        return f"{self.value.value!r} or as chosen in discover()"
+
+
+SESSION_LEVEL: Final = SessionLevel.SESSION_LEVEL
+"""The level chosen in `discover()`, which is `standard` unless it was told otherwise."""
