@@ -197,9 +197,10 @@ PROTOCOL = """\
 
 # What travels
 
-This page lists the fields of every request and reply. They travel as MessagePack maps, or as JSON if the client requests
-it. A request has its op in `op` and, except for `hello` and `meta`, its session in `session_id`. A reply has its own name
-in `op`, or `error` with a `code` and a `message`. [Ops and errors](ops.md) describes the purpose and the error codes of each op.
+This page lists the fields of every request and reply. They travel as MessagePack maps, or as JSON if the client
+requests it. A request has its op in `op` and, except for `hello` and `meta`, its session in `session_id`. A reply has
+its own name in `op`, or `error` with a `code` and a `message`. [Ops and errors](ops.md) describes the purpose and the
+error codes of each op.
 
 You may omit fields with a default; *required* fields are always present; *absent* means that an omitted field has no
 default value. In replies every number is a float64, including integers.
@@ -305,8 +306,8 @@ INTEGRATIONS = """\
 
 # Around the clients
 
-This page describes the modules around the clients and the server, from their docstrings. Each section is named after the
-module to import from.
+This page describes the modules around the clients and the server, from their docstrings. Each section is named after
+the module to import from.
 """
 
 

@@ -40,11 +40,11 @@ def test_check_finds_a_stale_file_and_writes_nothing(tmp_path: Path, capsys: pyt
     assert gen_docs.main([], folder) == 0
     for page in sorted(folder.iterdir()):
         assert gen_docs.main(["--check"], folder) == 0
-        before = page.read_text()
-        page.write_text(before + "An edit by hand.\n")
+        before = page.read_bytes()
+        page.write_bytes(before + b"An edit by hand.\n")
         assert gen_docs.main(["--check"], folder) == 1
-        assert page.read_text().endswith("An edit by hand.\n")
-        page.write_text(before)
+        assert page.read_bytes().endswith(b"An edit by hand.\n")
+        page.write_bytes(before)
 
 
 def test_every_op_has_a_row_of_full_width() -> None:
