@@ -41,8 +41,8 @@ def add_parser(commands: Commands) -> None:
         "console",
         help="show a simulation in the browser, and interact with it",
         description="Serve a page that shows a simulation and lets you interact with it, only on this machine, and "
-        "print a link that admits one browser. The page can create more links. Ends with exit code 0 on SIGINT (Ctrl-C) and "
-        "SIGTERM.",
+        "print a link that admits one browser. The page can create more links. Ends with exit code 0 on SIGINT "
+        "(Ctrl-C) and SIGTERM.",
         examples=(
             ("urlab console", "the server on this machine, at a link for your browser"),
             ("urlab console sim://quadruped --open", "a simulated robot, opened in the browser"),
