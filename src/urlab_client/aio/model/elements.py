@@ -22,6 +22,7 @@ from urlab_client.protocol.descriptions import (
     SetPointMeaning,
 )
 from urlab_client.protocol.enums import ActuatorType, OutOfRange, known
+from urlab_client.protocol.messages.session import ArticulationInfo
 from urlab_client.protocol.names import NameMap
 
 if TYPE_CHECKING:
@@ -368,27 +369,25 @@ class ArticulationElements:
 def make_elements(record: MirroredArticulation) -> ArticulationElements:
     """Make the handles of an articulation; without a local model only its actuators are known, by name and type."""
     model, layout, original = record.mirror.model, record.layout, record.info.original_names
-    prefix = record.info.compiled_prefix
+    bodies = [Body(record, name=name, id=i) for name, i in layout.bodies.items()]
     return ArticulationElements(
-        joints=_named(prefix, "joint", _joints(record, model), original.joints),
-        actuators=_named(prefix, "actuator", _actuators(record, model), original.actuators),
-        sensors=_named(prefix, "sensor", _sensors(record, model), original.sensors),
-        bodies=_named(
-            prefix, "body", [Body(record, name=name, id=i) for name, i in layout.bodies.items()], original.bodies
-        ),
+        joints=_named(record.info, "joint", _joints(record, model), original.joints),
+        actuators=_named(record.info, "actuator", _actuators(record, model), original.actuators),
+        sensors=_named(record.info, "sensor", _sensors(record, model), original.sensors),
+        bodies=_named(record.info, "body", bodies, original.bodies),
     )
 
 
 H = TypeVar("H", Actuator, Joint, Sensor, Body)
 
 
-def _named(prefix: str, kind: str, items: Sequence[H], original: Mapping[str, str]) -> NameMap[H]:
+def _named(info: ArticulationInfo, kind: str, items: Sequence[H], original: Mapping[str, str]) -> NameMap[H]:
     by_name = {item.name: item for item in items}
-    aliases = {f"{prefix}_{name}": [name] for name in by_name}
+    aliases = {f"{prefix}_{name}": [name] for name in by_name for prefix in {info.compiled_prefix, info.prefix}}
     for live, authored in original.items():
         if live in by_name:
             aliases.setdefault(authored, []).append(live)
-    return NameMap(by_name, aliases, kind=f"{kind} of {prefix}")
+    return NameMap(by_name, aliases, kind=f"{kind} of {info.prefix}")
 
 
 def _joints(record: MirroredArticulation, model: mujoco.MjModel | None) -> list[Joint]:

@@ -25,6 +25,7 @@ from urlab_client.integrations.gym.threaded_batch import ThreadedBatch
 from urlab_client.integrations.gym.vectorized import Floats, Found, Indices, Vectorized, check_render_mode
 from urlab_client.protocol.enums import ControllerKind
 from urlab_client.protocol.errors import UnknownKeyframe, URLabError
+from urlab_client.protocol.names import compiled_names
 from urlab_client.server.physics.controllers import Controller, ControllerConfig, PassthroughController, PDController
 from urlab_client.sync.client import URLabClient
 
@@ -88,7 +89,8 @@ class URLabBatchEnv(Vectorized):
             raise ValueError("num_envs and n_substeps are at least 1")
         noise = noise_of(reset_noise)
         check_render_mode(render_mode)
-        model, prefixes, controllers = _fetch(with_model_options(address), client_defaults(client_options))
+        scene = _fetch(with_model_options(address), client_defaults(client_options))
+        model, prefixes, controllers, exact = scene
         mapping = SpaceMapping(model, prefixes, fields_of(observations), space_mode)
         super().__init__(
             num_envs=num_envs,
@@ -100,7 +102,6 @@ class URLabBatchEnv(Vectorized):
             autoreset_mode=autoreset_mode,
         )
         self.model = model
-        self._prefixes = tuple(prefixes.values())
         self._n_substeps = n_substeps
         self._noise = noise
         self._start_keyframe = keyframe
@@ -110,6 +111,8 @@ class URLabBatchEnv(Vectorized):
         self._batch = (batch_class() or ThreadedBatch)(model, num_envs, n_threads)
         # Bound before the first call: a derived field is computed only where somebody looks at it.
         self._arrays = {name: self._batch.bind(name) for name in ("qpos", "qvel", "ctrl", "act", "sensordata", "time")}
+        self._prefixes = prefixes
+        self._target_type = np.float64 if exact else np.float32
         self._keyframes = {name: i for i, name in enumerate(model_names(model, "key"))}
         self._noisy = {
             key: np.array([mapping.layout(key).joints[name] for name in mapping.joint_names(key, model)], dtype=np.intp)
@@ -165,13 +168,13 @@ class URLabBatchEnv(Vectorized):
 
     def _step_some(self, indices: Indices, actions: Any) -> Found:
         ctrl = self._arrays["ctrl"]
-        targets: dict[str, NDArray[np.float32]] = {}
+        targets: dict[str, NDArray[Any]] = {}
         for key, values in self.mapping.set_points(actions).items():
             controller = self._controllers.get(key)
             if controller is None or not controller.active:
                 ctrl[np.ix_(indices, self.mapping.layout(key).ctrl_adr)] = values[indices]
             else:
-                targets[key] = values[indices].astype(np.float32)
+                targets[key] = values[indices].astype(self._target_type)
         if targets:
             for _ in range(self._n_substeps):
                 self._control(indices, targets)
@@ -181,7 +184,7 @@ class URLabBatchEnv(Vectorized):
         self._step_count[indices] += self._n_substeps
         return self._observe(indices), {}
 
-    def _control(self, indices: Indices, targets: Mapping[str, NDArray[np.float32]]) -> None:
+    def _control(self, indices: Indices, targets: Mapping[str, NDArray[Any]]) -> None:
         """Let the controllers turn their targets into controls, for the state as it is."""
         ctrl, qpos, qvel = (self._arrays[name][indices] for name in ("ctrl", "qpos", "qvel"))
         for key, values in targets.items():
@@ -213,7 +216,8 @@ class URLabBatchEnv(Vectorized):
                 return self._arrays["sensordata"][:, sensors]
 
     def _keyframe_id(self, name: str) -> int:
-        found = [full for full in self._keyframes if full in {name, *(f"{prefix}_{name}" for prefix in self._prefixes)}]
+        wanted = {name, *compiled_names(name, self._prefixes)}
+        found = [full for full in self._keyframes if full in wanted]
         if len(found) != 1:
             raise UnknownKeyframe(
                 "unknown_keyframe", f"{name!r} does not name exactly one of {', '.join(self._keyframes) or 'none'}"
@@ -223,8 +227,10 @@ class URLabBatchEnv(Vectorized):
 
 def _fetch(
     address: str, client_options: Mapping[str, Any]
-) -> tuple[mujoco.MjModel, dict[str, str], dict[str, tuple[str, dict[str, Any]]]]:
-    """Return a scene's model, its articulations' compiled prefixes, and kind and parameters of the controllers."""
+) -> tuple[mujoco.MjModel, dict[str, str], dict[str, tuple[str, dict[str, Any]]], bool]:
+    """Return a scene's model, its articulations with the prefixes of their names in it, the kind and parameters of
+    those controllers that there are, and whether those take set-points as they are.
+    """
     with URLabClient(address, **client_options) as client:
         client.discover()
         model = client.model
@@ -232,7 +238,7 @@ def _fetch(
             raise URLabError(f"There is no articulation at {address}.", hint="Start play first.")
         attached = {key: articulation.controller for key, articulation in client.articulations.items()}
         controllers = {key: (str(found.kind), dict(found.params)) for key, found in attached.items() if found}
-        return model, compiled_prefixes(client), controllers
+        return model, compiled_prefixes(client), controllers, client.server.features.exact_controls
 
 
 @dataclass(frozen=True)
