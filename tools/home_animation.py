@@ -36,7 +36,7 @@ def main() -> int:
                 client.step()
             if client.sim_time < end - 1e-9:
                 x, y, _ = robot.root_pos_w
-                client.viewport.set_camera((x + 1.15, y - 1.05, 0.72), rotation_euler=(0.0, -17.0, -137.5), fov=42.0)
+                client.viewport.set_camera((x + 1.15, y - 1.05, 0.72), rotation_euler=(0.0, -17.0, -137.5), fov=48.0)
                 pictures.append(Image.fromarray(server.snapshot(SIZE)).convert("RGB"))
     pictures[0].save(
         TARGET,

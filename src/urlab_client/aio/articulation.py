@@ -16,8 +16,15 @@ from urlab_client.aio.model.articulation_state import MirroredArticulation, Mirr
 from urlab_client.aio.model.elements import Actuator, ArticulationElements, Body, Joint, Sensor, make_elements
 from urlab_client.aio.model.layout import ArticulationLayout
 from urlab_client.aio.model.numbers import finite, finite_array
+from urlab_client.aio.motion import Motion
 from urlab_client.aio.session import Session
 from urlab_client.protocol.base import Floats
+from urlab_client.protocol.descriptions import (
+    ArticulationDescription,
+    ControllerDescription,
+    EntityDescription,
+    Pose,
+)
 from urlab_client.protocol.enums import ControlMode, OutOfRange
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import ControllerInfo
@@ -122,6 +129,18 @@ class URLabEntity:
         """
         self._record.apply_wrench(self._record.name, _wrench(force, torque))
 
+    def _place(self) -> Pose | None:
+        try:
+            position, quaternion = self._pose()
+        except URLabError:
+            return None
+        (x, y, z), (qw, qx, qy, qz) = position.tolist(), quaternion.tolist()
+        return Pose(position=(x, y, z), quaternion=(qw, qx, qy, qz))
+
+    def describe(self) -> EntityDescription | ArticulationDescription:
+        """Return what it is and where it is, as of the last reply, in a form that becomes JSON as it is."""
+        return EntityDescription(name=self.name, free_base=self.has_free_base, pose=self._place())
+
     def _pose(self) -> tuple[Floats, Floats]:
         record = self._record
         with record.mirror.lock:
@@ -160,10 +179,11 @@ class URLabArticulation(URLabEntity):
 
     _record: MirroredArticulation
 
-    def __init__(self, record: MirroredArticulation, session: Session, publishers: Publishers) -> None:
+    def __init__(self, record: MirroredArticulation, session: Session, publishers: Publishers, motion: Motion) -> None:
         super().__init__(record)
         self._session = session
         self._publishers = publishers
+        self._motion = motion
         self._controller: tuple[ControllerInfo, URLabController] | None = None
         self._handles: tuple[ArticulationLayout, ArticulationElements] | None = None
         self._cameras: NameMap[URLabCameraView] = NameMap()
@@ -354,6 +374,30 @@ class URLabArticulation(URLabEntity):
         """Return the last readings by sensor name, each a fresh array of shape (dim,)."""
         return {name: np.asarray(reading) for name, reading in self._record.sensors.items()}
 
+    def describe(self) -> ArticulationDescription:
+        """Return what it is made of, where it is and what it is told, as of the last reply.
+
+        `msgspec.json.encode` and `msgspec.to_builtins` take the result as it is.
+        """
+        controller = self._record.controller
+        with self._record.mirror.lock:
+            return ArticulationDescription(
+                name=self.prefix,
+                actor_id=self.actor_id,
+                free_base=self.has_free_base,
+                pose=self._place(),
+                joints=[joint.describe() for joint in self.joints.values()],
+                actuators=[actuator.describe() for actuator in self.actuators.values()],
+                sensors=[sensor.describe() for sensor in self.sensors.values()],
+                cameras=[camera.describe() for camera in self.cameras.values()],
+                controller=None
+                if controller is None
+                else ControllerDescription(
+                    kind=controller.kind, in_force=self.control_mode is ControlMode.UE_CONTROLLER
+                ),
+                control_owner=self.control_owner,
+            )
+
     def resolve_joint(self, name: str) -> str | None:
         """Return the live key of a joint given its live, compiled or original MJCF name, or None."""
         joint = self.joints.get(name)
@@ -391,6 +435,31 @@ class URLabArticulation(URLabEntity):
             raise ValueError(f"{self.prefix}: name the body: without a local model its root is not known")
         self._record.apply_wrench(body, _wrench(force, torque))
         self._record.drive()
+
+    async def move_to(self, targets: Mapping[str, float], *, tolerance: float = 0.01, timeout: float = 10.0) -> float:
+        """Move joints to positions with their position servos, and return when they have settled there.
+
+        Sets the set-points at once, without a path between, and steps in `direct` and `puppet`, watches in `live`. A
+        joint has settled when it is within the tolerance and so slow that it would stay there for 0.1 s. Other
+        set-points stay as they are, and these stay afterwards.
+
+        Args:
+            targets: Joint name to position, radians or metres.
+            tolerance: How far from its target a joint may be, in its unit.
+            timeout: Seconds of simulation time after which to give up.
+
+        Returns:
+            Seconds of simulation time that it took.
+
+        Raises:
+            NotSettled: Time is up; `.remaining` says how far each joint still has to go, the message what
+                `explain()` found. A servo that gravity pulls down may need a larger tolerance.
+            KeyError: The articulation has no such joint; nothing was set.
+            ValueError: A target is outside the range of its joint or actuator, or not finite, or nothing holds the
+                joint at a position; nothing was set.
+            URLabTimeoutError: Simulation time does not pass, as while paused in live mode.
+        """
+        return await self._motion.move_to(self, targets, tolerance, timeout)
 
     async def claim(self, *, force: bool = False, ttl: float = CLAIM_S, timeout: Timeout = DEFAULT) -> None:
         """Become the one client that controls the articulation, before the first write does it by itself.

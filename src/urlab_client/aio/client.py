@@ -7,7 +7,7 @@ import contextlib
 import logging
 import operator
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from types import TracebackType
 from typing import NoReturn, Self, TypeVar
 
@@ -19,6 +19,7 @@ from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.explain import diagnose
 from urlab_client.aio.live.camera_switch import CameraSwitch
 from urlab_client.aio.live.publishers import Publishers
+from urlab_client.aio.motion import Motion
 from urlab_client.aio.namespaces.debug import DebugNamespace
 from urlab_client.aio.namespaces.farm import FarmNamespace
 from urlab_client.aio.namespaces.outliner import OutlinerNamespace
@@ -160,7 +161,14 @@ class URLabClient(ClientState):
             memory=memory,
         )
         self._publishers.camera_switch = CameraSwitch(session, self._publishers.subscriptions.refresh)
-        state = SimState(session, self._publishers, wanted_mode=StepMode(step_mode), live_pictures=live_pictures)
+        self._motion = Motion(
+            self,
+            driven=lambda: any(record.driven for record in self._state.objects.records.values()),
+            patience=rcv_timeout_ms / 1000,
+        )
+        state = SimState(
+            session, self._publishers, self._motion, wanted_mode=StepMode(step_mode), live_pictures=live_pictures
+        )
         super().__init__(config, session, state)
         self._discovery = Discovery(
             state,
@@ -340,6 +348,39 @@ class URLabClient(ClientState):
             URLabConnectionError: The server is not back yet. What is in doubt stays so for the next attempt.
         """
         return await resync(self._state, self._discovery, timeout=timeout)
+
+    async def run_for(self, seconds: float) -> float:
+        """Let simulation time pass: step in `direct` and `puppet`, in `live` hand set-points over and watch.
+
+        Args:
+            seconds: Simulation time, seconds; rounded to whole physics steps where the client steps.
+
+        Returns:
+            Simulation time that passed, seconds.
+
+        Raises:
+            URLabTimeoutError: In live mode, simulation time stands still, as while paused; the message says why.
+            ValueError: Negative, NaN or infinite; nothing was sent.
+        """
+        return await self._motion.run_for(seconds)
+
+    async def wait_until(self, predicate: Callable[[], object], *, timeout: float = 10.0) -> float:
+        """Let simulation time pass, as `run_for` does, until something is so.
+
+        Args:
+            predicate: Says whether it is. Called before the first step, and then each 10 ms of simulation time at the
+                latest, in live mode with each snapshot; it reads the client's state and must return at once.
+            timeout: Seconds of simulation time after which to give up.
+
+        Returns:
+            Simulation time that passed, seconds.
+
+        Raises:
+            URLabTimeoutError: It was not so within that time, or simulation time stands still; the message says what
+                `explain()` found.
+            TypeError: The predicate returns an awaitable.
+        """
+        return await self._motion.wait_until(predicate, timeout)
 
     def state_stream(
         self,

@@ -12,6 +12,7 @@ from urlab_client.aio.control import CLAIM_S
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.model.elements import Actuator, Body, Joint, Sensor
 from urlab_client.protocol.base import Floats
+from urlab_client.protocol.descriptions import ArticulationDescription, EntityDescription
 from urlab_client.protocol.enums import ControlMode, OutOfRange
 from urlab_client.protocol.names import NameMap
 from urlab_client.sync._facade import Facade
@@ -105,6 +106,10 @@ class URLabEntity(Facade, twin=aio.URLabEntity):
             ValueError: A vector does not have three finite components.
         """
         self._aio.apply_xfrc(force=force, torque=torque)
+
+    def describe(self) -> EntityDescription | ArticulationDescription:
+        """Return what it is and where it is, as of the last reply, in a form that becomes JSON as it is."""
+        return self._aio.describe()
 
 
 class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
@@ -272,6 +277,13 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
         """Return the last readings by sensor name, each a fresh array of shape (dim,)."""
         return self._aio.get_sensors()
 
+    def describe(self) -> ArticulationDescription:
+        """Return what it is made of, where it is and what it is told, as of the last reply.
+
+        `msgspec.json.encode` and `msgspec.to_builtins` take the result as it is.
+        """
+        return self._aio.describe()
+
     def resolve_joint(self, name: str) -> str | None:
         """Return the live key of a joint given its live, compiled or original MJCF name, or None."""
         return self._aio.resolve_joint(name)
@@ -299,6 +311,31 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
             ValueError: A vector does not have three finite components, or the body must be named.
         """
         self._aio.apply_xfrc(body, force=force, torque=torque)
+
+    def move_to(self, targets: Mapping[str, float], *, tolerance: float = 0.01, timeout: float = 10.0) -> float:
+        """Move joints to positions with their position servos, and return when they have settled there.
+
+        Sets the set-points at once, without a path between, and steps in `direct` and `puppet`, watches in `live`. A
+        joint has settled when it is within the tolerance and so slow that it would stay there for 0.1 s. Other
+        set-points stay as they are, and these stay afterwards.
+
+        Args:
+            targets: Joint name to position, radians or metres.
+            tolerance: How far from its target a joint may be, in its unit.
+            timeout: Seconds of simulation time after which to give up.
+
+        Returns:
+            Seconds of simulation time that it took.
+
+        Raises:
+            NotSettled: Time is up; `.remaining` says how far each joint still has to go, the message what
+                `explain()` found. A servo that gravity pulls down may need a larger tolerance.
+            KeyError: The articulation has no such joint; nothing was set.
+            ValueError: A target is outside the range of its joint or actuator, or not finite, or nothing holds the
+                joint at a position; nothing was set.
+            URLabTimeoutError: Simulation time does not pass, as while paused in live mode.
+        """
+        return self._portal.call(self._aio.move_to, targets, tolerance=tolerance, timeout=timeout)
 
     def claim(self, *, force: bool = False, ttl: float = CLAIM_S, timeout: Timeout = DEFAULT) -> None:
         """Become the one client that controls the articulation, before the first write does it by itself.

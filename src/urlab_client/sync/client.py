@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from types import TracebackType
 from typing import Self, TypeVar
 
@@ -266,6 +266,39 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
             URLabConnectionError: The server is not back yet. What is in doubt stays so for the next attempt.
         """
         return self._portal.call(self._aio.resync, timeout=timeout)
+
+    def run_for(self, seconds: float) -> float:
+        """Let simulation time pass: step in `direct` and `puppet`, in `live` hand set-points over and watch.
+
+        Args:
+            seconds: Simulation time, seconds; rounded to whole physics steps where the client steps.
+
+        Returns:
+            Simulation time that passed, seconds.
+
+        Raises:
+            URLabTimeoutError: In live mode, simulation time stands still, as while paused; the message says why.
+            ValueError: Negative, NaN or infinite; nothing was sent.
+        """
+        return self._portal.call(self._aio.run_for, seconds)
+
+    def wait_until(self, predicate: Callable[[], object], *, timeout: float = 10.0) -> float:
+        """Let simulation time pass, as `run_for` does, until something is so.
+
+        Args:
+            predicate: Says whether it is. Called before the first step, and then each 10 ms of simulation time at the
+                latest, in live mode with each snapshot; it reads the client's state and must return at once.
+            timeout: Seconds of simulation time after which to give up.
+
+        Returns:
+            Simulation time that passed, seconds.
+
+        Raises:
+            URLabTimeoutError: It was not so within that time, or simulation time stands still; the message says what
+                `explain()` found.
+            TypeError: The predicate returns an awaitable.
+        """
+        return self._portal.call(self._aio.wait_until, predicate, timeout=timeout)
 
     def state_stream(
         self,
