@@ -21,6 +21,15 @@ from urlab_client.integrations.gym.episode import client_defaults, compiled_pref
 from urlab_client.integrations.gym.pictures import BatchPictures
 from urlab_client.integrations.gym.spaces import Field, Observation, SpaceMapping, SpaceMode
 from urlab_client.integrations.gym.starts import ResetNoise, noise_of
+from urlab_client.integrations.gym.task import (
+    Start,
+    States,
+    Task,
+    TaskScene,
+    add_observed,
+    check_alone,
+    with_task,
+)
 from urlab_client.integrations.gym.threaded_batch import ThreadedBatch
 from urlab_client.integrations.gym.vectorized import Floats, Found, Indices, Vectorized, check_render_mode
 from urlab_client.protocol.enums import ControllerKind
@@ -58,6 +67,7 @@ class URLabBatchEnv(Vectorized):
         keyframe: str | None = None,
         render_mode: Literal["rgb_array"] | None = None,
         render_camera: str | None = None,
+        task: Task | None = None,
         autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
         n_threads: int = 0,
         client_options: Mapping[str, Any] = MappingProxyType({}),
@@ -77,6 +87,7 @@ class URLabBatchEnv(Vectorized):
             keyframe: See `URLabEnv`.
             render_mode: None or `rgb_array`, with which `render` draws; steps cost the same.
             render_camera: Camera that `render` shows, `ARTICULATION/CAMERA`; the first one of the scene by default.
+            task: See `URLabEnv`. One object serves all environments.
             autoreset_mode: `NEXT_STEP`, `SAME_STEP` or `DISABLED`.
             n_threads: Threads that step, the caller's included; 0 for one per processor.
             client_options: Further options of the client that fetches the scene.
@@ -89,19 +100,27 @@ class URLabBatchEnv(Vectorized):
             raise ValueError("num_envs and n_substeps are at least 1")
         noise = noise_of(reset_noise)
         check_render_mode(render_mode)
+        check_alone(task, reward_fn=reward_fn, termination_fn=termination_fn, reset_noise=noise)
+        if task is not None:
+            observations, n_substeps, keyframe = task.observations, task.n_substeps, keyframe or task.keyframe
+            max_episode_steps = task.max_episode_steps if max_episode_steps is None else max_episode_steps
         scene = _fetch(with_model_options(address), client_defaults(client_options))
         model, prefixes, controllers, exact = scene
         mapping = SpaceMapping(model, prefixes, fields_of(observations), space_mode)
         super().__init__(
             num_envs=num_envs,
             mapping=mapping,
-            observation_space=mapping.observation_space,
+            observation_space=with_task(mapping.observation_space, task),
             reward_fn=reward_fn,
             termination_fn=termination_fn,
             max_episode_steps=max_episode_steps,
             autoreset_mode=autoreset_mode,
+            task=task,
         )
         self.model = model
+        self._goals: list[dict[str, Floats]] = [{} for _ in range(num_envs)]
+        if task is not None:
+            task.setup(TaskScene(model, mapping))
         self._n_substeps = n_substeps
         self._noise = noise
         self._start_keyframe = keyframe
@@ -163,6 +182,13 @@ class URLabBatchEnv(Vectorized):
                     address = self.model.jnt_qposadr[joints]
                     qpos[i, address] = self._noise.drawn(self._rngs[i], self.model, joints, qpos[i, address])
             self._batch.forward(indices)
+        if self.task is not None:
+            qpos = self._arrays["qpos"]
+            for i in map(int, indices):
+                start = Start(self.task.scene, qpos[i].copy())
+                self.task.reset(self._rngs[i], start)
+                qpos[i], self._goals[i] = start.qpos, start.goal
+            self._batch.forward(indices)
         self._step_count[indices] = 0
         return self._observe(indices), {}
 
@@ -198,7 +224,20 @@ class URLabBatchEnv(Vectorized):
         def read(key: str, field: Field) -> Floats:
             return self._read(self.mapping.layout(key), self._sensors[key], field)[indices]
 
-        return self.mapping.observe(read)
+        observation = self.mapping.observe(read)
+        if self.task is None:
+            return observation
+        return add_observed(observation, self.task, self.task.observe(self._states_of(indices)))
+
+    def _states(self) -> States:
+        return self._states_of(np.arange(self.num_envs))
+
+    def _states_of(self, indices: Indices) -> States:
+        if self.task is None:
+            raise URLabError("This environment has no task.")
+        arrays = self._arrays
+        qpos, qvel, time = (arrays[name][indices] for name in ("qpos", "qvel", "time"))
+        return States(self.task.scene, qpos, qvel, time, [self._goals[i] for i in map(int, indices)])
 
     def _read(self, layout: ArticulationLayout, sensors: Indices, field: Field) -> Floats:
         match field:
