@@ -137,6 +137,7 @@ async def test_wrong_transport_is_repeated_once_and_remembered(
 async def test_a_reply_that_turned_out_too_large_is_asked_for_again_only_if_that_changes_nothing(
     connect: Any, plugin: PluginMemory, scripted: Any
 ) -> None:
+    """Generation 2 statement 57."""
     pose = {"op": "read_mocap_pose_ok", "body": "b", "pos": [0.0] * 3, "quat": [1.0, 0.0, 0.0, 0.0]}
     scripted.on("read_mocap_pose", pose)
     too_large = {"op": "error", "code": "reply_too_large", "message": "the reply does not fit"}
