@@ -362,7 +362,7 @@ def batch_class() -> Any:
 
 
 def asset_bytes(model: mujoco.MjModel) -> int:
-    """Return how many bytes of a model are meshes, textures and height fields, which `merge_assets` shares.
+    """Return how many bytes of a model are meshes and textures, which `merge_assets` shares.
 
     Before 3.17 nothing is shared, and this is 0.
     """
@@ -370,7 +370,7 @@ def asset_bytes(model: mujoco.MjModel) -> int:
 
     if not hasattr(mujoco.MjSpec, "dedup_assets"):
         return 0
-    return sum(getattr(model, name).nbytes for name in dir(model) if name.startswith(("mesh_", "tex_", "hfield_")))
+    return sum(getattr(model, name).nbytes for name in dir(model) if name.startswith(("mesh_", "tex_")))
 
 
 def merge_assets(spec: mujoco.MjSpec, folders: Iterable[Path]) -> None:

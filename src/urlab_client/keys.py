@@ -122,12 +122,14 @@ def public_keys(sources: Iterable[str | os.PathLike[str]]) -> frozenset[bytes]:
 
 
 def _create(file: Path, text: str, mode: int) -> None:
+    # zmq.auth.create_certificates overwrites keys, and leaves the secret one to the process's usual permissions.
     handle = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
     with os.fdopen(handle, "w", encoding="ascii", errors="replace") as stream:
         stream.write(text)
 
 
 def _read(path: Path) -> tuple[bytes, bytes | None]:
+    # zmq.auth.load_certificate returns whatever stands there as a key, and raises IndexError for half a line.
     try:
         if path.stat().st_size > _MAX_BYTES:
             raise KeyFileError(f"{path} is not a key file: it is too long.")

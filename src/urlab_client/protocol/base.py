@@ -123,7 +123,8 @@ class Op:
         needs: What must be running.
         effect: Whether it may be sent again after a lost reply.
         timeout: Seconds to wait for the reply at least; None leaves it to the client's default.
-        hot: Built by the client itself at kilohertz rates, so sent without checking the struct's field types again.
+        hot: Built by the client itself at kilohertz rates or with megabytes in it: sent without checking the struct's
+            field types again, and decoded by the server in one go.
         infinite: Request fields whose numbers may be infinite; all others are finite.
         errors: Codes the op itself can answer, besides the envelope's.
         generated: Whether `tools/gen_ops.py` writes the client's method. Ops that mirror state or build handles

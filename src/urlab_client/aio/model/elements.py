@@ -12,8 +12,17 @@ from urlab_client._mujoco import acting_kind, control_counts, control_starts, fo
 from urlab_client.aio.model.articulation_state import MirroredArticulation
 from urlab_client.aio.model.layout import JOINT_TRANSMISSIONS, QPOS_WIDTH, QVEL_WIDTH
 from urlab_client.aio.model.numbers import finite, finite_array, is_array
+from urlab_client.aio.model.units import JOINT_KINDS, joint_unit, sensor_kind, sensor_unit, set_point_meaning
 from urlab_client.protocol.base import Floats
+from urlab_client.protocol.descriptions import (
+    ActuatorDescription,
+    JointDescription,
+    JointKind,
+    SensorDescription,
+    SetPointMeaning,
+)
 from urlab_client.protocol.enums import ActuatorType, OutOfRange, known
+from urlab_client.protocol.messages.session import ArticulationInfo
 from urlab_client.protocol.names import NameMap
 
 if TYPE_CHECKING:
@@ -137,6 +146,45 @@ class Actuator:
             raise ValueError(f"{what} takes {_listed(low)} to {_listed(high)}, got {v}. Nothing was set")
         return where, inside
 
+    def set_point_for(self, position: float) -> float:
+        """Return the set-point of a position servo that holds its joint at a position, but for what pulls at it.
+
+        Args:
+            position: In the joint's unit, radians or metres.
+
+        Raises:
+            ValueError: It is not a position servo, or there is no local model to tell.
+        """
+        record, model = self._record, self._record.mirror.model
+        if record.takes_positions:
+            return position
+        if model is None or set_point_meaning(model, self.id)[0] != "position":
+            raise ValueError(f"actuator {self.name!r} of {record.name!r} is not known to be a position servo")
+        gain, bias = float(model.actuator_gainprm[self.id][0]), float(model.actuator_biasprm[self.id][1])
+        return position * float(model.actuator_gear[self.id][0]) * (-bias / gain if gain else 1.0)
+
+    def describe(self) -> ActuatorDescription:
+        """Return what it is and what it is told."""
+        record, model = self._record, self._record.mirror.model
+        takes: SetPointMeaning = ""
+        unit = ""
+        if model is not None:
+            takes, unit = set_point_meaning(model, self.id)
+        if record.takes_positions:
+            takes, unit = "position", "" if model is None or self.joint is None else _unit_of(record, model, self.joint)
+        low, high = (float(bounds[self.ctrl_local.start]) for bounds in record.ranges())
+        return ActuatorDescription(
+            name=self.name,
+            kind=None if self.type is None else str(self.type),
+            joint=self.joint,
+            takes=takes,
+            unit=unit,
+            limits=(low, high) if np.isfinite((low, high)).all() else None,
+            force_limits=self.forcerange,
+            gear=float(model.actuator_gear[self.id][0]) if model is not None and self.joint else None,
+            set_point=self.value,
+        )
+
     def __repr__(self) -> str:
         return f"<Actuator {self.name!r} id={self.id}>"
 
@@ -156,6 +204,7 @@ class Joint:
     """
 
     __slots__ = (
+        "_record",
         "id",
         "jnt_type",
         "name",
@@ -168,6 +217,7 @@ class Joint:
 
     def __init__(
         self,
+        record: MirroredArticulation,
         *,
         name: str,
         id: int,  # noqa: A002
@@ -178,6 +228,7 @@ class Joint:
         qvel_local_offset: int,
         range: tuple[float, float] | None,  # noqa: A002
     ) -> None:
+        self._record = record
         self.name = name
         self.id = id
         self.jnt_type = jnt_type
@@ -186,6 +237,50 @@ class Joint:
         self.qvel_offset = qvel_offset
         self.qvel_local_offset = qvel_local_offset
         self.range = range
+
+    @property
+    def kind(self) -> JointKind:
+        """`hinge`, `slide`, `ball` or `free`."""
+        return JOINT_KINDS[self.jnt_type]
+
+    @property
+    def unit(self) -> str:
+        """`rad` or `m`; empty for joints whose position is not one number. The velocity's is the same per second."""
+        return joint_unit(self.kind)
+
+    @property
+    def limits(self) -> tuple[float, float] | None:
+        """(low, high) in its unit, or None if unlimited; the same as `range`."""
+        return self.range
+
+    @property
+    def position(self) -> float | Floats:
+        """Position as of the last reply, in its unit.
+
+        Of a ball joint the quaternion (w, x, y, z), shape (4,); of a free joint (x, y, z) in metres before it, shape
+        (7,). Arrays are fresh copies.
+        """
+        return _value(self._record.qpos, self.qpos_local_offset, int(QPOS_WIDTH[self.jnt_type]))
+
+    @property
+    def velocity(self) -> float | Floats:
+        """Velocity as of the last reply, in its unit per second.
+
+        Of a ball joint angular, body frame, shape (3,); of a free joint linear in the world frame and angular in the
+        body frame, shape (6,). Arrays are fresh copies.
+        """
+        return _value(self._record.qvel, self.qvel_local_offset, int(QVEL_WIDTH[self.jnt_type]))
+
+    def describe(self) -> JointDescription:
+        """Return what it is and where it is."""
+        return JointDescription(
+            name=self.name,
+            kind=self.kind,
+            unit=self.unit,
+            limits=self.limits,
+            position=np.asarray(self.position).tolist(),
+            velocity=np.asarray(self.velocity).tolist(),
+        )
 
     def __repr__(self) -> str:
         return f"<Joint {self.name!r} id={self.id}>"
@@ -213,6 +308,29 @@ class Sensor:
         """Reading of the last reply, shape (dim,), in the sensor's own units and frame; a fresh array; or None."""
         reading = self._record.sensors.get(self.name)
         return None if reading is None else np.asarray(reading, dtype=np.float64)
+
+    @property
+    def kind(self) -> str:
+        """MJCF element: `accelerometer`, `framepos`, …; empty without a local model."""
+        model = self._record.mirror.model
+        return "" if model is None else sensor_kind(model, self.id)
+
+    @property
+    def unit(self) -> str:
+        """Unit of its reading; empty for directions, quaternions and sensors of unknown meaning."""
+        model = self._record.mirror.model
+        return "" if model is None else sensor_unit(model, self.id)
+
+    def describe(self) -> SensorDescription:
+        """Return what it is and what it reads."""
+        reading = self._record.sensors.get(self.name)
+        return SensorDescription(
+            name=self.name,
+            kind=self.kind,
+            unit=self.unit,
+            dim=self.dim,
+            reading=None if reading is None else [*map(float, reading)],
+        )
 
     def __repr__(self) -> str:
         return f"<Sensor {self.name!r} id={self.id} dim={self.dim}>"
@@ -262,27 +380,25 @@ class ArticulationElements:
 def make_elements(record: MirroredArticulation) -> ArticulationElements:
     """Make the handles of an articulation; without a local model only its actuators are known, by name and type."""
     model, layout, original = record.mirror.model, record.layout, record.info.original_names
-    prefix = record.info.compiled_prefix
+    bodies = [Body(record, name=name, id=i) for name, i in layout.bodies.items()]
     return ArticulationElements(
-        joints=_named(prefix, "joint", _joints(record, model), original.joints),
-        actuators=_named(prefix, "actuator", _actuators(record, model), original.actuators),
-        sensors=_named(prefix, "sensor", _sensors(record, model), original.sensors),
-        bodies=_named(
-            prefix, "body", [Body(record, name=name, id=i) for name, i in layout.bodies.items()], original.bodies
-        ),
+        joints=_named(record.info, "joint", _joints(record, model), original.joints),
+        actuators=_named(record.info, "actuator", _actuators(record, model), original.actuators),
+        sensors=_named(record.info, "sensor", _sensors(record, model), original.sensors),
+        bodies=_named(record.info, "body", bodies, original.bodies),
     )
 
 
 H = TypeVar("H", Actuator, Joint, Sensor, Body)
 
 
-def _named(prefix: str, kind: str, items: Sequence[H], original: Mapping[str, str]) -> NameMap[H]:
+def _named(info: ArticulationInfo, kind: str, items: Sequence[H], original: Mapping[str, str]) -> NameMap[H]:
     by_name = {item.name: item for item in items}
-    aliases = {f"{prefix}_{name}": [name] for name in by_name}
+    aliases = {f"{prefix}_{name}": [name] for name in by_name for prefix in {info.compiled_prefix, info.prefix}}
     for live, authored in original.items():
         if live in by_name:
             aliases.setdefault(authored, []).append(live)
-    return NameMap(by_name, aliases, kind=f"{kind} of {prefix}")
+    return NameMap(by_name, aliases, kind=f"{kind} of {info.prefix}")
 
 
 def _joints(record: MirroredArticulation, model: mujoco.MjModel | None) -> list[Joint]:
@@ -294,6 +410,7 @@ def _joints(record: MirroredArticulation, model: mujoco.MjModel | None) -> list[
         kind = int(model.jnt_type[i])
         joints.append(
             Joint(
+                record,
                 name=name,
                 id=i,
                 jnt_type=kind,
@@ -350,6 +467,14 @@ def _sensors(record: MirroredArticulation, model: mujoco.MjModel | None) -> list
     if model is None:
         return []
     return [Sensor(record, name=name, id=i, dim=int(model.sensor_dim[i])) for name, i in record.layout.sensors.items()]
+
+
+def _unit_of(record: MirroredArticulation, model: mujoco.MjModel, joint: str) -> str:
+    return joint_unit(JOINT_KINDS[int(model.jnt_type[record.layout.joints[joint]])])
+
+
+def _value(values: Floats, start: int, width: int) -> float | Floats:
+    return float(values[start]) if width == 1 else values[start : start + width].copy()
 
 
 def _interval(bounds: Floats) -> tuple[float, float]:

@@ -188,6 +188,8 @@ class ShmTransport:
         """Return why a request cannot go over shared memory, whatever its state; empty if it can."""
         if op.needs is Needs.EDITOR:
             return "editor op"
+        if op.ns == "scene":
+            return "upload"  # its chunks and its reply outgrow a slot
         if op.name in _UNBOUNDED:
             return "handshake" if op.needs is Needs.NOTHING else "reply may be too large"
         if op.name in _UPLOADS:

@@ -117,6 +117,7 @@ OPS: Final = (
         ns="scene",
         needs=Needs.NOTHING,
         timeout=60.0,
+        hot=True,
         errors=("bad_request", "payload_too_large", "unknown_upload", "hash_mismatch"),
         undeclared=("data",),
         dialects=("beta",),

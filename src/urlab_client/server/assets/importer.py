@@ -40,7 +40,7 @@ class Compiled(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         messages: MuJoCo's warnings.
         n_bytes: Size of the compiled model.
-        n_asset_bytes: How much of that are meshes, textures and height fields, which all robots of a kind share.
+        n_asset_bytes: How much of that are meshes and textures, which all robots of a kind share.
         n_data_bytes: Memory of its simulation, without an arena of MuJoCo's own choice.
         n_arena_bytes: Memory of its arena.
         n_sensor_values: Numbers that its sensors give.

@@ -104,7 +104,7 @@ class CameraStreams:
             health: Told when images cannot be published any more.
             host: Address of the interface.
             port: Port of the first camera; the others get the free ones after it. 0 picks any.
-            door: Who may connect; None for anybody who reaches the interface.
+            curve_keys: Who may connect; None for anybody who reaches the interface.
             memory: Shared memory that gets the images as well, in every mode.
             dialect: Decides what streams when, under which topic and with what in front.
 

@@ -89,7 +89,7 @@ class StreamServer:
             state_port: TCP port; 0 picks a free one, here and below.
             ctrl_port: TCP port.
             info_port: TCP port.
-            door: Who may connect; None for anybody who reaches the interface.
+            curve_keys: Who may connect; None for anybody who reaches the interface.
             memory: Shared memory that gets the snapshots as well.
 
         Raises:

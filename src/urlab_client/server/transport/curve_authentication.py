@@ -94,7 +94,11 @@ class CurveKeys:
 
 
 class ZapAuthenticator:
-    """Guards the sockets of one ZeroMQ context. Without a door it has nothing to do, and no thread."""
+    """Guards the sockets of one ZeroMQ context. Without keys it has nothing to do, and no thread."""
+
+    # Not zmq.auth.thread.ThreadAuthenticator: who is refused is not told at a level that is shown, nor its address to a
+    # callback; when its thread dies nobody is told and every new client waits for ever; and it needs an event loop,
+    # which on Windows takes tornado.
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]], curve_keys: CurveKeys | None, health: Health) -> None:
         self._curve_keys = curve_keys
@@ -114,7 +118,7 @@ class ZapAuthenticator:
         self._thread.start()
 
     def protect(self, socket: zmq.Socket[bytes]) -> None:
-        """Make a socket of the context speak CURVE, if there is a door; before it is bound."""
+        """Make a socket of the context speak CURVE, if there are keys; before it is bound."""
         if self._curve_keys is not None:
             self._curve_keys.protect(socket)
 

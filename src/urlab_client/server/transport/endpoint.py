@@ -167,7 +167,7 @@ class RpcEndpoint:
             health: Told when requests cannot be served any more.
             host: IP address of the interface.
             port: TCP port; 0 picks a free one.
-            door: Who may connect; None for anybody who reaches the interface.
+            curve_keys: Who may connect; None for anybody who reaches the interface.
             request_bytes: Largest request that is answered with anything but its size.
 
         Raises:
