@@ -96,6 +96,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "model",
         "controllers",
         "cameras",
+        "motion",
         "articulation",
         "state",
         "explain",

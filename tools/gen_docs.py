@@ -32,23 +32,23 @@ HEADER = """\
 
 # Ops and errors
 
-What the client can ask of a server, and what can go wrong. Both tables are derived from the declarations that the
-client and the simulated server run on. [adding-an-op.md](../adding-an-op.md) shows how a row comes about.
+This page lists everything that a client can request from a server, and every error. Both tables are generated from the
+declarations that the client and the simulated server use. [Adding an op](../adding-an-op.md) shows how to add a row.
 """
 
 LEGEND = """\
-- **Method**, of what the heading says, is the same in both flavours; the async one is awaited.
-- **Op** leads to its [fields](protocol.md): types, defaults and units of request and reply, and the codes of its own
+- **Method** is a method of the object in the heading. Both clients have it; you await the async one.
+- **Op** links to its [fields](protocol.md): types, defaults and units of request and reply, and the codes of its own
   errors.
 - **Needs**: *nothing*; an *editor* (a packaged build answers `unknown_op`); a running *play* session (else
   `no_active_manager`).
 - **Lost reply**: when the connection breaks after the request was sent, *read* ops are sent again within the same
   deadline; *write* ops raise `OutcomeUnknown` and are never sent twice. See [reliability](../reliability.md).
-- **Timeout**: what a call waits for at least. Where there is none, the client's default holds: `rcv_timeout_ms`,
+- **Timeout**: the minimum deadline of a call. If the cell is empty, the client's default applies: `rcv_timeout_ms`,
   5 seconds.
 """
 
-ERRORS = "Besides its own errors any op can answer those of the envelope: {}."
+ERRORS = "Besides its own errors, any op can answer these common ones: {}."
 
 
 BAR = "\\|"
@@ -197,12 +197,13 @@ PROTOCOL = """\
 
 # What travels
 
-The fields of every request and reply, as MessagePack maps or, where the client asks for it, JSON. A request has its op
-in `op` and, but for `hello` and `meta`, its session in `session_id`. A reply has its own name in `op`, or `error` with
-a `code` and a `message`. What each op is for, and which codes it answers, stands in [ops and errors](ops.md).
+This page lists the fields of every request and reply. They travel as MessagePack maps, or as JSON if the client
+requests it. A request has its op in `op` and, except for `hello` and `meta`, its session in `session_id`. A reply has
+its own name in `op`, or `error` with a `code` and a `message`. [Ops and errors](ops.md) describes the purpose and the
+error codes of each op.
 
-Fields with a default may be left out, *required* ones are always there; *absent* means that nothing takes the field's
-place. In replies every number is a float64, integers too.
+You may omit fields with a default; *required* fields are always present; *absent* means that an omitted field has no
+default value. In replies every number is a float64, including integers.
 """
 
 PLAIN = {str: "string", int: "integer", float: "number", bool: "boolean", bytes: "bytes", Any: "anything"}
@@ -305,7 +306,8 @@ INTEGRATIONS = """\
 
 # Around the clients
 
-What comes with the package beside clients and server, from its docstrings. Each section names what to import from.
+This page describes the modules around the clients and the server, from their docstrings. Each section is named after
+the module to import from.
 """
 
 

@@ -26,6 +26,7 @@ PICTURES = {
     "policy.png": ("examples/run_policy.py", "policy.png"),
     "ray_timeline.png": ("examples/ray_rollouts.py", "timeline.png"),
     "recorded_run.png": ("examples/record_run.py", "run.png"),
+    "trot.webp": ("tools/home_animation.py", ""),
     "viewport.png": ("examples/viewport_picture.py", "viewport.png"),
 }
 """Picture: the script that makes it, and the name under which an example leaves it."""

@@ -2,7 +2,7 @@
 
 The pages at the root of the repository belong to the site, too, and links between the two work in both places. Files
 that are not pages, such as sources, are named but not linked. A page that the navigation does not mention is put at its
-end.
+end. Code blocks under `<!-- tab: NAME -->`, one after the other, become tabs, and those of one name open together.
 """
 
 from __future__ import annotations
@@ -24,6 +24,9 @@ ROOT_PAGES = {
 }
 
 _LINK = re.compile(r"(?P<picture>!?)\[(?P<text>[^]]*)\]\((?P<target>[^)\s#]+)(?P<anchor>#[^)\s]*)?\)")
+_TAB = re.compile(
+    r"^<!-- tab: (?P<name>[^\n]+?) -->\n(?P<body>```.*?^```$(?:\n\n```text\n.*?^```$)?)", re.MULTILINE | re.DOTALL
+)
 _CODE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 
 
@@ -54,7 +57,21 @@ def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: 
     for block in _CODE.finditer(markdown):
         kept += [_LINK.sub(lambda link: _link(link, source, uri, files), markdown[end : block.start()]), block[0]]
         end = block.end()
-    return "".join([*kept, _LINK.sub(lambda link: _link(link, source, uri, files), markdown[end:])])
+    return tabs("".join([*kept, _LINK.sub(lambda link: _link(link, source, uri, files), markdown[end:])]))
+
+
+def tabs(markdown: str) -> str:
+    """Return a page in which blocks under `<!-- tab: NAME -->` are tabs; text between two begins a new set."""
+
+    def tab(found: re.Match[str]) -> str:
+        start = markdown[: found.start()].rstrip()
+        first = "" if any(start.endswith(other) for other in bodies) else "!"
+        bodies.append(found["body"])
+        lines = "\n".join(f"    {line}" if line else "" for line in found["body"].splitlines())
+        return f'==={first} "{found["name"]}"\n\n{lines}'
+
+    bodies: list[str] = []
+    return _TAB.sub(tab, markdown)
 
 
 def _link(link: re.Match[str], source: str, uri: str, files: Files) -> str:

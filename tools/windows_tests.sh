@@ -12,7 +12,6 @@ SUBSET=(
     tests/test_mujoco_releases.py tests/test_not_on_windows.py
     tests/protocol
     tests/aio/test_readiness.py tests/aio/test_busy_loops.py tests/aio/test_stream_buffer.py
-    tests/cli/test_cli_ping.py
     tests/server/test_debug_ops.py
 )
 PACKAGES=(wine wine64 gcc-mingw-w64-x86-64 xvfb libgl1 libgl1-mesa-dri libxcomposite1 libxcursor1 libxi6 libxrandr2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -15,7 +16,8 @@ import msgspec
 import mujoco
 
 from benchmarks.canned import Requester, server
-from benchmarks.harness import Burst, Pair, Row
+from benchmarks.conditions import warm
+from benchmarks.harness import Burst, Figure, Pair, Row
 from benchmarks.robots import humanoid, recorded_of, robot_mjcf
 from urlab_client.protocol.codec import decode_reply, encode_request, op_of
 from urlab_client.protocol.messages.runtime import SetMode
@@ -24,13 +26,16 @@ from urlab_client.protocol.messages.session import Hello, HelloOk, Reset, Step
 __all__ = ["ROWS"]
 
 _JOINTS = 29
+_ROUNDS = 10
+_STEPS = 100
 
 
 class _Simulated:
     """A session with a simulated server in a process of its own, spoken to with bytes alone."""
 
-    def __init__(self, requester: Requester) -> None:
+    def __init__(self, requester: Requester, process: int) -> None:
         self.requester = requester
+        self.process = process
         hello = decode_reply(op_of(Hello), HelloOk, requester.ask(encode_request(Hello(), "")))
         self.session_id = hello.session_id
         assert hello.mjb is not None  # noqa: S101
@@ -77,9 +82,41 @@ def _simulated(path: Path) -> Iterator[_Simulated]:
         try:
             port = msgspec.json.decode(process.stdout.readline())["step_port"]
             with Requester(port) as requester:
-                yield _Simulated(requester)
+                yield _Simulated(requester, process.pid)
         finally:
             process.stdin.close()
+
+
+def _processor_s(process: int) -> float | None:
+    """Return the processor time of all threads of a process so far; None where the system does not tell."""
+    try:
+        stats = [path.read_text() for path in Path(f"/proc/{process}/task").glob("*/schedstat")]
+    except OSError:
+        return None
+    return sum(int(text.split()[0]) for text in stats) / 1e9 if stats else None
+
+
+def _processor_figures(simulated: _Simulated) -> list[Figure]:
+    """Return what a step takes the server's process beyond `mj_step`, all its threads and ZeroMQ's counted."""
+    step, reset = simulated.stepping(1), simulated.resetting()
+    data = mujoco.MjData(simulated.model)
+    spent: list[float] = []
+    for _ in range(_ROUNDS):
+        reset()
+        mujoco.mj_resetData(simulated.model, data)
+        before = _processor_s(simulated.process)
+        for _ in range(_STEPS):
+            step()
+        after = _processor_s(simulated.process)
+        if before is None or after is None:
+            return []
+        physics = time.thread_time()
+        for _ in range(_STEPS):
+            mujoco.mj_step(simulated.model, data)
+        spent.append((after - before - (time.thread_time() - physics)) / _STEPS)
+    return [
+        Figure(name="processor time of a step beyond mj_step, µs", value=1e6 * statistics.median(spent), at_most=20)
+    ]
 
 
 def _from_start(reset: Callable[[], object], step: Callable[[], object]) -> Burst:
@@ -114,6 +151,7 @@ def _single(robot: AbstractContextManager[Path]) -> Iterator[Pair]:
         yield Pair(
             ours=_from_start(ours.resetting(), ours.stepping(1)),
             floor=_from_start(lambda: mujoco.mj_resetData(ours.model, data), physics_and_round_trip),
+            figures=lambda: _processor_figures(ours),
         )
 
 
@@ -157,9 +195,12 @@ def _rows(suffix: str, robot: str, make: Callable[[], AbstractContextManager[Pat
     )
 
 
-# What the server adds is the same for all of them: the less there is to compute, the more it weighs.
+_HUMANOID = _rows("", "Gymnasium's humanoid", lambda: contextlib.nullcontext(humanoid()))
+
 ROWS = (
-    *_rows("", "Gymnasium's humanoid", lambda: contextlib.nullcontext(humanoid())),
+    *_HUMANOID,
+    warm(_HUMANOID[0], reach=1.25),
+    # What the server adds is the same for all of them: the less there is to compute, the more it weighs.
     *_rows("-light", f"{_LIGHT} standing on the ground", lambda: _robot(standing=True)),
     *_rows("-falling", f"{_LIGHT} in free fall", lambda: _robot(standing=False)),
 )

@@ -121,7 +121,8 @@ class Shell:
         if " examples/" in command:
             shutil.copytree(ROOT / "examples", self.folder / "examples", dirs_exist_ok=True)
         for name in re.findall(r"(?<![\w/.-])(\w+)\.xml\b", command):
-            (self.folder / f"{name}.xml").write_text(MODEL.format(name), encoding="utf-8")
+            if not (self.folder / f"{name}.xml").exists():  # which the page's program may have written
+                (self.folder / f"{name}.xml").write_text(MODEL.format(name), encoding="utf-8")
         for name in re.findall(r"(?<![\w/.-])\w+\.json\b", command):
             if not (self.folder / name).exists():
                 (self.folder / name).write_text(LEVEL, encoding="utf-8")

@@ -11,7 +11,9 @@ import msgspec
 import pytest
 from pages import ROOT
 
+import gen_cli
 import gen_docs
+from urlab_client.cli import _parser
 from urlab_client.protocol.errors import RPC_ERRORS
 from urlab_client.protocol.registry import OPS
 
@@ -38,11 +40,11 @@ def test_check_finds_a_stale_file_and_writes_nothing(tmp_path: Path, capsys: pyt
     assert gen_docs.main([], folder) == 0
     for page in sorted(folder.iterdir()):
         assert gen_docs.main(["--check"], folder) == 0
-        before = page.read_text()
-        page.write_text(before + "An edit by hand.\n")
+        before = page.read_bytes()
+        page.write_bytes(before + b"An edit by hand.\n")
         assert gen_docs.main(["--check"], folder) == 1
-        assert page.read_text().endswith("An edit by hand.\n")
-        page.write_text(before)
+        assert page.read_bytes().endswith(b"An edit by hand.\n")
+        page.write_bytes(before)
 
 
 def test_every_op_has_a_row_of_full_width() -> None:
@@ -111,3 +113,20 @@ def test_where_public_names_are_defined_is_found() -> None:
     for name, where in gen_docs.exports("urlab_client.server").items():
         module, _, attribute = where.rpartition(".")
         assert getattr(importlib.import_module(module), attribute) is getattr(urlab_client.server, name)
+
+
+def test_every_option_of_every_command_is_in_the_reference() -> None:
+    text = (ROOT / "docs" / "reference" / "cli.md").read_text(encoding="utf-8")
+    for name, command in _parser().commands.items():
+        section = text.split(f"\n## urlab {name}\n")[1].split("\n## ")[0]
+        options = re.findall(r"(?<![\w-])--[a-z-]+", command.format_help().split("\nexamples:")[0])
+        assert [option for option in options if option not in (*section.split("`"), "--help")] == [], name
+        assert all(f"`{line}`" in section for line, _ in command.examples)
+
+
+def test_the_reference_of_the_commands_is_current(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert gen_cli.main(["--check"]) == 0, "run python tools/gen_cli.py"
+    monkeypatch.setattr(gen_cli, "OUTPUT", tmp_path / "cli.md")
+    assert gen_cli.main(["--check"]) == 1
+    assert gen_cli.main([]) == 0
+    assert gen_cli.main(["--check"]) == 0

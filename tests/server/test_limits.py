@@ -57,6 +57,10 @@ def test_requests_name_the_limit_they_exceed(small: Wire) -> None:
         ("spawn_actor", spawn | {"actor_id": long}, "bad_request", "string_chars"),
         ("import_xml", {"path": long}, "bad_request", "string_chars"),
         ("reset", {"per_articulation_qpos": {"bot": {long: 1.0}}}, "bad_request", "string_chars"),
+        ("step", {"per_articulation": {long: {"ctrl": [0.0]}}}, "bad_request", "string_chars"),
+        ("step", {"per_articulation": {"bot": {"xfrc_applied": {long: [0.0] * 6}}}}, "bad_request", "string_chars"),
+        ("step", {"per_articulation": {"bot": {"control_mode": long}}}, "bad_request", "string_chars"),
+        ("step", {"include_cameras": {"eye": long}}, "bad_request", "string_chars"),
         ("spawn_grid", spawn | {"base_actor_id": "g", "count_x": 7, "count_y": 1}, "too_many_cells", "grid_cells"),
     ):
         answer = small.refusal(op, **fields)

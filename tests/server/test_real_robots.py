@@ -26,7 +26,7 @@ def test_two_of_a_robot_move_as_mj_step_says(model: Path) -> None:
         client.discover()
         assert client.model is not None
         assert len(client.articulations) == 2
-        layouts = articulation_layouts(client.model, list(client.articulations))
+        layouts = articulation_layouts(client.model, {key: key for key in client.articulations})
         data = mujoco.MjData(client.model)
         client.reset()
         rng = np.random.default_rng(0)

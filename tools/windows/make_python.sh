@@ -85,6 +85,8 @@ if [[ $(cat "$site/.packages" 2>/dev/null) != "${packages[*]}" ]]; then
         python3 -m zipfile -e "$wheel" "$site/"
     done
     rm -rf "$wheels"
+    mkdir -p "$target/py/Scripts"
+    find "$site" -path '*.data/scripts/*.exe' -exec mv {} "$target/py/Scripts/" \;
     python3 - "$site" <<'EOF'
 import pathlib
 import sys

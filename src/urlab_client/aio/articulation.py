@@ -16,8 +16,15 @@ from urlab_client.aio.model.articulation_state import MirroredArticulation, Mirr
 from urlab_client.aio.model.elements import Actuator, ArticulationElements, Body, Joint, Sensor, make_elements
 from urlab_client.aio.model.layout import ArticulationLayout
 from urlab_client.aio.model.numbers import finite, finite_array
+from urlab_client.aio.motion import Motion
 from urlab_client.aio.session import Session
 from urlab_client.protocol.base import Floats
+from urlab_client.protocol.descriptions import (
+    ArticulationDescription,
+    ControllerDescription,
+    EntityDescription,
+    Pose,
+)
 from urlab_client.protocol.enums import ControlMode, OutOfRange
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import ControllerInfo
@@ -122,6 +129,18 @@ class URLabEntity:
         """
         self._record.apply_wrench(self._record.name, _wrench(force, torque))
 
+    def _place(self) -> Pose | None:
+        try:
+            position, quaternion = self._pose()
+        except URLabError:
+            return None
+        (x, y, z), (qw, qx, qy, qz) = position.tolist(), quaternion.tolist()
+        return Pose(position=(x, y, z), quaternion=(qw, qx, qy, qz))
+
+    def describe(self) -> EntityDescription | ArticulationDescription:
+        """Return name, kind and pose, as of the last reply, in a form that encodes directly to JSON."""
+        return EntityDescription(name=self.name, free_base=self.has_free_base, pose=self._place())
+
     def _pose(self) -> tuple[Floats, Floats]:
         record = self._record
         with record.mirror.lock:
@@ -160,10 +179,11 @@ class URLabArticulation(URLabEntity):
 
     _record: MirroredArticulation
 
-    def __init__(self, record: MirroredArticulation, session: Session, publishers: Publishers) -> None:
+    def __init__(self, record: MirroredArticulation, session: Session, publishers: Publishers, motion: Motion) -> None:
         super().__init__(record)
         self._session = session
         self._publishers = publishers
+        self._motion = motion
         self._controller: tuple[ControllerInfo, URLabController] | None = None
         self._handles: tuple[ArticulationLayout, ArticulationElements] | None = None
         self._cameras: NameMap[URLabCameraView] = NameMap()
@@ -325,7 +345,7 @@ class URLabArticulation(URLabEntity):
         """Set some set-points by actuator name; the others keep their last value.
 
         Args:
-            values: Actuator name to set-point.
+            values: Actuator name to set-point; of an actuator with several inputs, the first.
             out_of_range: What becomes of a value outside its actuator's range; see `Actuator.set_control`.
 
         Raises:
@@ -335,7 +355,7 @@ class URLabArticulation(URLabEntity):
         """
         rule = OutOfRange(out_of_range)
         found = [(self.actuators[name], value) for name, value in values.items()]
-        checked = [(actuator.ctrl_local, actuator.checked(value, rule)) for actuator, value in found]
+        checked = [actuator.checked(value, rule) for actuator, value in found]
         if checked:
             self._record.drive()
         for where, value in checked:
@@ -353,6 +373,30 @@ class URLabArticulation(URLabEntity):
     def get_sensors(self) -> dict[str, Floats]:
         """Return the last readings by sensor name, each a fresh array of shape (dim,)."""
         return {name: np.asarray(reading) for name, reading in self._record.sensors.items()}
+
+    def describe(self) -> ArticulationDescription:
+        """Return its parts, its state and its set-points, as of the last reply.
+
+        `msgspec.json.encode` and `msgspec.to_builtins` accept the result directly.
+        """
+        controller = self._record.controller
+        with self._record.mirror.lock:
+            return ArticulationDescription(
+                name=self.prefix,
+                actor_id=self.actor_id,
+                free_base=self.has_free_base,
+                pose=self._place(),
+                joints=[joint.describe() for joint in self.joints.values()],
+                actuators=[actuator.describe() for actuator in self.actuators.values()],
+                sensors=[sensor.describe() for sensor in self.sensors.values()],
+                cameras=[camera.describe() for camera in self.cameras.values()],
+                controller=None
+                if controller is None
+                else ControllerDescription(
+                    kind=controller.kind, in_force=self.control_mode is ControlMode.UE_CONTROLLER
+                ),
+                control_owner=self.control_owner,
+            )
 
     def resolve_joint(self, name: str) -> str | None:
         """Return the live key of a joint given its live, compiled or original MJCF name, or None."""
@@ -392,8 +436,33 @@ class URLabArticulation(URLabEntity):
         self._record.apply_wrench(body, _wrench(force, torque))
         self._record.drive()
 
+    async def move_to(self, targets: Mapping[str, float], *, tolerance: float = 0.01, timeout: float = 10.0) -> float:
+        """Move joints to positions with their position servos, and return when they have settled there.
+
+        Sets the set-points at once, without an intermediate path, and then steps in `direct` and `puppet` or watches
+        in `live`. A joint has settled when it is within the tolerance and so slow that it would stay there for 0.1 s.
+        Other set-points do not change, and the new ones stay in force afterwards.
+
+        Args:
+            targets: Joint name to position, radians or metres.
+            tolerance: How far from its target a joint may be, in its unit.
+            timeout: Seconds of simulation time after which to give up.
+
+        Returns:
+            Seconds of simulation time that it took.
+
+        Raises:
+            NotSettled: Time is up; `.remaining` has the distance that each joint still has to go, and the message
+                contains what `explain()` found. A servo that works against gravity may need a larger tolerance.
+            KeyError: The articulation has no such joint; nothing was set.
+            ValueError: A target is outside the range of its joint or actuator, or not finite, or nothing holds the
+                joint at a position; nothing was set.
+            URLabTimeoutError: Simulation time does not pass, for example while paused in live mode.
+        """
+        return await self._motion.move_to(self, targets, tolerance, timeout)
+
     async def claim(self, *, force: bool = False, ttl: float = CLAIM_S, timeout: Timeout = DEFAULT) -> None:
-        """Become the one client that controls the articulation, before the first write does it by itself.
+        """Become the only client that controls the articulation, before the first write does so automatically.
 
         A claim is renewed for as long as the client lives, and given up by `release()` and by closing the client. On a
         server whose robots have no owner this does nothing.
@@ -404,7 +473,7 @@ class URLabArticulation(URLabEntity):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            ControlClaimed: Another client controls it; `.owner` says which.
+            ControlClaimed: Another client controls it; `.owner` names it.
             ValueError: `ttl` is negative or not a number.
         """
         await self._session.control.claim(self.prefix, force=force, ttl=ttl, timeout=timeout)
@@ -421,9 +490,9 @@ class URLabArticulation(URLabEntity):
 
     @property
     def control_owner(self) -> str | None:
-        """Who controls it, as far as this client knows: `HOST/PROCESS/…` for this process, else the other's name.
+        """The client that controls it, as far as is known: `HOST/PROCESS/…` for this process, else the other's name.
 
-        None when nobody does, when it is not known, and on servers whose robots have no owner.
+        None if no client controls it, if it is not known, and on servers whose robots have no owner.
         """
         return self._session.control.owner_of(self.prefix)
 

@@ -10,6 +10,7 @@ from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.live.live_state import LatestPicture
 from urlab_client.aio.live.publishers import Publishers, SharedFrame
 from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS, Stream
+from urlab_client.protocol.descriptions import CameraDescription
 from urlab_client.protocol.enums import CameraMode, known
 from urlab_client.protocol.messages.session import CameraInfo
 from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
@@ -73,6 +74,11 @@ class URLabCameraView:
     def dtype(self) -> np.dtype[Any]:
         """uint8, or float32 for depth."""
         return np.dtype(np.float32 if self.mode == CameraMode.DEPTH else np.uint8)
+
+    def describe(self) -> CameraDescription:
+        """Return what it is."""
+        width, height = self.resolution
+        return CameraDescription(name=self.name, mode=str(self.mode), width=width, height=height, fovy=self.fovy)
 
     def frames(
         self,

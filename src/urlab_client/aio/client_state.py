@@ -11,6 +11,7 @@ from urlab_client.aio.session import Session
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.transport.base import TransportStats
 from urlab_client.protocol.client_types import ClientConfig, ServerInfo
+from urlab_client.protocol.descriptions import ArticulationDescription, EntityDescription, SceneDescription
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.names import NameMap
@@ -166,6 +167,25 @@ class ClientState:
     def recv_wall_time_ns(self) -> int:
         """This machine's UTC clock when the last reply arrived, nanoseconds."""
         return self._state.recv_wall_time_ns
+
+    def describe(self) -> SceneDescription:
+        """Return everything that moves, as of the last reply: robots, other bodies, cameras of the scene.
+
+        Sends nothing. `msgspec.json.encode` and `msgspec.to_builtins` take the result as it is.
+        """
+        with self._state.mirror.lock:
+            described = [entity.describe() for entity in self.entities.values()]
+            model = self.model
+            return SceneDescription(
+                address=self.address,
+                playing=self.manager_present,
+                step_mode=str(self.step_mode),
+                sim_time=self.sim_time,
+                timestep=None if model is None else float(model.opt.timestep),
+                articulations=[one for one in described if isinstance(one, ArticulationDescription)],
+                entities=[one for one in described if isinstance(one, EntityDescription)],
+                cameras=[camera.describe() for camera in self.global_cameras.values()],
+            )
 
     def camera(self, name: str) -> URLabCameraView:
         """Return a camera by `<articulation>/<camera>`, or by `<camera>` where that means one of them.

@@ -39,9 +39,10 @@ def add_parser(commands: Commands) -> None:
     """Add the command to the parser."""
     parser = commands.add_parser(
         "console",
-        help="a page in the browser to see and touch a simulation",
-        description="Serve a page to see and touch a simulation, on this machine alone, and print a link that lets one "
-        "browser in. The page makes links for more. It ends with exit code 0 on SIGINT (Ctrl-C) and SIGTERM.",
+        help="show a simulation in the browser, and interact with it",
+        description="Serve a page that shows a simulation and lets you interact with it, only on this machine, and "
+        "print a link that admits one browser. The page can create more links. Ends with exit code 0 on SIGINT "
+        "(Ctrl-C) and SIGTERM.",
         examples=(
             ("urlab console", "the server on this machine, at a link for your browser"),
             ("urlab console sim://quadruped --open", "a simulated robot, opened in the browser"),
@@ -52,7 +53,7 @@ def add_parser(commands: Commands) -> None:
     add_ports(parser)
     add_keys(parser)
     parser.add_argument(
-        "--port", type=port, default=PAGE_PORT, help="of the page; 0: any free one (default: %(default)s)"
+        "--port", type=port, default=PAGE_PORT, help="port of the page; 0: any free one (default: %(default)s)"
     )
     parser.add_argument(
         "--host",

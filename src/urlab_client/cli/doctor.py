@@ -46,9 +46,9 @@ def add_parser(commands: Commands) -> None:
     parser = commands.add_parser(
         "doctor",
         help="find out why a robot does not move",
-        description="Examine a server from its sockets to the set-points and say what keeps robots from moving. "
-        "Opens a session, which takes the server over from the client that drives it; a program of your own can call "
-        "client.explain() without doing so. Exit code 0 when nothing is in the way, 1 when something is.",
+        description="Check a server from its sockets to the set-points, and say what keeps robots from moving. This "
+        "opens a session, which takes the server over from the client that drives it; in your own program, "
+        "client.explain() does the same without that. Exit code 0 if nothing is wrong, 1 if something is.",
         examples=(
             ("urlab doctor", "the server on this machine"),
             ("urlab doctor 'sim://arm?unpaused'", "a simulated server, started for this command"),

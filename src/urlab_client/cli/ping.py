@@ -113,10 +113,10 @@ def add_parser(commands: Commands) -> None:
     """Add the command to the parser."""
     parser = commands.add_parser(
         "ping",
-        help="show who answers at an address",
-        description="Show who answers at an address: versions, play state and step mode, articulations, and the "
-        "round-trip times of `meta`. Reading them opens a session, which takes the server over from the client that "
-        "drives it; with --no-session only the op list and the round-trip times are read, and nobody is disturbed.",
+        help="show which server answers at an address, and how fast",
+        description="Show which server answers at an address: versions, play state and step mode, articulations, and "
+        "the round-trip times of `meta`. This opens a session, which takes the server over from the client that "
+        "drives it. --no-session reads only the op list and the round-trip times, and does not disturb other clients.",
         examples=(
             ("urlab ping", "the server on this machine: versions, play state, robots, round trip"),
             ("urlab ping 192.168.1.20:5559 --no-session", "another machine, without taking over its session"),
@@ -129,12 +129,14 @@ def add_parser(commands: Commands) -> None:
         "--timeout", type=seconds, default=2.0, metavar="SECONDS", help="to wait for each reply (default: 2)"
     )
     parser.add_argument("--count", type=count, default=5, metavar="N", help="round trips to time (default: 5)")
-    parser.add_argument("--no-session", action="store_true", help="disturb nobody: do not open a session")
+    parser.add_argument(
+        "--no-session", action="store_true", help="do not open a session, so that no client is disturbed"
+    )
     parser.add_argument(
         "--all",
         action="store_true",
-        help="list the servers that this machine's registry knows (the plugin's beta keeps one), and ask each whether "
-        "it answers; nobody is disturbed",
+        help="list the servers in this machine's registry (which the plugin's beta writes), and check whether each "
+        "answers; does not disturb other clients",
     )
     parser.add_argument("--json", action="store_true", help="print one line of JSON")
     add_keys(parser)

@@ -78,11 +78,11 @@ def add_parser(commands: Commands) -> None:
         "--seconds", type=seconds, default=10.0, metavar="S", help="simulated seconds (default: %(default)s)"
     )
     parser.add_argument("--keyframe", metavar="NAME", help="keyframe to start from, in direct mode")
-    add_cameras(parser, "a camera to keep")
+    add_cameras(parser, "a camera to record")
     parser.add_argument(
         "--camera-hz", type=hertz, default=30.0, metavar="HZ", help="pictures per second (default: %(default)s)"
     )
-    parser.add_argument("--contacts", action="store_true", help="keep contacts, too")
+    parser.add_argument("--contacts", action="store_true", help="also record contacts")
     parser.add_argument("--overwrite", action="store_true", help="replace FILE if it exists")
     add_keys(parser)
     parser.set_defaults(run=run)

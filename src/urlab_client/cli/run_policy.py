@@ -114,7 +114,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--record", type=Path, metavar="FILE", help="record the policy's run into a .mcap file (extra 'mcap')"
     )
-    add_cameras(parser, "with --record: a camera to keep")
+    add_cameras(parser, "with --record: a camera to record")
     parser.add_argument("--overwrite", action="store_true", help="with --record: replace FILE if it exists")
     parser.add_argument("--json", action="store_true", help="print JSON")
     add_ports(parser)

@@ -117,7 +117,7 @@ def add_parser(commands: Commands) -> None:
         "--server-key",
         type=Path,
         metavar="FILE",
-        help="encrypt everything and prove who this server is, with the secret key file that `urlab keys new` made",
+        help="encrypt everything and prove this server's identity, with a secret key file from `urlab keys new`",
     )
     who = network.add_mutually_exclusive_group()
     who.add_argument(
@@ -126,10 +126,12 @@ def add_parser(commands: Commands) -> None:
         action="append",
         default=[],
         metavar="PATH",
-        help="with --server-key: let in the client with this public key file, or those of a folder; repeatable",
+        help="with --server-key: admit the client with this public key file, or the clients of a folder; repeatable",
     )
     who.add_argument(
-        "--allow-any-client", action="store_true", help="with --server-key: let in whoever has the server's public key"
+        "--allow-any-client",
+        action="store_true",
+        help="with --server-key: admit every client that has the server's public key",
     )
     network.add_argument(
         "--insecure-no-auth",
@@ -153,13 +155,13 @@ def add_parser(commands: Commands) -> None:
         metavar="N",
         help="number of this server among several: ports 5559 + 10 N and the two after it, for those not given",
     )
-    network.add_argument("--instance-id", default="", metavar="NAME", help="what this server is called among several")
+    network.add_argument("--instance-id", default="", metavar="NAME", help="name of this server among several")
     memory = network.add_mutually_exclusive_group()
     memory.add_argument(
         "--shm-dir",
         type=Path,
         metavar="DIR",
-        help="serve over shared memory, too, in a directory of its own below DIR (on Linux /dev/shm spares the disk)",
+        help="also serve over shared memory, in a new directory below DIR (on Linux, /dev/shm avoids the disk)",
     )
     memory.add_argument("--no-shm", action="store_true", help="do without shared memory (default)")
     content = parser.add_argument_group("content")
@@ -167,7 +169,7 @@ def add_parser(commands: Commands) -> None:
         "--saved-dir",
         type=Path,
         metavar="DIR",
-        help="where levels and imported models are kept (default: a folder that goes with the server)",
+        help="folder for levels and imported models (default: a temporary folder)",
     )
     content.add_argument(
         "--model-root",
@@ -222,7 +224,9 @@ def add_parser(commands: Commands) -> None:
         metavar="ACTOR/CAMERA=MODE",
         help=f"{', '.join(CameraMode)}; repeatable (default: real)",
     )
-    cameras.add_argument("--camera-size", type=image_size, metavar="WxH", help="pixels, for cameras that give none")
+    cameras.add_argument(
+        "--camera-size", type=image_size, metavar="WxH", help="pixels, for cameras without a resolution"
+    )
     cameras.add_argument(
         "--render-quality",
         choices=("auto", "fast", "high"),
@@ -232,12 +236,12 @@ def add_parser(commands: Commands) -> None:
         "(default: auto)",
     )
     life = parser.add_argument_group("for programs that start a server")
-    life.add_argument("--json", action="store_true", help="say that the server is ready with one line of JSON")
+    life.add_argument("--json", action="store_true", help="print one line of JSON when the server is ready")
     life.add_argument(
         "--until-eof",
         action="store_true",
-        help="also end when standard input closes, so that the server cannot outlive whoever holds the other end; "
-        "SIGINT is ignored then, unless standard input is a terminal",
+        help="also end when standard input closes, so that the server cannot outlive the program that started it; "
+        "it then ignores SIGINT, unless standard input is a terminal",
     )
     parser.set_defaults(run=run)
 

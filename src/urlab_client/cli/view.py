@@ -57,7 +57,7 @@ def add_parser(commands: Commands) -> None:
     """Add the command to the parser."""
     parser = commands.add_parser(
         "view",
-        help="see a simulation: MuJoCo's window, a browser, Rerun, Foxglove",
+        help="show a simulation in MuJoCo's window, a browser, Rerun or Foxglove",
         description="Show a play session while it goes on. In live mode physics runs by itself and is watched; in "
         "direct mode this command resets and steps it, with all set-points zero. Opens a session, which takes the "
         "server over from the client that drives it; a program of your own can call rerun_view(client) and its "
@@ -87,7 +87,7 @@ def add_parser(commands: Commands) -> None:
         action="store_true",
         help="with --rerun: serve Rerun's page for browsers; Rerun does that on every interface, to anybody",
     )
-    parser.add_argument("--port", type=port, metavar="PORT", help="of what --web, --foxglove or --page serves")
+    parser.add_argument("--port", type=port, metavar="PORT", help="port for --web, --foxglove or --page")
     add_ports(parser)
     add_step_mode(parser)
     parser.add_argument("--seconds", type=seconds, metavar="S", help="simulated seconds (default: until Ctrl-C)")

@@ -10,6 +10,7 @@ __all__ = [
     "ConcurrentReadError",
     "ConnectionLost",
     "ForkedError",
+    "NotSettled",
     "OutcomeUnknown",
     "ProtocolError",
     "ServerUnreachable",
@@ -102,6 +103,20 @@ class URLabTimeoutError(URLabError, TimeoutError):
     """
 
     job_id: str | None = None
+
+
+class NotSettled(URLabTimeoutError):
+    """Joints are not where `move_to()` was to take them. Their set-points stay.
+
+    Attributes:
+        remaining: How far each of them has to go, by joint name: radians or metres, with sign.
+    """
+
+    remaining: dict[str, float]
+
+    def __init__(self, message: str, *, remaining: dict[str, float], hint: str | None = None) -> None:
+        super().__init__(message, hint=hint)
+        self.remaining = remaining
 
 
 class ProtocolError(URLabError):

@@ -137,6 +137,11 @@ class Features(Struct, frozen=True, kw_only=True, dict=True):
         return not self._beta_state
 
     @cached_property
+    def exact_controls(self) -> bool:
+        """Set-points and what controllers make of them are not rounded to single precision."""
+        return self._beta_state
+
+    @cached_property
     def idles_in_puppet(self) -> bool:
         """Physics takes steps of its own between the pushes of puppet mode, unless it is paused."""
         return self._beta_state

@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from typing import Any, NoReturn, TypeVar, cast, overload
 
-__all__ = ["NameMap", "UnknownName", "did_you_mean", "owner_of", "split_prefix"]
+__all__ = ["NameMap", "UnknownName", "compiled_names", "did_you_mean", "owner_of", "split_prefix"]
 
 T = TypeVar("T")
 D = TypeVar("D")
@@ -194,3 +194,15 @@ def split_prefix(names: Iterable[str], prefixes: Collection[str]) -> list[tuple[
     known = frozenset(prefixes)
     owned = ((owner_of(name, known), name) for name in names)
     return [(owner, name if owner is None else name[len(owner) + 1 :]) for owner, name in owned]
+
+
+def compiled_names(name: str, prefixes: Mapping[str, str]) -> set[str]:
+    """Return what a user may mean by a name in the compiled model, besides that very name.
+
+    Args:
+        name: The name an articulation's author gave, or that with the articulation's key and `_` in front.
+        prefixes: By key of the articulation, what the names of its elements begin with, without the underscore.
+    """
+    local = {f"{prefix}_{name}" for prefix in prefixes.values()}
+    keyed = {f"{prefix}{name.removeprefix(key)}" for key, prefix in prefixes.items() if name.startswith(f"{key}_")}
+    return local | keyed

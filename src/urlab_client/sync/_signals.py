@@ -7,7 +7,7 @@ import signal
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable
-from itertools import compress, repeat, starmap
+from itertools import repeat, starmap
 from operator import itemgetter
 from types import FrameType, TracebackType
 from typing import Any, Self
@@ -46,7 +46,7 @@ class DeferredSignals:
 
     def __enter__(self) -> Self:
         if threading.get_ident() == threading.main_thread().ident:
-            self._numbers = numbers = list(compress(_SIGNALS, map(callable, map(_get_handler, _SIGNALS))))
+            self._numbers = numbers = [number for number in _SIGNALS if callable(_get_handler(number))]
             try:
                 # A list keeps what came before an exception: exactly the handlers that were replaced.
                 self._handlers.extend(map(_set_handler, numbers, repeat(self._on_signal)))

@@ -12,6 +12,7 @@ from urlab_client.aio.control import CLAIM_S
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.model.elements import Actuator, Body, Joint, Sensor
 from urlab_client.protocol.base import Floats
+from urlab_client.protocol.descriptions import ArticulationDescription, EntityDescription
 from urlab_client.protocol.enums import ControlMode, OutOfRange
 from urlab_client.protocol.names import NameMap
 from urlab_client.sync._facade import Facade
@@ -105,6 +106,10 @@ class URLabEntity(Facade, twin=aio.URLabEntity):
             ValueError: A vector does not have three finite components.
         """
         self._aio.apply_xfrc(force=force, torque=torque)
+
+    def describe(self) -> EntityDescription | ArticulationDescription:
+        """Return name, kind and pose, as of the last reply, in a form that encodes directly to JSON."""
+        return self._aio.describe()
 
 
 class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
@@ -250,7 +255,7 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
         """Set some set-points by actuator name; the others keep their last value.
 
         Args:
-            values: Actuator name to set-point.
+            values: Actuator name to set-point; of an actuator with several inputs, the first.
             out_of_range: What becomes of a value outside its actuator's range; see `Actuator.set_control`.
 
         Raises:
@@ -271,6 +276,13 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
     def get_sensors(self) -> dict[str, Floats]:
         """Return the last readings by sensor name, each a fresh array of shape (dim,)."""
         return self._aio.get_sensors()
+
+    def describe(self) -> ArticulationDescription:
+        """Return its parts, its state and its set-points, as of the last reply.
+
+        `msgspec.json.encode` and `msgspec.to_builtins` accept the result directly.
+        """
+        return self._aio.describe()
 
     def resolve_joint(self, name: str) -> str | None:
         """Return the live key of a joint given its live, compiled or original MJCF name, or None."""
@@ -300,8 +312,33 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
         """
         self._aio.apply_xfrc(body, force=force, torque=torque)
 
+    def move_to(self, targets: Mapping[str, float], *, tolerance: float = 0.01, timeout: float = 10.0) -> float:
+        """Move joints to positions with their position servos, and return when they have settled there.
+
+        Sets the set-points at once, without an intermediate path, and then steps in `direct` and `puppet` or watches
+        in `live`. A joint has settled when it is within the tolerance and so slow that it would stay there for 0.1 s.
+        Other set-points do not change, and the new ones stay in force afterwards.
+
+        Args:
+            targets: Joint name to position, radians or metres.
+            tolerance: How far from its target a joint may be, in its unit.
+            timeout: Seconds of simulation time after which to give up.
+
+        Returns:
+            Seconds of simulation time that it took.
+
+        Raises:
+            NotSettled: Time is up; `.remaining` has the distance that each joint still has to go, and the message
+                contains what `explain()` found. A servo that works against gravity may need a larger tolerance.
+            KeyError: The articulation has no such joint; nothing was set.
+            ValueError: A target is outside the range of its joint or actuator, or not finite, or nothing holds the
+                joint at a position; nothing was set.
+            URLabTimeoutError: Simulation time does not pass, for example while paused in live mode.
+        """
+        return self._portal.call(self._aio.move_to, targets, tolerance=tolerance, timeout=timeout)
+
     def claim(self, *, force: bool = False, ttl: float = CLAIM_S, timeout: Timeout = DEFAULT) -> None:
-        """Become the one client that controls the articulation, before the first write does it by itself.
+        """Become the only client that controls the articulation, before the first write does so automatically.
 
         A claim is renewed for as long as the client lives, and given up by `release()` and by closing the client. On a
         server whose robots have no owner this does nothing.
@@ -312,7 +349,7 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            ControlClaimed: Another client controls it; `.owner` says which.
+            ControlClaimed: Another client controls it; `.owner` names it.
             ValueError: `ttl` is negative or not a number.
         """
         self._portal.call(self._aio.claim, force=force, ttl=ttl, timeout=timeout)
@@ -327,8 +364,8 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
 
     @property
     def control_owner(self) -> str | None:
-        """Who controls it, as far as this client knows: `HOST/PROCESS/…` for this process, else the other's name.
+        """The client that controls it, as far as is known: `HOST/PROCESS/…` for this process, else the other's name.
 
-        None when nobody does, when it is not known, and on servers whose robots have no owner.
+        None if no client controls it, if it is not known, and on servers whose robots have no owner.
         """
         return self._aio.control_owner

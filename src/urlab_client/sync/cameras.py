@@ -12,6 +12,7 @@ from urlab_client.aio import cameras as aio
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.live.publishers import SharedFrame
 from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS
+from urlab_client.protocol.descriptions import CameraDescription
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraInfo
 from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
@@ -80,6 +81,10 @@ class URLabCameraView(Facade, twin=aio.URLabCameraView):
     def dtype(self) -> np.dtype[Any]:
         """uint8, or float32 for depth."""
         return self._aio.dtype
+
+    def describe(self) -> CameraDescription:
+        """Return what it is."""
+        return self._aio.describe()
 
     def frames(
         self,

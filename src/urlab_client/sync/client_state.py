@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from urlab_client.aio import client_state as aio
 from urlab_client.aio.transport.base import TransportStats
 from urlab_client.protocol.client_types import ClientConfig, ServerInfo
+from urlab_client.protocol.descriptions import SceneDescription
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.names import NameMap
@@ -159,6 +160,13 @@ class ClientState(Facade, twin=aio.ClientState):
     def recv_wall_time_ns(self) -> int:
         """This machine's UTC clock when the last reply arrived, nanoseconds."""
         return self._aio.recv_wall_time_ns
+
+    def describe(self) -> SceneDescription:
+        """Return everything that moves, as of the last reply: robots, other bodies, cameras of the scene.
+
+        Sends nothing. `msgspec.json.encode` and `msgspec.to_builtins` take the result as it is.
+        """
+        return self._aio.describe()
 
     def camera(self, name: str) -> URLabCameraView:
         """Return a camera by `<articulation>/<camera>`, or by `<camera>` where that means one of them.

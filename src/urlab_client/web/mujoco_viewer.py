@@ -177,7 +177,6 @@ def _prepare(model: mujoco.MjModel, prefixes: Mapping[str, str]) -> Shown:
     bundle: bytes = _payload().serialize_model_bundle(model)
     camera = mujoco.MjvCamera()
     mujoco.mjv_defaultFreeCamera(model, camera)
-    layouts = articulation_layouts(model, list(prefixes.values()))
-    addresses = {key: layouts[prefix].qpos_adr for key, prefix in prefixes.items()}
+    addresses = {key: layout.qpos_adr for key, layout in articulation_layouts(model, prefixes).items()}
     flags = [int(flag) for flag in mujoco.MjvScene(model, maxgeom=1).flags]  # shadows, reflections, sky
     return Shown(model, mujoco.MjData(model), bundle, zlib.crc32(bundle), addresses, camera, flags)

@@ -375,20 +375,26 @@ class MirroredArticulation(MirroredEntity):
             i -= count
         raise IndexError(i)
 
+    @property
+    def takes_positions(self) -> bool:
+        """Whether set-points are positions of the joints, because a PD controller is in force."""
+        controller = self.controller
+        return (
+            controller is not None
+            and controller.kind == ControllerKind.PD
+            and self.control_mode is ControlMode.UE_CONTROLLER
+        )
+
     def ranges(self) -> tuple[Floats, Floats]:
         """Return the least and the largest value of each set-point, infinite where there is none or it is not known.
 
         Set-points are controls, and those of a PD controller in force are positions of the joint that is driven.
         """
         low, high = np.full(len(self.ctrl), -np.inf), np.full(len(self.ctrl), np.inf)
-        model, controller = self.mirror.model, self.controller
+        model = self.mirror.model
         if model is None:
             return low, high
-        positions = (
-            controller is not None
-            and controller.kind == ControllerKind.PD
-            and self.control_mode is ControlMode.UE_CONTROLLER
-        )
+        positions = self.takes_positions
         counts, starts = control_counts(model), control_starts(model)
         start = 0
         for actuator in self.layout.actuators.values():

@@ -12,8 +12,17 @@ from urlab_client._mujoco import acting_kind, control_counts, control_starts, fo
 from urlab_client.aio.model.articulation_state import MirroredArticulation
 from urlab_client.aio.model.layout import JOINT_TRANSMISSIONS, QPOS_WIDTH, QVEL_WIDTH
 from urlab_client.aio.model.numbers import finite, finite_array, is_array
+from urlab_client.aio.model.units import JOINT_KINDS, joint_unit, sensor_kind, sensor_unit, set_point_meaning
 from urlab_client.protocol.base import Floats
+from urlab_client.protocol.descriptions import (
+    ActuatorDescription,
+    JointDescription,
+    JointKind,
+    SensorDescription,
+    SetPointMeaning,
+)
 from urlab_client.protocol.enums import ActuatorType, OutOfRange, known
+from urlab_client.protocol.messages.session import ArticulationInfo
 from urlab_client.protocol.names import NameMap
 
 if TYPE_CHECKING:
@@ -101,30 +110,80 @@ class Actuator:
         """Set the set-point that the next step sends.
 
         Args:
-            v: The set-point; for actuators with several inputs a sequence.
+            v: The set-point. For an actuator with several inputs, a number is its first input, which `value` tells, and
+                the others stay; a sequence is all of them.
             out_of_range: What becomes of a value outside the actuator's range: `error` refuses it, `clamp` takes the
                 nearest value inside, `allow` sends it as it is. The range is the control range; while a PD controller
                 is in force it is that of the driven joint. Without a local model no range is known.
 
         Raises:
             TypeError: It is not a number.
-            ValueError: It is NaN, infinite, or, with `error`, out of range; nothing was set.
+            ValueError: It is NaN, infinite, as a sequence not as long as there are inputs, or, with `error`, out of
+                range; nothing was set.
         """
-        value = self.checked(v, OutOfRange(out_of_range))
+        where, value = self.checked(v, OutOfRange(out_of_range))
         self._record.drive()
-        self._record.ctrl[self.ctrl_local] = value
+        self._record.ctrl[where] = value
 
-    def checked(self, v: object, out_of_range: OutOfRange) -> float | Floats:
-        """Return what `set_control` would set; raises as it does."""
+    def checked(self, v: object, out_of_range: OutOfRange) -> tuple[slice, float | Floats]:
+        """Return what `set_control` would set, and where; raises as it does."""
         what = f"actuator {self.name!r} of {self._record.name!r}"
-        value = finite_array(what, v) if is_array(v) else finite(what, v)
+        where = self.ctrl_local
+        value: float | Floats
+        if is_array(v):
+            value = finite_array(what, v)
+            inputs = where.stop - where.start
+            if value.shape != (inputs,):
+                raise ValueError(f"{what} takes {inputs} numbers, got an array of shape {value.shape}. Nothing was set")
+        else:
+            value = finite(what, v)
+            where = slice(where.start, where.start + 1)
         if out_of_range is OutOfRange.ALLOW:
-            return value
-        low, high = (bounds[self.ctrl_local] for bounds in self._record.ranges())
+            return where, value
+        low, high = (bounds[where] for bounds in self._record.ranges())
         inside = np.clip(value, low, high)
         if out_of_range is OutOfRange.ERROR and np.any(inside != value):
             raise ValueError(f"{what} takes {_listed(low)} to {_listed(high)}, got {v}. Nothing was set")
-        return inside
+        return where, inside
+
+    def set_point_for(self, position: float) -> float:
+        """Return the set-point of a position servo that holds its joint at a position, but for what pulls at it.
+
+        Args:
+            position: In the joint's unit, radians or metres.
+
+        Raises:
+            ValueError: It is not a position servo, or there is no local model to tell.
+        """
+        record, model = self._record, self._record.mirror.model
+        if record.takes_positions:
+            return position
+        if model is None or set_point_meaning(model, self.id)[0] != "position":
+            raise ValueError(f"actuator {self.name!r} of {record.name!r} is not known to be a position servo")
+        gain, bias = float(model.actuator_gainprm[self.id][0]), float(model.actuator_biasprm[self.id][1])
+        return position * float(model.actuator_gear[self.id][0]) * (-bias / gain if gain else 1.0)
+
+    def describe(self) -> ActuatorDescription:
+        """Return what it is and what it is told."""
+        record, model = self._record, self._record.mirror.model
+        takes: SetPointMeaning = ""
+        unit = ""
+        if model is not None:
+            takes, unit = set_point_meaning(model, self.id)
+        if record.takes_positions:
+            takes, unit = "position", "" if model is None or self.joint is None else _unit_of(record, model, self.joint)
+        low, high = (float(bounds[self.ctrl_local.start]) for bounds in record.ranges())
+        return ActuatorDescription(
+            name=self.name,
+            kind=None if self.type is None else str(self.type),
+            joint=self.joint,
+            takes=takes,
+            unit=unit,
+            limits=(low, high) if np.isfinite((low, high)).all() else None,
+            force_limits=self.forcerange,
+            gear=float(model.actuator_gear[self.id][0]) if model is not None and self.joint else None,
+            set_point=self.value,
+        )
 
     def __repr__(self) -> str:
         return f"<Actuator {self.name!r} id={self.id}>"
@@ -145,6 +204,7 @@ class Joint:
     """
 
     __slots__ = (
+        "_record",
         "id",
         "jnt_type",
         "name",
@@ -157,6 +217,7 @@ class Joint:
 
     def __init__(
         self,
+        record: MirroredArticulation,
         *,
         name: str,
         id: int,  # noqa: A002
@@ -167,6 +228,7 @@ class Joint:
         qvel_local_offset: int,
         range: tuple[float, float] | None,  # noqa: A002
     ) -> None:
+        self._record = record
         self.name = name
         self.id = id
         self.jnt_type = jnt_type
@@ -175,6 +237,50 @@ class Joint:
         self.qvel_offset = qvel_offset
         self.qvel_local_offset = qvel_local_offset
         self.range = range
+
+    @property
+    def kind(self) -> JointKind:
+        """`hinge`, `slide`, `ball` or `free`."""
+        return JOINT_KINDS[self.jnt_type]
+
+    @property
+    def unit(self) -> str:
+        """`rad` or `m`; empty for joints whose position is not one number. The velocity's is the same per second."""
+        return joint_unit(self.kind)
+
+    @property
+    def limits(self) -> tuple[float, float] | None:
+        """(low, high) in its unit, or None if unlimited; the same as `range`."""
+        return self.range
+
+    @property
+    def position(self) -> float | Floats:
+        """Position as of the last reply, in its unit.
+
+        Of a ball joint the quaternion (w, x, y, z), shape (4,); of a free joint (x, y, z) in metres before it, shape
+        (7,). Arrays are fresh copies.
+        """
+        return _value(self._record.qpos, self.qpos_local_offset, int(QPOS_WIDTH[self.jnt_type]))
+
+    @property
+    def velocity(self) -> float | Floats:
+        """Velocity as of the last reply, in its unit per second.
+
+        Of a ball joint angular, body frame, shape (3,); of a free joint linear in the world frame and angular in the
+        body frame, shape (6,). Arrays are fresh copies.
+        """
+        return _value(self._record.qvel, self.qvel_local_offset, int(QVEL_WIDTH[self.jnt_type]))
+
+    def describe(self) -> JointDescription:
+        """Return what it is and where it is."""
+        return JointDescription(
+            name=self.name,
+            kind=self.kind,
+            unit=self.unit,
+            limits=self.limits,
+            position=np.asarray(self.position).tolist(),
+            velocity=np.asarray(self.velocity).tolist(),
+        )
 
     def __repr__(self) -> str:
         return f"<Joint {self.name!r} id={self.id}>"
@@ -202,6 +308,29 @@ class Sensor:
         """Reading of the last reply, shape (dim,), in the sensor's own units and frame; a fresh array; or None."""
         reading = self._record.sensors.get(self.name)
         return None if reading is None else np.asarray(reading, dtype=np.float64)
+
+    @property
+    def kind(self) -> str:
+        """MJCF element: `accelerometer`, `framepos`, …; empty without a local model."""
+        model = self._record.mirror.model
+        return "" if model is None else sensor_kind(model, self.id)
+
+    @property
+    def unit(self) -> str:
+        """Unit of its reading; empty for directions, quaternions and sensors of unknown meaning."""
+        model = self._record.mirror.model
+        return "" if model is None else sensor_unit(model, self.id)
+
+    def describe(self) -> SensorDescription:
+        """Return what it is and what it reads."""
+        reading = self._record.sensors.get(self.name)
+        return SensorDescription(
+            name=self.name,
+            kind=self.kind,
+            unit=self.unit,
+            dim=self.dim,
+            reading=None if reading is None else [*map(float, reading)],
+        )
 
     def __repr__(self) -> str:
         return f"<Sensor {self.name!r} id={self.id} dim={self.dim}>"
@@ -251,27 +380,25 @@ class ArticulationElements:
 def make_elements(record: MirroredArticulation) -> ArticulationElements:
     """Make the handles of an articulation; without a local model only its actuators are known, by name and type."""
     model, layout, original = record.mirror.model, record.layout, record.info.original_names
-    prefix = record.info.compiled_prefix
+    bodies = [Body(record, name=name, id=i) for name, i in layout.bodies.items()]
     return ArticulationElements(
-        joints=_named(prefix, "joint", _joints(record, model), original.joints),
-        actuators=_named(prefix, "actuator", _actuators(record, model), original.actuators),
-        sensors=_named(prefix, "sensor", _sensors(record, model), original.sensors),
-        bodies=_named(
-            prefix, "body", [Body(record, name=name, id=i) for name, i in layout.bodies.items()], original.bodies
-        ),
+        joints=_named(record.info, "joint", _joints(record, model), original.joints),
+        actuators=_named(record.info, "actuator", _actuators(record, model), original.actuators),
+        sensors=_named(record.info, "sensor", _sensors(record, model), original.sensors),
+        bodies=_named(record.info, "body", bodies, original.bodies),
     )
 
 
 H = TypeVar("H", Actuator, Joint, Sensor, Body)
 
 
-def _named(prefix: str, kind: str, items: Sequence[H], original: Mapping[str, str]) -> NameMap[H]:
+def _named(info: ArticulationInfo, kind: str, items: Sequence[H], original: Mapping[str, str]) -> NameMap[H]:
     by_name = {item.name: item for item in items}
-    aliases = {f"{prefix}_{name}": [name] for name in by_name}
+    aliases = {f"{prefix}_{name}": [name] for name in by_name for prefix in {info.compiled_prefix, info.prefix}}
     for live, authored in original.items():
         if live in by_name:
             aliases.setdefault(authored, []).append(live)
-    return NameMap(by_name, aliases, kind=f"{kind} of {prefix}")
+    return NameMap(by_name, aliases, kind=f"{kind} of {info.prefix}")
 
 
 def _joints(record: MirroredArticulation, model: mujoco.MjModel | None) -> list[Joint]:
@@ -283,6 +410,7 @@ def _joints(record: MirroredArticulation, model: mujoco.MjModel | None) -> list[
         kind = int(model.jnt_type[i])
         joints.append(
             Joint(
+                record,
                 name=name,
                 id=i,
                 jnt_type=kind,
@@ -339,6 +467,14 @@ def _sensors(record: MirroredArticulation, model: mujoco.MjModel | None) -> list
     if model is None:
         return []
     return [Sensor(record, name=name, id=i, dim=int(model.sensor_dim[i])) for name, i in record.layout.sensors.items()]
+
+
+def _unit_of(record: MirroredArticulation, model: mujoco.MjModel, joint: str) -> str:
+    return joint_unit(JOINT_KINDS[int(model.jnt_type[record.layout.joints[joint]])])
+
+
+def _value(values: Floats, start: int, width: int) -> float | Floats:
+    return float(values[start]) if width == 1 else values[start : start + width].copy()
 
 
 def _interval(bounds: Floats) -> tuple[float, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -65,13 +66,22 @@ class ArticulationLayout:
     free_joint: int = -1
 
 
-def articulation_layouts(model: mujoco.MjModel, keys: list[str]) -> dict[str, ArticulationLayout]:
-    """Return the layout of each articulation; an element belongs to the longest key that prefixes its name."""
+def articulation_layouts(model: mujoco.MjModel, prefixes: Mapping[str, str]) -> dict[str, ArticulationLayout]:
+    """Return the layout of each articulation; an element belongs to the longest prefix of its name.
+
+    Args:
+        model: The compiled model.
+        prefixes: By key of the articulation, what the names of its elements begin with, without the underscore.
+    """
+    keys = list(prefixes.values())
     bodies = _by_owner(model, "body", keys)
     joints = _by_owner(model, "joint", keys)
     actuators = _by_owner(model, "actuator", keys)
     sensors = _by_owner(model, "sensor", keys)
-    return {key: _layout(model, bodies[key], joints[key], actuators[key], sensors[key]) for key in keys}
+    return {
+        key: _layout(model, bodies[prefix], joints[prefix], actuators[prefix], sensors[prefix])
+        for key, prefix in prefixes.items()
+    }
 
 
 def _by_owner(model: mujoco.MjModel, kind: str, keys: list[str]) -> dict[str, dict[str, int]]:

@@ -40,12 +40,13 @@ _NAME_ADDRESSES = {
     "actuator": "name_actuatoradr",
     "sensor": "name_sensoradr",
     "geom": "name_geomadr",
+    "site": "name_siteadr",
     "key": "name_keyadr",
 }
 
 
 def model_names(model: mujoco.MjModel, kind: str) -> list[str]:
-    """Return the compiled names of all bodies, joints, actuators, sensors, geoms or keys, in id order."""
+    """Return the compiled names of all bodies, joints, actuators, sensors, geoms, sites or keys, in id order."""
     pool = model.names
     addresses: list[int] = getattr(model, _NAME_ADDRESSES[kind]).tolist()
     return [pool[start : pool.index(b"\0", start)].decode() for start in addresses]

@@ -62,9 +62,8 @@ def examine(hello: HelloOk, model: mujoco.MjModel | None) -> Examined:
         return Examined({key: ArticulationLayout() for key in keys}, entities)
     prefixes = {info.prefix: info.compiled_prefix for info in hello.articulations}
     try:
-        layouts = articulation_layouts(model, list(prefixes.values()))
-        mine = {key: layouts[prefix] for key, prefix in prefixes.items()}
-        return Examined(mine, entities or _entities_of(model, frozenset(prefixes.values())))
+        layouts = articulation_layouts(model, prefixes)
+        return Examined(layouts, entities or _entities_of(model, frozenset(prefixes.values())))
     except UnicodeDecodeError as error:
         raise _refused(f"a name in its model is not text: {error}") from error
 

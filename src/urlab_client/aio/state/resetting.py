@@ -11,6 +11,7 @@ from urlab_client.aio.state.pending_outcomes import leaves_open
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.protocol.errors import UnknownKeyframe
 from urlab_client.protocol.messages.session import Reset, ResetOk
+from urlab_client.protocol.names import compiled_names
 
 __all__ = ["take_reset"]
 
@@ -60,7 +61,8 @@ def _compiled_keyframe(state: SimState, name: str) -> str:
     compiled = [key for key in model_names(model, "key") if key]
     if name in compiled:
         return name
-    wanted = {f"{art.compiled_prefix}_{name}" for art in state.objects.articulations.values()}
+    prefixes = {key: art.compiled_prefix for key, art in state.objects.articulations.items()}
+    wanted = compiled_names(name, prefixes)
     matches = [key for key in compiled if key in wanted]
     if len(matches) == 1:
         return matches[0]

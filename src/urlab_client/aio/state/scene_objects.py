@@ -12,6 +12,7 @@ from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.live.publishers import Publishers
 from urlab_client.aio.model.articulation_state import MirroredArticulation, MirroredEntity
 from urlab_client.aio.model.mirror import Mirror
+from urlab_client.aio.motion import Motion
 from urlab_client.aio.session import Session
 from urlab_client.aio.state.handshake import Examined
 from urlab_client.protocol.enums import CameraMode
@@ -38,7 +39,7 @@ class SceneObjects:
         entity_records: What is mirrored of the plain entities, by name.
     """
 
-    def __init__(self, session: Session, publishers: Publishers, mirror: Mirror) -> None:
+    def __init__(self, session: Session, publishers: Publishers, mirror: Mirror, motion: Motion) -> None:
         self.articulations: NameMap[URLabArticulation] = NameMap(kind="articulation")
         self.articulations_by_id: dict[str, URLabArticulation] = {}
         self.entities: NameMap[URLabEntity] = NameMap(kind="entity")
@@ -48,6 +49,7 @@ class SceneObjects:
         self._session = session
         self._publishers = publishers
         self._mirror = mirror
+        self._motion = motion
 
     def bind(self, hello: HelloOk, examined: Examined) -> None:
         """Take over what a handshake lists."""
@@ -155,7 +157,9 @@ class SceneObjects:
                 record = self.records[key] = MirroredArticulation(self._mirror, info, layout)
             else:
                 record.bind(info, layout)
-            wrappers[key] = self.articulations.get(key) or URLabArticulation(record, self._session, self._publishers)
+            wrappers[key] = self.articulations.get(key) or URLabArticulation(
+                record, self._session, self._publishers, self._motion
+            )
             found = _ENGINE_NAME.fullmatch(info.compiled_prefix)
             for alias in {info.actor_id, info.compiled_prefix, found["stem"] if found else ""} - {"", key}:
                 aliases.setdefault(alias, []).append(key)

@@ -18,6 +18,7 @@ from urlab_client.aio.live.live_state import LatestPicture, LiveState
 from urlab_client.aio.live.publishers import Publishers
 from urlab_client.aio.model.articulation_state import MirroredArticulation, MirroredEntity
 from urlab_client.aio.model.mirror import Mirror, write_options
+from urlab_client.aio.motion import Motion
 from urlab_client.aio.session import Session
 from urlab_client.aio.state.pending_outcomes import PendingOutcomes
 from urlab_client.aio.state.scene_objects import SceneObjects
@@ -88,6 +89,7 @@ class SimState:
         self,
         session: Session,
         publishers: Publishers,
+        motion: Motion,
         *,
         wanted_mode: StepMode,
         live_pictures: bool,
@@ -95,7 +97,7 @@ class SimState:
         self.session = session
         self.publishers = publishers
         self.mirror = Mirror()
-        self.objects = SceneObjects(session, publishers, self.mirror)
+        self.objects = SceneObjects(session, publishers, self.mirror, motion)
         self.wanted_mode = wanted_mode
         self._mode = StepMode.LIVE
         self.mode_assumed = False

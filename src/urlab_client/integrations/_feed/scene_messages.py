@@ -26,6 +26,7 @@ from urlab_client.integrations._feed.messages import (
     Vector3,
 )
 from urlab_client.protocol.base import Floats
+from urlab_client.protocol.dialects import cleaned_name
 from urlab_client.protocol.messages.session import ArticulationState, EntityState
 
 if TYPE_CHECKING:
@@ -104,11 +105,10 @@ class SceneMessages:
     def of(cls, client: URLabClient, cameras: list[tuple[str, URLabCameraView]]) -> SceneMessages:
         """Describe what the client knows."""
         model, arts = client.model, client.articulations
+        prefixes = {key: art.compiled_prefix for key, art in arts.items()}
         layouts = {key: ArticulationLayout() for key in arts}
         if model is not None:
-            found = articulation_layouts(model, [art.compiled_prefix for art in arts.values()])
-            layouts = {key: found[art.compiled_prefix] for key, art in arts.items()}
-        ids = _camera_ids(model)
+            layouts = articulation_layouts(model, prefixes)
         entities: dict[str, tuple[int, int] | None] = {}
         mocap: dict[str, int] = {}
         for name, entity in client.entities.items():
@@ -124,7 +124,7 @@ class SceneMessages:
             names={key: _layout(model, layout) for key, layout in layouts.items()},
             entities=entities,
             mocap=mocap,
-            cameras={id(view): CameraLayout(name, view, ids.get(name.replace("/", "_"), -1)) for name, view in cameras},
+            cameras={id(view): CameraLayout(name, view, _camera_id(model, prefixes, name)) for name, view in cameras},
         )
 
 
@@ -283,8 +283,13 @@ def _transform(time: Time, child: str, position: list[float], rotation: list[flo
     return FrameTransform(time, "world", child, Vector3(*position), Quaternion(x, y, z, w))
 
 
-def _camera_ids(model: mujoco.MjModel | None) -> dict[str, int]:
-    return {} if model is None else {model.cam(i).name: i for i in range(model.ncam)}
+def _camera_id(model: mujoco.MjModel | None, prefixes: Mapping[str, str], name: str) -> int:
+    """Return the id of `ARTICULATION/CAMERA`, or of a camera of the scene; -1 if the model has none of that name."""
+    if model is None:
+        return -1
+    owner, slash, short = name.rpartition("/")
+    wanted = cleaned_name(f"{prefixes.get(owner, owner)}_{short}" if slash else name)  # as the beta cleans its part
+    return next((i for i in range(model.ncam) if cleaned_name(model.cam(i).name) == wanted), -1)
 
 
 def _layout(model: mujoco.MjModel | None, layout: ArticulationLayout) -> SceneLayout:

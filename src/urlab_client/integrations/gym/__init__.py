@@ -5,21 +5,29 @@ Needs the extra `gym`. Importing this package registers the environments of `tas
 
 from urlab_client.integrations.gym.batch import URLabBatchEnv
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn, URLabEnv
+from urlab_client.integrations.gym.shipped_tasks import Reach, Walk
 from urlab_client.integrations.gym.spaces import SpaceMapping, SpaceMode
 from urlab_client.integrations.gym.starts import ResetNoise
+from urlab_client.integrations.gym.task import Start, States, Task, TaskScene
 from urlab_client.integrations.gym.tasks import TASKS, register
 from urlab_client.integrations.gym.vector import URLabVectorEnv
 
 __all__ = [
     "TASKS",
+    "Reach",
     "ResetNoise",
     "RewardFn",
     "SpaceMapping",
     "SpaceMode",
+    "Start",
+    "States",
+    "Task",
+    "TaskScene",
     "TerminationFn",
     "URLabBatchEnv",
     "URLabEnv",
     "URLabVectorEnv",
+    "Walk",
 ]
 
 register()

@@ -21,10 +21,20 @@ from urlab_client.integrations.gym.episode import client_defaults, compiled_pref
 from urlab_client.integrations.gym.pictures import BatchPictures
 from urlab_client.integrations.gym.spaces import Field, Observation, SpaceMapping, SpaceMode
 from urlab_client.integrations.gym.starts import ResetNoise, noise_of
+from urlab_client.integrations.gym.task import (
+    Start,
+    States,
+    Task,
+    TaskScene,
+    add_observed,
+    check_alone,
+    with_task,
+)
 from urlab_client.integrations.gym.threaded_batch import ThreadedBatch
 from urlab_client.integrations.gym.vectorized import Floats, Found, Indices, Vectorized, check_render_mode
 from urlab_client.protocol.enums import ControllerKind
 from urlab_client.protocol.errors import UnknownKeyframe, URLabError
+from urlab_client.protocol.names import compiled_names
 from urlab_client.server.physics.controllers import Controller, ControllerConfig, PassthroughController, PDController
 from urlab_client.sync.client import URLabClient
 
@@ -57,6 +67,7 @@ class URLabBatchEnv(Vectorized):
         keyframe: str | None = None,
         render_mode: Literal["rgb_array"] | None = None,
         render_camera: str | None = None,
+        task: Task | None = None,
         autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
         n_threads: int = 0,
         client_options: Mapping[str, Any] = MappingProxyType({}),
@@ -76,6 +87,7 @@ class URLabBatchEnv(Vectorized):
             keyframe: See `URLabEnv`.
             render_mode: None or `rgb_array`, with which `render` draws; steps cost the same.
             render_camera: Camera that `render` shows, `ARTICULATION/CAMERA`; the first one of the scene by default.
+            task: See `URLabEnv`. One object serves all environments.
             autoreset_mode: `NEXT_STEP`, `SAME_STEP` or `DISABLED`.
             n_threads: Threads that step, the caller's included; 0 for one per processor.
             client_options: Further options of the client that fetches the scene.
@@ -88,19 +100,27 @@ class URLabBatchEnv(Vectorized):
             raise ValueError("num_envs and n_substeps are at least 1")
         noise = noise_of(reset_noise)
         check_render_mode(render_mode)
-        model, prefixes, controllers = _fetch(with_model_options(address), client_defaults(client_options))
+        check_alone(task, reward_fn=reward_fn, termination_fn=termination_fn, reset_noise=noise)
+        if task is not None:
+            observations, n_substeps, keyframe = task.observations, task.n_substeps, keyframe or task.keyframe
+            max_episode_steps = task.max_episode_steps if max_episode_steps is None else max_episode_steps
+        scene = _fetch(with_model_options(address), client_defaults(client_options))
+        model, prefixes, controllers, exact = scene
         mapping = SpaceMapping(model, prefixes, fields_of(observations), space_mode)
         super().__init__(
             num_envs=num_envs,
             mapping=mapping,
-            observation_space=mapping.observation_space,
+            observation_space=with_task(mapping.observation_space, task),
             reward_fn=reward_fn,
             termination_fn=termination_fn,
             max_episode_steps=max_episode_steps,
             autoreset_mode=autoreset_mode,
+            task=task,
         )
         self.model = model
-        self._prefixes = tuple(prefixes.values())
+        self._goals: list[dict[str, Floats]] = [{} for _ in range(num_envs)]
+        if task is not None:
+            task.setup(TaskScene(model, mapping))
         self._n_substeps = n_substeps
         self._noise = noise
         self._start_keyframe = keyframe
@@ -110,6 +130,8 @@ class URLabBatchEnv(Vectorized):
         self._batch = (batch_class() or ThreadedBatch)(model, num_envs, n_threads)
         # Bound before the first call: a derived field is computed only where somebody looks at it.
         self._arrays = {name: self._batch.bind(name) for name in ("qpos", "qvel", "ctrl", "act", "sensordata", "time")}
+        self._prefixes = prefixes
+        self._target_type = np.float64 if exact else np.float32
         self._keyframes = {name: i for i, name in enumerate(model_names(model, "key"))}
         self._noisy = {
             key: np.array([mapping.layout(key).joints[name] for name in mapping.joint_names(key, model)], dtype=np.intp)
@@ -160,18 +182,25 @@ class URLabBatchEnv(Vectorized):
                     address = self.model.jnt_qposadr[joints]
                     qpos[i, address] = self._noise.drawn(self._rngs[i], self.model, joints, qpos[i, address])
             self._batch.forward(indices)
+        if self.task is not None:
+            qpos = self._arrays["qpos"]
+            for i in map(int, indices):
+                start = Start(self.task.scene, qpos[i].copy())
+                self.task.reset(self._rngs[i], start)
+                qpos[i], self._goals[i] = start.qpos, start.goal
+            self._batch.forward(indices)
         self._step_count[indices] = 0
         return self._observe(indices), {}
 
     def _step_some(self, indices: Indices, actions: Any) -> Found:
         ctrl = self._arrays["ctrl"]
-        targets: dict[str, NDArray[np.float32]] = {}
+        targets: dict[str, NDArray[Any]] = {}
         for key, values in self.mapping.set_points(actions).items():
             controller = self._controllers.get(key)
             if controller is None or not controller.active:
                 ctrl[np.ix_(indices, self.mapping.layout(key).ctrl_adr)] = values[indices]
             else:
-                targets[key] = values[indices].astype(np.float32)
+                targets[key] = values[indices].astype(self._target_type)
         if targets:
             for _ in range(self._n_substeps):
                 self._control(indices, targets)
@@ -181,7 +210,7 @@ class URLabBatchEnv(Vectorized):
         self._step_count[indices] += self._n_substeps
         return self._observe(indices), {}
 
-    def _control(self, indices: Indices, targets: Mapping[str, NDArray[np.float32]]) -> None:
+    def _control(self, indices: Indices, targets: Mapping[str, NDArray[Any]]) -> None:
         """Let the controllers turn their targets into controls, for the state as it is."""
         ctrl, qpos, qvel = (self._arrays[name][indices] for name in ("ctrl", "qpos", "qvel"))
         for key, values in targets.items():
@@ -195,7 +224,20 @@ class URLabBatchEnv(Vectorized):
         def read(key: str, field: Field) -> Floats:
             return self._read(self.mapping.layout(key), self._sensors[key], field)[indices]
 
-        return self.mapping.observe(read)
+        observation = self.mapping.observe(read)
+        if self.task is None:
+            return observation
+        return add_observed(observation, self.task, self.task.observe(self._states_of(indices)))
+
+    def _states(self) -> States:
+        return self._states_of(np.arange(self.num_envs))
+
+    def _states_of(self, indices: Indices) -> States:
+        if self.task is None:
+            raise URLabError("This environment has no task.")
+        arrays = self._arrays
+        qpos, qvel, time = (arrays[name][indices] for name in ("qpos", "qvel", "time"))
+        return States(self.task.scene, qpos, qvel, time, [self._goals[i] for i in map(int, indices)])
 
     def _read(self, layout: ArticulationLayout, sensors: Indices, field: Field) -> Floats:
         match field:
@@ -213,7 +255,8 @@ class URLabBatchEnv(Vectorized):
                 return self._arrays["sensordata"][:, sensors]
 
     def _keyframe_id(self, name: str) -> int:
-        found = [full for full in self._keyframes if full in {name, *(f"{prefix}_{name}" for prefix in self._prefixes)}]
+        wanted = {name, *compiled_names(name, self._prefixes)}
+        found = [full for full in self._keyframes if full in wanted]
         if len(found) != 1:
             raise UnknownKeyframe(
                 "unknown_keyframe", f"{name!r} does not name exactly one of {', '.join(self._keyframes) or 'none'}"
@@ -223,8 +266,10 @@ class URLabBatchEnv(Vectorized):
 
 def _fetch(
     address: str, client_options: Mapping[str, Any]
-) -> tuple[mujoco.MjModel, dict[str, str], dict[str, tuple[str, dict[str, Any]]]]:
-    """Return a scene's model, its articulations' compiled prefixes, and kind and parameters of the controllers."""
+) -> tuple[mujoco.MjModel, dict[str, str], dict[str, tuple[str, dict[str, Any]]], bool]:
+    """Return a scene's model, its articulations with the prefixes of their names in it, the kind and parameters of
+    those controllers that there are, and whether those take set-points as they are.
+    """
     with URLabClient(address, **client_options) as client:
         client.discover()
         model = client.model
@@ -232,7 +277,7 @@ def _fetch(
             raise URLabError(f"There is no articulation at {address}.", hint="Start play first.")
         attached = {key: articulation.controller for key, articulation in client.articulations.items()}
         controllers = {key: (str(found.kind), dict(found.params)) for key, found in attached.items() if found}
-        return model, compiled_prefixes(client), controllers
+        return model, compiled_prefixes(client), controllers, client.server.features.exact_controls
 
 
 @dataclass(frozen=True)

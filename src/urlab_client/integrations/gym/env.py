@@ -14,6 +14,7 @@ from urlab_client.aio.launch import with_model_options
 from urlab_client.integrations.gym.episode import EnvEpisode, client_defaults, first_camera
 from urlab_client.integrations.gym.spaces import Observation, SpaceMapping, SpaceMode
 from urlab_client.integrations.gym.starts import ResetNoise
+from urlab_client.integrations.gym.task import Task, check_alone
 from urlab_client.protocol.names import NameMap
 from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.articulation import URLabArticulation, URLabEntity
@@ -48,6 +49,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
 
     Attributes:
         client: The client.
+        task: The task, or None.
         reward_fn: The reward function, or None for rewards of 0.
         termination_fn: The termination function, or None for episodes that never end by themselves.
     """
@@ -69,6 +71,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         render_camera: str | None = None,
         reset_noise: float | ResetNoise = 0.0,
         keyframe: str | None = None,
+        task: Task | None = None,
         owns_client: bool = False,
     ) -> None:
         """Make an environment.
@@ -89,6 +92,8 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
             reset_noise: Largest deviation of joints at a reset: a `ResetNoise`, or radians for hinge joints alone. A
                 joint stays within its range.
             keyframe: Where episodes start, unless `reset` names another one; the initial state by default.
+            task: What the robot is to do. It settles observations, `n_substeps`, `max_episode_steps`, where episodes
+                start, rewards and ends; what it takes the place of is refused or not used.
             owns_client: Close the client with the environment.
 
         Raises:
@@ -98,6 +103,10 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         """
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or 'rgb_array', not {render_mode!r}")
+        check_alone(task, reward_fn=reward_fn, termination_fn=termination_fn, reset_noise=reset_noise)
+        if task is not None:
+            observations, n_substeps, keyframe = task.observations, task.n_substeps, keyframe or task.keyframe
+            max_episode_steps = task.max_episode_steps if max_episode_steps is None else max_episode_steps
         if max_episode_steps is not None and max_episode_steps < 1:
             raise ValueError(f"max_episode_steps must be at least 1 or None, not {max_episode_steps}")
         self.client = client
@@ -112,6 +121,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
             n_substeps=n_substeps,
             reset_noise=reset_noise,
             keyframe=keyframe,
+            task=task,
         )
         self.action_space = self.mapping.action_space
         self.observation_space = self._episode.observation_space
@@ -120,6 +130,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
             **self.metadata,
             "render_fps": 1.0 / (model.opt.timestep * n_substeps) if model else _FALLBACK_FPS,
         }
+        self.task = task
         self.reward_fn = reward_fn
         self.termination_fn = termination_fn
         self._max_episode_steps = max_episode_steps
@@ -195,6 +206,8 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         after = self._observation = portal_of(self.client).call(self._episode.step, action)
         self._elapsed += 1
         info = self._info()
+        if self.task is not None:
+            return self._judged(self.task, action, info)
         reward = 0.0 if self.reward_fn is None else float(self.reward_fn(before, action, after, info))
         terminated = self.termination_fn is not None and bool(self.termination_fn(after, info))
         truncated = self._max_episode_steps is not None and self._elapsed >= self._max_episode_steps
@@ -219,6 +232,22 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         if self._owns_client:
             self.client.close()
         super().close()
+
+    def _judged(
+        self, task: Task, action: Any, info: dict[str, Any]
+    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        states = self._episode.states()
+        actions: Any = np.asarray(action)[None]
+        if self.mapping.mode == "dict":
+            actions = {key: np.asarray(action[key])[None] for key in self.mapping.keys}
+        reward, terminated = float(task.reward(states, actions)[0]), bool(task.terminated(states)[0])
+        truncated = self._max_episode_steps is not None and self._elapsed >= self._max_episode_steps
+        success = task.success(states)
+        if success is not None:
+            info["success"] = bool(success[0])
+        if terminated or truncated:
+            task.ended(info.get("success", False), self._elapsed)
+        return self._observation, reward, terminated, truncated, info
 
     def _info(self) -> dict[str, Any]:
         client = self.client

@@ -12,6 +12,7 @@ from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
 from urlab_client.integrations.gym.spaces import LEVELS, Field, Observation, Space, SpaceMapping, SpaceMode, dict_space
 from urlab_client.integrations.gym.starts import ResetNoise, noise_of
+from urlab_client.integrations.gym.task import Start, States, Task, TaskScene, add_observed, with_task
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.enums import CameraMode, ObservationLevel, StepMode
 from urlab_client.protocol.errors import URLabError
@@ -66,6 +67,7 @@ class EnvEpisode:
         n_substeps: int,
         reset_noise: float | ResetNoise,
         keyframe: str | None,
+        task: Task | None = None,
     ) -> None:
         """Describe the episodes of a client.
 
@@ -78,6 +80,7 @@ class EnvEpisode:
             n_substeps: Physics steps per action.
             reset_noise: Largest deviation of joints at a reset; a number is for hinge joints, radians.
             keyframe: Where episodes start, unless a reset names another one.
+            task: What chooses the start, and adds to observations; set up here if it is not yet.
 
         Raises:
             URLabError: The client has no model, no articulation, or is in live mode.
@@ -112,6 +115,24 @@ class EnvEpisode:
         self._n_substeps = n_substeps
         self._noise = noise
         self._keyframe = keyframe
+        self._task = task
+        self._goal: dict[str, Floats] = {}
+        if task is not None:
+            if not hasattr(task, "scene"):
+                task.setup(TaskScene(model, self.mapping))
+            self.observation_space = with_task(self.observation_space, task)
+
+    def states(self) -> States:
+        """Return the present state as a task sees it, with n = 1.
+
+        Raises:
+            URLabError: There is no task, or no local data.
+        """
+        data = self.client.data
+        if self._task is None or data is None:
+            raise URLabError("This environment has no task.")
+        qpos, qvel = np.array(data.qpos)[None], np.array(data.qvel)[None]
+        return States(self._task.scene, qpos, qvel, np.array([data.time]), [self._goal])
 
     async def reset(self, rng: np.random.Generator, keyframe: str | None = None) -> Observation:
         """Reset the simulation and return the first observation; set-points become zero."""
@@ -123,8 +144,9 @@ class EnvEpisode:
         overrides = self._noisy_positions(rng) if self._noise else None
         if overrides:
             await client.reset(keyframe, per_articulation_qpos=overrides)
+        placed = await self._start_task(rng)
         if self._cameras:
-            await self._look(keyframe, overrides)
+            await self._look(keyframe, overrides, placed)
         return self._observe()
 
     async def step(self, action: Any) -> Observation:
@@ -154,7 +176,35 @@ class EnvEpisode:
             positions[key] = dict(zip(names, drawn.tolist(), strict=True))
         return positions
 
-    async def _look(self, keyframe: str | None, overrides: Mapping[str, Mapping[str, float]] | None) -> None:
+    async def _start_task(self, rng: np.random.Generator) -> dict[str, Floats]:
+        """Let the task choose the start; return the positions of each articulation that it moved."""
+        task, data = self._task, self.client.data
+        if task is None or data is None:
+            return {}
+        start = Start(task.scene, np.array(data.qpos))
+        task.reset(rng, start)
+        self._goal = start.goal
+        placed: dict[str, Floats] = {}
+        for key in self.mapping.keys:
+            address = self.mapping.layout(key).qpos_adr
+            if not np.array_equal(start.qpos[address], data.qpos[address]):
+                placed[key] = start.qpos[address]
+        await self._place(placed)
+        return placed
+
+    async def _place(self, placed: Mapping[str, Floats]) -> None:
+        runtime = self.client.runtime
+        for key, positions in placed.items():
+            await runtime.set_qpos(key, positions, by_name=True)
+        if placed:
+            await runtime.forward()
+
+    async def _look(
+        self,
+        keyframe: str | None,
+        overrides: Mapping[str, Mapping[str, float]] | None,
+        placed: Mapping[str, Floats],
+    ) -> None:
         """Take the frames of the state as it is. Only a puppet step draws without integrating.
 
         It leaves traces in the solver's warm start, so the reset is done once more: rollouts are the same with and
@@ -168,6 +218,7 @@ class EnvEpisode:
         if mode is not StepMode.PUPPET:
             await client.runtime.set_mode(mode)
             await client.reset(keyframe, per_articulation_qpos=overrides)
+            await self._place(placed)
 
     def _take_frames(self) -> None:
         for name, view in self._cameras.items():
@@ -191,6 +242,8 @@ class EnvEpisode:
             return np.array([n for name in self._sensors[key] for n in value[name]]) if field == "sensors" else value
 
         observation = self.mapping.observe(read)
+        if self._task is not None:
+            observation = add_observed(observation, self._task, self._task.observe(self.states())[0])
         if self._observed_cameras:
             observation["cameras"] = {name: self._shown(name) for name in self._observed_cameras}
         return observation

@@ -58,7 +58,13 @@ class SpaceMapping:
     def __init__(
         self, model: mujoco.MjModel, prefixes: Mapping[str, str], fields: Sequence[Field], mode: SpaceMode = "flat"
     ) -> None:
-        """Map articulations of a compiled scene, by key to what their compiled names begin with.
+        """Map articulations of a compiled scene.
+
+        Args:
+            model: The scene.
+            prefixes: Keys of the articulations, and what the names of their elements in the model begin with.
+            fields: What to observe.
+            mode: `flat` or `dict`.
 
         Raises:
             ValueError: An unknown field or mode, or nothing to observe.
@@ -71,8 +77,8 @@ class SpaceMapping:
         self.keys = tuple(prefixes)
         self.fields = tuple(fields)
         self.mode: SpaceMode = mode
-        layouts = articulation_layouts(model, list(prefixes.values()))
-        self._parts = {key: _part(model, layouts[prefix]) for key, prefix in prefixes.items()}
+        layouts = articulation_layouts(model, prefixes)
+        self._parts = {key: _part(model, layout) for key, layout in layouts.items()}
         self._where = self._slices()
         ends = list(itertools.accumulate(len(part.low) for part in self._parts.values()))
         self._n_actions = ends[-1]

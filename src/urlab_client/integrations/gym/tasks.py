@@ -15,11 +15,13 @@ import numpy as np
 
 from urlab_client.integrations.gym.batch import URLabBatchEnv
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn, URLabEnv
+from urlab_client.integrations.gym.shipped_tasks import Reach, Walk
 from urlab_client.integrations.gym.spaces import Observation, SpaceMapping
+from urlab_client.integrations.gym.task import Task
 from urlab_client.integrations.gym.vector import URLabVectorEnv
 from urlab_client.protocol.base import Floats
 
-__all__ = ["TASKS", "Task", "make", "make_vec", "register"]
+__all__ = ["FULL_TASKS", "TASKS", "RewardedRobot", "make", "make_vec", "register"]
 
 FALLEN_M: Final = 0.15
 """Height of the trunk below which the quadruped has fallen, metres."""
@@ -32,7 +34,7 @@ TARGET_M: Final = (0.35, 0.2, 0.4)
 
 
 @dataclass(frozen=True)
-class Task:
+class RewardedRobot:
     """A robot and what it is to do.
 
     Attributes:
@@ -87,7 +89,7 @@ def _reach(mapping: SpaceMapping) -> RewardFn:
 
 
 TASKS: Final = {
-    "urlab/Quadruped-v0": Task(
+    "urlab/Quadruped-v0": RewardedRobot(
         robot="quadruped",
         n_substeps=10,
         max_episode_steps=500,
@@ -95,22 +97,28 @@ TASKS: Final = {
         reward=_walk,
         termination=_fallen,
     ),
-    "urlab/Arm-v0": Task(robot="arm", n_substeps=10, max_episode_steps=200, reset_noise=0.05, reward=_reach),
+    "urlab/Arm-v0": RewardedRobot(robot="arm", n_substeps=10, max_episode_steps=200, reset_noise=0.05, reward=_reach),
 }
-"""Tasks by their Gymnasium id."""
+"""Robots with rewards alone, by their Gymnasium id."""
+
+FULL_TASKS: Final[dict[str, type[Task]]] = {"urlab/Reach-v0": Reach, "urlab/Walk-v0": Walk}
+"""Tasks whose goal varies, by their Gymnasium id."""
 
 
 def make(task_id: str, address: str | None = None, **options: Any) -> URLabEnv:
     """Make the environment of a task over a client of its own, which it closes.
 
     Args:
-        task_id: Key of `TASKS`.
+        task_id: Key of `TASKS` or `FULL_TASKS`.
         address: Where the robot is; a simulated server of its own by default.
         options: Further arguments of `URLabEnv`.
 
     Raises:
         URLabError: The server cannot be reached, or has no articulation.
     """
+    if task_id in FULL_TASKS:
+        goal = FULL_TASKS[task_id]()
+        return URLabEnv.connect(address or goal.scene_address, task=goal, **options)
     task = TASKS[task_id]
     options = {"n_substeps": task.n_substeps, "reset_noise": task.reset_noise, **options}
     env = URLabEnv.connect(address or f"sim://{task.robot}", **options)
@@ -125,7 +133,7 @@ def make_vec(
     """Make the vector environment of a task.
 
     Args:
-        task_id: Key of `TASKS`.
+        task_id: Key of `TASKS` or `FULL_TASKS`.
         num_envs: Number of environments.
         backend: `servers` for a simulated server each, `batch` for physics in this process without a wire.
         options: Further arguments of `URLabVectorEnv` or `URLabBatchEnv`.
@@ -136,6 +144,10 @@ def make_vec(
     """
     if backend not in ("servers", "batch"):
         raise ValueError(f"backend must be 'servers' or 'batch', not {backend!r}")
+    kind = URLabVectorEnv if backend == "servers" else URLabBatchEnv
+    if task_id in FULL_TASKS:
+        goal = FULL_TASKS[task_id]()
+        return kind(goal.scene_address, num_envs, task=goal, **options)
     task = TASKS[task_id]
     options = {
         "n_substeps": task.n_substeps,
@@ -143,7 +155,6 @@ def make_vec(
         "max_episode_steps": task.max_episode_steps,
         **options,
     }
-    kind = URLabVectorEnv if backend == "servers" else URLabBatchEnv
     env = kind(f"sim://{task.robot}", num_envs, **options)
     env.reward_fn = task.reward(env.mapping)
     env.termination_fn = None if task.termination is None else task.termination(env.mapping)
@@ -152,7 +163,7 @@ def make_vec(
 
 def register() -> None:
     """Register the tasks with Gymnasium; again is without effect."""
-    for task_id, task in TASKS.items():
+    for task_id, task in (*TASKS.items(), *FULL_TASKS.items()):
         if task_id not in gymnasium.registry:
             gymnasium.register(  # pyright: ignore[reportUnknownMemberType]  # its kwargs are a bare dict
                 task_id,

@@ -22,6 +22,7 @@ from urlab_client.integrations.gym.env import RewardFn, TerminationFn
 from urlab_client.integrations.gym.episode import EnvEpisode, client_defaults, first_camera
 from urlab_client.integrations.gym.spaces import Observation, SpaceMode
 from urlab_client.integrations.gym.starts import ResetNoise, noise_of
+from urlab_client.integrations.gym.task import States, Task, check_alone, joined
 from urlab_client.integrations.gym.vectorized import Found, Indices, Vectorized, check_render_mode
 from urlab_client.protocol.errors import URLabError
 from urlab_client.sync._portal import Portal
@@ -153,6 +154,7 @@ class URLabVectorEnv(Vectorized):
         keyframe: str | None = None,
         render_mode: Literal["rgb_array"] | None = None,
         render_camera: str | None = None,
+        task: Task | None = None,
         autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
         step_timeout: float = 10.0,
         start_timeout: float = 60.0,
@@ -175,6 +177,7 @@ class URLabVectorEnv(Vectorized):
             keyframe: See `URLabEnv`.
             render_mode: None or `rgb_array`, with which every step draws a picture of each environment.
             render_camera: Camera that `render` shows; the first one of the scene by default.
+            task: See `URLabEnv`. One object serves all environments.
             autoreset_mode: `NEXT_STEP`, `SAME_STEP` or `DISABLED`.
             step_timeout: Seconds an environment may take for a step or reset.
             start_timeout: Seconds a server may take to start, each counted from its own start.
@@ -195,6 +198,11 @@ class URLabVectorEnv(Vectorized):
         for name, seconds in (("step_timeout", step_timeout), ("start_timeout", start_timeout)):
             if seconds <= 0:
                 raise ValueError(f"{name} must be above 0 seconds, not {seconds}")
+        check_render_mode(render_mode)
+        check_alone(task, reward_fn=reward_fn, termination_fn=termination_fn, reset_noise=noise_of(reset_noise))
+        if task is not None:
+            observations, n_substeps, keyframe = task.observations, task.n_substeps, keyframe or task.keyframe
+            max_episode_steps = task.max_episode_steps if max_episode_steps is None else max_episode_steps
         episode_options = {
             "space_mode": space_mode,
             "observations": observations,
@@ -202,11 +210,11 @@ class URLabVectorEnv(Vectorized):
             "n_substeps": n_substeps,
             "reset_noise": noise_of(reset_noise),
             "keyframe": keyframe,
+            "task": task,
         }
         self._step_timeout = step_timeout
         self._addresses = tuple(addresses)
         client_options = client_defaults(client_options)
-        check_render_mode(render_mode)
         rendered = None if render_mode is None else _Rendered(render_camera)
         starts = asyncio.Semaphore(_processors())
         self._sessions = [
@@ -227,8 +235,10 @@ class URLabVectorEnv(Vectorized):
             termination_fn=termination_fn,
             max_episode_steps=max_episode_steps,
             autoreset_mode=autoreset_mode,
+            task=task,
         )
         self.render_mode = render_mode
+        self._seen: dict[int, States] = {}
         self._pictures: dict[int, NDArray[np.uint8]] = {}
         self._sim_time = np.zeros(self.num_envs)
         self._step_count = np.zeros(self.num_envs, dtype=np.int64)
@@ -283,6 +293,12 @@ class URLabVectorEnv(Vectorized):
         steps = {i: partial(sessions[i].step, each[i], timeout) for i in map(int, acting)}
         results = self._portal.call(self._all, {**resets, **steps})
         return self._found({i: results[i] for i in resets}), self._found({i: results[i] for i in steps})
+
+    def _states(self) -> States:
+        for i, session in enumerate(self._sessions):
+            if session.episode is not None:
+                self._seen[i] = session.episode.states()
+        return joined([self._seen.get(i) for i in range(self.num_envs)])
 
     def _clocks(self) -> dict[str, NDArray[Any]]:
         for i, session in enumerate(self._sessions):

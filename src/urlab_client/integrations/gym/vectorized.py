@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn, keyframe_option
 from urlab_client.integrations.gym.spaces import Observation, Space, SpaceMapping
+from urlab_client.integrations.gym.task import States, Task
 
 __all__ = ["Bools", "Floats", "Found", "Indices", "Vectorized", "check_render_mode"]
 
@@ -35,6 +36,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
 
     Attributes:
         mapping: The articulations as spaces.
+        task: The task, or None.
         reward_fn: The reward function, or None for rewards of 0.
         termination_fn: The termination function, or None for episodes that never end by themselves.
         autoreset_mode: What happens to environments whose episode ended.
@@ -57,8 +59,10 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         termination_fn: TerminationFn | None,
         max_episode_steps: int | None,
         autoreset_mode: AutoresetMode,
+        task: Task | None,
     ) -> None:
         self.mapping = mapping
+        self.task = task
         self.num_envs = num_envs
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
@@ -83,6 +87,10 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
     @abstractmethod
     def _reset_and_step(self, fresh: Indices, acting: Indices, actions: Any) -> tuple[Found, Found]:
         """Reset some environments into `_keyframe` and step others, given the actions of all."""
+
+    @abstractmethod
+    def _states(self) -> States:
+        """Return the states of all environments as the task sees them."""
 
     @abstractmethod
     def _clocks(self) -> dict[str, NDArray[Any]]:
@@ -152,6 +160,10 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
             truncated[acting] = self._elapsed[acting] >= self._max_episode_steps
         truncated[list(errors)] = True
         self._ended = terminated | truncated
+        if self.task is not None:
+            successes = infos.get("success", np.zeros(self.num_envs, dtype=bool))
+            for i in np.flatnonzero(self._ended & stepped):
+                self.task.ended(bool(successes[i]), int(self._elapsed[i]))
         if self.autoreset_mode is AutoresetMode.SAME_STEP and self._ended.any():
             infos = self._same_step_reset(infos)
         return self._copied(), rewards, terminated, truncated, infos
@@ -172,6 +184,12 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         rewards = np.zeros(self.num_envs)
         terminated = np.zeros(self.num_envs, dtype=bool)
         after = self._copied()
+        if self.task is not None:
+            states = self._states()
+            rewards[:], terminated[:] = self.task.reward(states, actions), self.task.terminated(states)
+            success = self.task.success(states)
+            if success is not None:
+                infos["success"], infos["_success"] = success & stepped, stepped.copy()
         if self.reward_fn is not None:
             rewards[:] = self.reward_fn(before, actions, after, infos)
         if self.termination_fn is not None:

@@ -126,10 +126,11 @@ class Articulations:
 
     def stage_positional(self, commands: Mapping[str, ArticulationCommand]) -> None:
         """Stage the `ctrl` of a step's commands."""
-        for key, command in commands.items():
-            control = self.find(key)
-            if control is not None and command.ctrl is not None:
-                control.set_points.stage(command.ctrl)
+        with np.errstate(over="ignore"):  # as in `SetPoints.stage`: entered once, it costs the robots nothing
+            for key, command in commands.items():
+                control = self.find(key)
+                if control is not None and command.ctrl is not None:
+                    control.set_points.stage_quietly(command.ctrl)
 
     def stage_named(self, commands: Mapping[str, ArticulationCommand]) -> set[ArticulationControl]:
         """Stage `ctrl_map` and return the articulations whose controller the request bypasses."""

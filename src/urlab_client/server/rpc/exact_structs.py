@@ -13,7 +13,7 @@ from msgspec import NODEFAULT, Struct, inspect
 
 from urlab_client.server.rpc.coercion import INT32_MAX, INT32_MIN
 
-__all__ = ["collision_test_of", "strict_array", "strict_struct", "type_info"]
+__all__ = ["collision_test_of", "longest_string", "strict_array", "strict_struct", "string_measures_of", "type_info"]
 
 
 # Inspecting the types took most of a server's start, and gives the same for every server.
@@ -126,3 +126,70 @@ def _struct_collision_test(tests: list[tuple[str, Callable[[Any], bool]]]) -> Ca
         return False
 
     return collides
+
+
+def longest_string(value: object) -> int:
+    """Return the length of the longest string in a value of a request, whatever it is."""
+    match value:
+        case str():
+            return len(value)
+        case dict():
+            items = cast("dict[object, object]", value)
+            return max((max(longest_string(key), longest_string(item)) for key, item in items.items()), default=0)
+        case list() | tuple():
+            return max(map(longest_string, cast("list[object]", value)), default=0)
+        case Struct():
+            return max((longest_string(getattr(value, name)) for name in value.__struct_fields__), default=0)
+        case _:
+            return 0
+
+
+@cache
+def string_measures_of(kind: type[Struct]) -> tuple[tuple[str, Callable[[Any], int]], ...]:
+    """Return how to find the longest string in each field that can hold one, for values of exactly this type.
+
+    What holds numbers alone, as nearly all of a step of many robots, is not looked at.
+    """
+    fields = msgspec.structs.fields(kind)
+    return tuple((f.name, measure) for f in fields if (measure := _string_measure(type_info(f.type))) is not None)
+
+
+def _string_measure(info: inspect.Type) -> Callable[[Any], int] | None:  # noqa: PLR0911
+    match info:
+        case inspect.Metadata(type=inner):
+            return _string_measure(inner)
+        case inspect.UnionType(types=members):
+            present = [member for member in members if not isinstance(member, inspect.NoneType)]
+            if len(present) == 1:
+                return _optional_measure(_string_measure(present[0]))
+            return longest_string if any(_string_measure(member) is not None for member in present) else None
+        case inspect.DictType(value_type=item):
+            return _dict_measure(_string_measure(item))
+        case inspect.ListType(item_type=item) | inspect.VarTupleType(item_type=item):
+            measure = _string_measure(item)
+            return None if measure is None else lambda values: max(map(measure, values), default=0)
+        case inspect.StructType(cls=cls):
+            return _struct_measure(cls)
+        case inspect.FloatType() | inspect.IntType() | inspect.BoolType() | inspect.NoneType() | inspect.CustomType():
+            return None
+        case _:
+            return longest_string
+
+
+def _optional_measure(measure: Callable[[Any], int] | None) -> Callable[[Any], int] | None:
+    return None if measure is None else lambda value: 0 if value is None else measure(value)
+
+
+def _dict_measure(of_items: Callable[[Any], int] | None) -> Callable[[Any], int]:
+    def measure(value: dict[str, Any]) -> int:
+        of_keys = max(map(len, value), default=0)
+        return of_keys if of_items is None else max(of_keys, max(map(of_items, value.values()), default=0))
+
+    return measure
+
+
+def _struct_measure(kind: type[Struct]) -> Callable[[Any], int]:
+    def measure(value: Struct) -> int:
+        return max((of_field(getattr(value, name)) for name, of_field in string_measures_of(kind)), default=0)
+
+    return measure

@@ -14,7 +14,7 @@ from __future__ import annotations
 import types
 from collections.abc import Callable, Mapping
 from functools import cached_property
-from typing import Any, Final, TypeVar, Union, cast
+from typing import Any, Final, TypeVar, Union
 
 import msgspec
 from msgspec import UNSET, Struct
@@ -27,8 +27,10 @@ from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.coercion import ABSENT, as_text, struct_converter
 from urlab_client.server.rpc.exact_structs import (
     collision_test_of,
+    longest_string,
     strict_array,
     strict_struct,
+    string_measures_of,
 )
 from urlab_client.server.rpc.plain_data import Plain, bad_request, decode_plain, fold_keys
 
@@ -138,16 +140,18 @@ class RequestReader:
         if len(frame) > self._limits.request_bytes or (collides is not None and collides(request)):
             return self._read_loosely(frame)
         op = self._exact[kind]
-        self._check_strings(op, request, frame)
+        self._check_strings(op, request, frame, exact=True)
         return Incoming(op.name, op, request.session_id, request)
 
-    def _check_strings(self, op: Op, request: Request[Any], frame: bytes) -> None:
+    def _check_strings(self, op: Op, request: Request[Any], frame: bytes, *, exact: bool) -> None:
         most = self._limits.string_chars
         if len(frame) <= most:  # which spares nearly every request the search
             return
-        for field in msgspec.structs.fields(request):
-            longest = _longest(getattr(request, field.name))
+        anything = ((name, longest_string) for name in request.__struct_fields__)
+        for name, measure in string_measures_of(type(request)) if exact else anything:
+            longest = measure(getattr(request, name))
             if longest > most:
+                field = next(field for field in msgspec.structs.fields(request) if field.name == name)
                 raise bad_request(
                     f"{op.name}: field '{field.encode_name}' holds a string of {longest} characters, more than the "
                     f"limit string_chars, {most}"
@@ -168,24 +172,8 @@ class RequestReader:
             return Incoming(name, session_id=_session_id(fields))
         missing = tuple(field for field in loose.declared if field.lower() not in fields)
         request = loose.convert(fields)
-        self._check_strings(loose.op, request, frame)
+        self._check_strings(loose.op, request, frame, exact=False)
         return Incoming(name, loose.op, _session_id(fields), request, missing)
-
-
-def _longest(value: object) -> int:
-    """Return the length of the longest string in a value of a request."""
-    match value:
-        case str():
-            return len(value)
-        case dict():
-            items = cast("dict[object, object]", value)
-            return max((max(_longest(key), _longest(item)) for key, item in items.items()), default=0)
-        case list() | tuple():
-            return max(map(_longest, cast("list[object]", value)), default=0)
-        case Struct():
-            return max((_longest(getattr(value, name)) for name in value.__struct_fields__), default=0)
-        case _:
-            return 0
 
 
 def _session_id(fields: Mapping[str, Plain]) -> str:

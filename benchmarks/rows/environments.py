@@ -1,0 +1,104 @@
+"""Gymnasium environments over a simulated server, against Gymnasium's own of the same robot and as many substeps."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from benchmarks.harness import Burst, Pair, Row
+from benchmarks.robots import humanoid
+
+__all__ = ["ROWS"]
+
+_OWN = "Humanoid-v5"
+_SUBSTEPS = 5  # as Gymnasium's takes
+_SERVERS = 4
+_BATCH = 16
+
+
+def _stepping(environment: Any, copies: int = 1) -> Burst:
+    """Return seconds per step of one environment, from the same start each time."""
+    action = 0 * environment.action_space.sample()
+
+    def burst(count: int) -> list[float]:
+        environment.reset(seed=0)
+        started = time.perf_counter()
+        for _ in range(count):
+            environment.step(action)
+        return [(time.perf_counter() - started) / count / copies]
+
+    return burst
+
+
+def _own(copies: int | None = None) -> Any:
+    import gymnasium  # noqa: PLC0415  # an extra
+
+    if copies is None:
+        return gymnasium.make(_OWN, terminate_when_unhealthy=False)
+    return gymnasium.make_vec(_OWN, copies, vectorization_mode="sync", terminate_when_unhealthy=False)
+
+
+@contextlib.contextmanager
+def _against(ours: Callable[[], Any], copies: int, own_copies: int | None) -> Iterator[Pair]:
+    with contextlib.closing(ours()) as environment, contextlib.closing(_own(own_copies)) as own:
+        yield Pair(ours=_stepping(environment, copies), floor=_stepping(own, own_copies or 1))
+
+
+def _single() -> Any:
+    from urlab_client.integrations.gym import URLabEnv  # noqa: PLC0415  # an extra
+
+    return URLabEnv.connect(f"sim://{humanoid()}", n_substeps=_SUBSTEPS)
+
+
+def _vector() -> Any:
+    from urlab_client.integrations.gym import URLabVectorEnv  # noqa: PLC0415  # an extra
+
+    return URLabVectorEnv(f"sim://{humanoid()}", _SERVERS, n_substeps=_SUBSTEPS)
+
+
+def _batch() -> Any:
+    from urlab_client.integrations.gym import URLabBatchEnv  # noqa: PLC0415  # an extra
+
+    return URLabBatchEnv(f"sim://{humanoid()}", _BATCH, n_substeps=_SUBSTEPS)
+
+
+def _rows() -> tuple[Row, ...]:
+    # Gymnasium's environments import what draws them.
+    if importlib.util.find_spec("gymnasium") is None or importlib.util.find_spec("imageio") is None:
+        return ()
+    floor = f"Gymnasium's own {_OWN}"
+    return (
+        Row(
+            name="env",
+            what=f"steps per second of URLabEnv, the humanoid, {_SUBSTEPS} substeps",
+            floor=floor,
+            reach=0.35,
+            kind="rate",
+            prepare=lambda: _against(_single, 1, None),
+            count=100,
+        ),
+        Row(
+            name="env-4-servers",
+            what=f"the same of URLabVectorEnv with {_SERVERS} servers, together",
+            floor=floor,
+            reach=0.9,
+            kind="rate",
+            prepare=lambda: _against(_vector, _SERVERS, None),
+            count=50,
+        ),
+        Row(
+            name="env-batch-16",
+            what=f"the same of URLabBatchEnv with {_BATCH} copies, together",
+            floor=f"{_BATCH} of them in Gymnasium's SyncVectorEnv, together",
+            reach=1.5,
+            kind="rate",
+            prepare=lambda: _against(_batch, _BATCH, _BATCH),
+            count=20,
+        ),
+    )
+
+
+ROWS = _rows()

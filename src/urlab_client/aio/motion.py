@@ -1,0 +1,213 @@
+"""Letting simulation time pass until something is so: `run_for()`, `wait_until()` and `move_to()`.
+
+Works alike in every step mode: in `direct` and `puppet` the client steps, in `live` it watches. Limits are simulation
+time, so that they mean the same on a slow machine; that time itself passes is watched by the clock on the wall.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import AsyncGenerator, Callable, Mapping
+from contextlib import aclosing
+from typing import TYPE_CHECKING, Protocol
+
+from urlab_client.aio.event_loop import running_loop
+from urlab_client.aio.model.elements import Actuator, Joint
+from urlab_client.aio.model.numbers import finite
+from urlab_client.aio.streams import Stream
+from urlab_client.protocol.client_types import Diagnosis, Verdict
+from urlab_client.protocol.enums import OutOfRange, StepMode
+from urlab_client.protocol.errors import NotSettled, URLabTimeoutError
+from urlab_client.protocol.messages.session import StepOk
+from urlab_client.protocol.messages.streams import StateSnapshot
+from urlab_client.protocol.names import NameMap
+
+if TYPE_CHECKING:
+    import mujoco
+
+__all__ = ["Motion"]
+
+_LOOK_S = 0.01  # simulation time between two looks at a predicate
+_SLICE_S = 0.1  # simulation time per request where nobody looks: what a slow scene still does within its deadline
+_AT_REST_S = 0.1  # a joint has settled if it would stay within the tolerance for so long
+
+
+class Simulation(Protocol):
+    """What is needed of a client."""
+
+    @property
+    def step_mode(self) -> StepMode: ...
+    @property
+    def sim_time(self) -> float: ...
+    @property
+    def model(self) -> mujoco.MjModel | None: ...
+    async def step(self, n_steps: int = 1) -> StepOk: ...
+    def state_stream(self) -> Stream[StateSnapshot]: ...
+    async def explain(self) -> Diagnosis: ...
+
+
+class Movable(Protocol):
+    """What is needed of an articulation."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def joints(self) -> NameMap[Joint]: ...
+    @property
+    def actuators(self) -> NameMap[Actuator]: ...
+
+
+class Motion:
+    """Lets the time of a simulation pass.
+
+    Args:
+        simulation: The client.
+        driven: Tells whether the client has set-points of its own, which in live mode must be handed over.
+        patience: Seconds on the wall in which simulation time must move; None waits without limit.
+    """
+
+    def __init__(self, simulation: Simulation, *, driven: Callable[[], bool], patience: float | None) -> None:
+        self._simulation = simulation
+        self._driven = driven
+        self._patience = patience
+
+    async def run_for(self, seconds: float) -> float:
+        """See `URLabClient.run_for`."""
+        seconds = finite("run_for", seconds)
+        if seconds < 0:
+            raise ValueError(f"run_for takes 0 seconds or more, got {seconds:g}.")
+        passed, _ = await self._until(lambda: False, "run_for", seconds, _SLICE_S)
+        return passed
+
+    async def wait_until(self, predicate: Callable[[], object], timeout: float) -> float:
+        """See `URLabClient.wait_until`."""
+
+        def holds() -> bool:
+            answer = predicate()
+            if inspect.isawaitable(answer):
+                if inspect.iscoroutine(answer):
+                    answer.close()  # or Python warns that nobody awaited it
+                raise TypeError("wait_until takes a function that returns at once, not a coroutine function.")
+            return bool(answer)
+
+        limit = _positive("wait_until: timeout", timeout)
+        passed, so = await self._until(holds, "wait_until", limit, _LOOK_S)
+        if not so:
+            raise URLabTimeoutError(
+                f"wait_until: not so within {limit:g} s of simulation time.", hint=await self._findings()
+            )
+        return passed
+
+    async def move_to(
+        self, articulation: Movable, targets: Mapping[str, float], tolerance: float, timeout: float
+    ) -> float:
+        """See `URLabArticulation.move_to`."""
+        tolerance, limit = _positive("move_to: tolerance", tolerance), _positive("move_to: timeout", timeout)
+        aims = [_Aim(articulation, name, target) for name, target in targets.items()]
+        for aim in aims:
+            aim.actuator.set_control(aim.set_point)
+        passed, settled = await self._until(
+            lambda: all(aim.settled(tolerance) for aim in aims), "move_to", limit, _LOOK_S
+        )
+        if not settled:
+            left = {aim.joint.name: aim.left() for aim in aims if not aim.settled(tolerance)}
+            joints = articulation.joints
+            texts = [f"{name!r} is {abs(error):.3g} {joints[name].unit} away" for name, error in left.items()]
+            raise NotSettled(
+                f"move_to: {articulation.name!r} has not settled within {limit:g} s of simulation time: "
+                f"{', '.join(texts)}.",
+                remaining=left,
+                hint=await self._findings(),
+            )
+        return passed
+
+    async def _until(self, done: Callable[[], bool], what: str, limit: float, slice_s: float) -> tuple[float, bool]:
+        """Let time pass until something is so or the limit has come; return how much passed, and whether it is so."""
+        if done():
+            return 0.0, True
+        start = self._simulation.sim_time
+        passed = 0.0
+        async with aclosing(self._passing(what, start + limit, slice_s)) as times:
+            async for now in times:
+                # A reset puts the clock back: what passed since counts, too.
+                start = min(start, now)
+                passed = now - start
+                if done():
+                    return passed, True
+        return passed, False
+
+    async def _passing(self, what: str, end: float, slice_s: float) -> AsyncGenerator[float, None]:
+        simulation = self._simulation
+        if simulation.step_mode is StepMode.LIVE:
+            async with aclosing(self._watched(what)) as times:
+                async for now in times:
+                    yield now
+                    if now >= end:
+                        return
+        model = simulation.model
+        timestep = 0.0 if model is None else float(model.opt.timestep)
+        while (left := end - simulation.sim_time) > timestep / 2:
+            before = simulation.sim_time
+            n = max(1, round(min(left, slice_s) / timestep)) if timestep else 1
+            await simulation.step(n)
+            timestep = timestep or max(0.0, simulation.sim_time - before)
+            yield simulation.sim_time
+
+    async def _watched(self, what: str) -> AsyncGenerator[float, None]:
+        loop = running_loop()
+        if self._driven():
+            await self._simulation.step()
+        newest, since = -1.0, loop.time()
+        async with self._simulation.state_stream() as snapshots:
+            while True:
+                now = (await snapshots.receive(timeout=self._patience)).time
+                if now != newest:
+                    newest, since = now, loop.time()
+                    yield now
+                elif self._patience is not None and loop.time() - since > self._patience:
+                    raise URLabTimeoutError(
+                        f"{what}: simulation time has stood still at {now:.3f} s for {self._patience:g} s.",
+                        hint=await self._findings(),
+                    )
+
+    async def _findings(self) -> str | None:
+        """Return what keeps robots from moving, as far as that can be found out."""
+        found = (await self._simulation.explain()).findings
+        return " ".join(f"{one.subject}: {one.text}" for one in found if one.verdict is Verdict.PROBLEM) or None
+
+
+class _Aim:
+    """One joint on its way."""
+
+    def __init__(self, articulation: Movable, name: str, target: float) -> None:
+        self.joint = articulation.joints[name]
+        what = f"move_to: joint {self.joint.name!r} of {articulation.name!r}"
+        self.target = finite(what, target)
+        if not self.joint.unit:
+            raise ValueError(f"{what} is a {self.joint.kind} joint: its position is not one number. Nothing was set.")
+        low, high = self.joint.limits or (self.target, self.target)
+        if not low <= self.target <= high:
+            raise ValueError(
+                f"{what} takes {low:g} to {high:g} {self.joint.unit}, got {self.target:g}. Nothing was set."
+            )
+        driving = [actuator for actuator in articulation.actuators.values() if actuator.joint == self.joint.name]
+        servos = [actuator for actuator in driving if actuator.describe().takes == "position"]
+        if not servos:
+            takes = [f"{actuator.name!r} takes {actuator.describe().takes or 'something else'}" for actuator in driving]
+            raise ValueError(f"{what} has no position servo: {', '.join(takes) or 'nothing drives it'}.")
+        self.actuator = servos[0]
+        self.set_point = self.actuator.set_point_for(self.target)
+        self.actuator.checked(self.set_point, OutOfRange.ERROR)
+
+    def left(self) -> float:
+        return self.target - float(self.joint.position)
+
+    def settled(self, tolerance: float) -> bool:
+        return abs(self.left()) <= tolerance and abs(float(self.joint.velocity)) * _AT_REST_S <= tolerance
+
+
+def _positive(what: str, value: float) -> float:
+    number = finite(what, value)
+    if number <= 0:
+        raise ValueError(f"{what} takes a number above 0, got {number:g}.")
+    return number

@@ -1,0 +1,112 @@
+"""Tasks on the bundled robots, as `Task` has them: reaching a place, walking as told."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from urlab_client.integrations.gym.starts import ResetNoise
+from urlab_client.integrations.gym.task import Start, States, Task
+from urlab_client.protocol.base import Floats
+
+__all__ = ["Reach", "Walk"]
+
+Bools = NDArray[np.bool_]
+
+
+class Reach(Task):
+    """The arm holds its hand where it is told: somewhere in a box before it, another place in each episode.
+
+    Observed besides the arm's positions and velocities: the target and the hand's distance to it, metres, world frame.
+    The reward is minus the distance, plus 1 within `CLOSE_M`, which is success.
+    """
+
+    LOW_M: Final = np.array([0.25, -0.25, 0.25])
+    HIGH_M: Final = np.array([0.45, 0.25, 0.5])
+    CLOSE_M: Final = 0.03
+
+    scene_address: ClassVar[str] = "sim://arm"
+    n_observed: ClassVar[int] = 6
+    max_episode_steps: ClassVar[int | None] = 100
+
+    def reset(self, rng: np.random.Generator, start: Start) -> None:
+        """See `Task.reset`."""
+        start.noise(rng, "arm", ResetNoise(hinge=0.05, slide=0.005))
+        start.goal["target"] = rng.uniform(self.LOW_M, self.HIGH_M)
+
+    def observe(self, states: States) -> Floats:
+        """See `Task.observe`."""
+        target = states.goal["target"]
+        return np.concatenate([target, target - self._hand(states)], axis=1)
+
+    def reward(self, states: States, actions: Any) -> Floats:
+        """See `Task.reward`."""
+        distance = self._distance(states)
+        return -distance + (distance < self.CLOSE_M)
+
+    def success(self, states: States) -> Bools:
+        """See `Task.success`."""
+        return self._distance(states) < self.CLOSE_M
+
+    def _hand(self, states: States) -> Floats:
+        return states.site_position("arm/grip")
+
+    def _distance(self, states: States) -> Floats:
+        return np.linalg.norm(states.goal["target"] - self._hand(states), axis=1)
+
+
+class Walk(Task):
+    """The quadruped walks with the velocity it is told: ahead, to the left and turning, drawn anew for each episode.
+
+    Its PD controller holds joint targets, which actions are. Observed besides its positions and velocities: the
+    command, m/s and rad/s, base frame. The reward is between 0 and 1.5 and counts how well the command is followed; an
+    episode ends when the robot falls. Success is to follow the command within `CLOSE`.
+    """
+
+    LOW: Final = np.array([-0.2, -0.1, -0.4])
+    HIGH: Final = np.array([0.6, 0.1, 0.4])
+    CLOSE: Final = 0.2
+    FALLEN_M: Final = 0.15
+    UPRIGHT: Final = 0.5
+
+    scene_address: ClassVar[str] = "sim://quadruped?controller=quadruped=pd,kp=60,kv=2"
+    n_observed: ClassVar[int] = 3
+    max_episode_steps: ClassVar[int | None] = 500
+
+    def reset(self, rng: np.random.Generator, start: Start) -> None:
+        """See `Task.reset`."""
+        start.noise(rng, "quadruped", ResetNoise(hinge=0.05))
+        turn = rng.uniform(-np.pi, np.pi)
+        start.place("quadruped/trunk", [0.0, 0.0, 0.3], (np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2)))
+        start.goal["command"] = rng.uniform(self.LOW, self.HIGH)
+
+    def observe(self, states: States) -> Floats:
+        """See `Task.observe`."""
+        return states.goal["command"]
+
+    def reward(self, states: States, actions: Any) -> Floats:
+        """See `Task.reward`."""
+        error = self._moves(states) - states.goal["command"]
+        followed = np.exp(-np.sum(error[:, :2] ** 2, axis=1) / 0.1) + 0.5 * np.exp(-(error[:, 2] ** 2) / 0.1)
+        return np.where(self.terminated(states), 0.0, followed)
+
+    def terminated(self, states: States) -> Bools:
+        """See `Task.terminated`."""
+        _, x, y, _ = states.body_quaternion("quadruped/trunk").T
+        height = states.body_position("quadruped/trunk")[:, 2]
+        return (height < self.FALLEN_M) | (1.0 - 2.0 * (x**2 + y**2) < self.UPRIGHT)
+
+    def success(self, states: States) -> Bools:
+        """See `Task.success`."""
+        return np.linalg.norm(self._moves(states) - states.goal["command"], axis=1) < self.CLOSE
+
+    def _moves(self, states: States) -> Floats:
+        """Return the velocity ahead and to the left, and the rate of turn, base frame, shape (n, 3)."""
+        w, x, y, z = states.body_quaternion("quadruped/trunk").T
+        heading = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y**2 + z**2))
+        velocity = states.velocities("quadruped")  # of a free joint: linear in the world's frame, angular in its own
+        ahead = velocity[:, 0] * np.cos(heading) + velocity[:, 1] * np.sin(heading)
+        left = velocity[:, 1] * np.cos(heading) - velocity[:, 0] * np.sin(heading)
+        return np.stack([ahead, left, velocity[:, 5]], axis=1)

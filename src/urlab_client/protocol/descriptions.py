@@ -1,0 +1,204 @@
+"""What `client.describe()` and `articulation.describe()` return: robots as typed values that JSON can hold."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from msgspec import Struct
+
+from urlab_client.protocol.base import Quat, Vec3
+
+__all__ = [
+    "ActuatorDescription",
+    "ArticulationDescription",
+    "CameraDescription",
+    "ControllerDescription",
+    "EntityDescription",
+    "JointDescription",
+    "JointKind",
+    "Pose",
+    "SceneDescription",
+    "SensorDescription",
+    "SetPointMeaning",
+]
+
+JointKind = Literal["free", "ball", "slide", "hinge"]
+"""What a joint allows: all of six degrees of freedom, three rotations, one translation, one rotation."""
+
+SetPointMeaning = Literal["force", "position", "velocity", ""]
+"""What an actuator does with a set-point: make a force of it, or pull towards it; empty where that is not known."""
+
+
+class Pose(Struct, frozen=True, kw_only=True):
+    """Where something is, in the world frame.
+
+    Attributes:
+        position: Metres.
+        quaternion: Orientation (w, x, y, z).
+    """
+
+    position: Vec3
+    quaternion: Quat
+
+
+class JointDescription(Struct, frozen=True, kw_only=True):
+    """One joint and where it is.
+
+    Attributes:
+        name: Short name, without the articulation's prefix.
+        kind: `hinge`, `slide`, `ball` or `free`.
+        unit: `rad` or `m`; empty for joints whose position is not one number.
+        limits: (low, high) in that unit, or None if unlimited.
+        position: One number; a ball joint has the quaternion (w, x, y, z), a free joint (x, y, z) before it.
+        velocity: In the unit per second: one number, three for a ball joint, six for a free joint.
+    """
+
+    name: str
+    kind: JointKind
+    unit: str
+    limits: tuple[float, float] | None
+    position: float | list[float]
+    velocity: float | list[float]
+
+
+class ActuatorDescription(Struct, frozen=True, kw_only=True):
+    """One actuator and what it is told.
+
+    Attributes:
+        name: Short name, without the articulation's prefix.
+        kind: `motor`, `position`, `velocity`, …; None if unknown.
+        joint: The joint that it drives, or None for other transmissions.
+        takes: What a set-point means: `force`, `position`, `velocity`, or empty where that is not known. While a PD
+            controller is in force every set-point is a `position`.
+        unit: Unit of a set-point, where it is known.
+        limits: (low, high) of a set-point, or None if unlimited.
+        force_limits: (low, high) of the force in N or N m, or None if unlimited.
+        gear: Ratio from the actuator's force to that on the joint; None for other transmissions.
+        set_point: What the next step sends.
+    """
+
+    name: str
+    kind: str | None
+    joint: str | None
+    takes: SetPointMeaning
+    unit: str
+    limits: tuple[float, float] | None
+    force_limits: tuple[float, float] | None
+    gear: float | None
+    set_point: float
+
+
+class SensorDescription(Struct, frozen=True, kw_only=True):
+    """One sensor and what it reads.
+
+    Attributes:
+        name: Short name, without the articulation's prefix.
+        kind: MJCF element: `accelerometer`, `framepos`, ….
+        unit: Unit of its reading; empty for directions, quaternions and sensors of unknown meaning.
+        dim: Numbers in a reading.
+        reading: The last one, or None.
+    """
+
+    name: str
+    kind: str
+    unit: str
+    dim: int
+    reading: list[float] | None
+
+
+class CameraDescription(Struct, frozen=True, kw_only=True):
+    """One camera.
+
+    Attributes:
+        name: Name that `step(include_cameras=…)` and `capture()` take.
+        mode: `real`, `depth`, `semantic` or `instance`.
+        width: Pixels.
+        height: Pixels.
+        fovy: Vertical field of view, degrees.
+    """
+
+    name: str
+    mode: str
+    width: int
+    height: int
+    fovy: float
+
+
+class ControllerDescription(Struct, frozen=True, kw_only=True):
+    """The controller of an articulation.
+
+    Attributes:
+        kind: `pd`, or another that the server names.
+        in_force: Whether set-points go through it: the control mode is `ue_controller`.
+    """
+
+    kind: str
+    in_force: bool
+
+
+class ArticulationDescription(Struct, frozen=True, kw_only=True):
+    """One robot: what it is made of, where it is, what it is told.
+
+    Joints and sensors are known with a local model only.
+
+    Attributes:
+        name: Key in `client.articulations`.
+        actor_id: Stable id given when it was spawned; empty if none.
+        free_base: Whether its root moves freely.
+        pose: Pose of its root, or None without a local model.
+        joints: In id order.
+        actuators: In id order.
+        sensors: In id order.
+        cameras: Its cameras.
+        controller: Its controller, or None.
+        control_owner: Who controls it, as far as this client knows; see `URLabArticulation.control_owner`.
+    """
+
+    name: str
+    actor_id: str
+    free_base: bool
+    pose: Pose | None
+    joints: list[JointDescription]
+    actuators: list[ActuatorDescription]
+    sensors: list[SensorDescription]
+    cameras: list[CameraDescription]
+    controller: ControllerDescription | None
+    control_owner: str | None
+
+
+class EntityDescription(Struct, frozen=True, kw_only=True):
+    """One dynamic body that is not part of a robot.
+
+    Attributes:
+        name: Key in `client.entities`.
+        free_base: Whether it moves freely.
+        pose: Its pose, or None without a local model.
+    """
+
+    name: str
+    free_base: bool
+    pose: Pose | None
+
+
+class SceneDescription(Struct, frozen=True, kw_only=True):
+    """Everything that moves, as of the last reply.
+
+    Attributes:
+        address: The server.
+        playing: Whether a play session runs, as far as this client knows.
+        step_mode: `direct`, `puppet` or `live`.
+        sim_time: Simulation time, seconds.
+        timestep: Seconds per physics step, or None without a local model.
+        articulations: The robots.
+        entities: Other dynamic bodies.
+        cameras: Cameras of the scene.
+    """
+
+    address: str
+    playing: bool
+    step_mode: str
+    sim_time: float
+    timestep: float | None
+    articulations: list[ArticulationDescription]
+    entities: list[EntityDescription]
+    cameras: list[CameraDescription]

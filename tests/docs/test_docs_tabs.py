@@ -1,0 +1,44 @@
+"""Code in both flavours is in tabs, of which the site opens the same one everywhere."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import sys
+from pathlib import Path
+
+import pytest
+from pages import ROOT, pages, shown
+
+TAB = re.compile(r"^<!-- tab: (.*?) -->$", re.MULTILINE)
+
+
+@pytest.mark.parametrize("page", [page for page in pages() if TAB.search(page.read_text("utf-8"))], ids=shown)
+def test_tabs_come_in_pairs_above_code(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    names = TAB.findall(text)
+    assert names == ["Blocking", "Async"] * (len(names) // 2)
+    assert len(re.findall(r"^<!-- tab: .*? -->\n```python$", text, re.MULTILINE)) == len(names)
+
+
+def test_the_home_page_and_the_quickstart_have_them() -> None:
+    with_tabs = {shown(page) for page in pages() if TAB.search(page.read_text("utf-8"))}
+    assert with_tabs >= {"README.md", "docs/index.md", "docs/start.md", "docs/quickstart.md"}
+
+
+def test_the_site_makes_tabs_of_neighbours_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("mkdocs", "mkdocs.structure", "mkdocs.structure.files"):  # which the tests do without
+        monkeypatch.setitem(sys.modules, name, type(sys)(name))
+    for name in ("File", "Files"):
+        monkeypatch.setattr(sys.modules["mkdocs.structure.files"], name, object, raising=False)
+    spec = importlib.util.spec_from_file_location("site_hooks_alone", ROOT / "tools" / "site_hooks.py")
+    assert spec is not None
+    assert spec.loader is not None
+    hooks = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(hooks)
+    tab = "<!-- tab: {0} -->\n```python\n{1}\n```\n"
+    first, second, third = tab.format("Blocking", "a"), tab.format("Async", "b"), tab.format("Blocking", "c")
+    page = f"{first}\n```text\n1\n```\n\n{second}\nwords\n\n{third}"
+    made = hooks.tabs(page)
+    assert re.findall(r'^===!? ".*"$', made, re.MULTILINE) == ['===! "Blocking"', '=== "Async"', '===! "Blocking"']
+    assert '===! "Blocking"\n\n    ```python\n    a\n    ```\n\n    ```text\n    1\n    ```\n' in made

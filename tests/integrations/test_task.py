@@ -1,0 +1,188 @@
+"""Tasks: one object serves single environments, servers and batches, with the same numbers."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from typing import Any, ClassVar
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from urlab_client.integrations.gym import (
+    Reach,
+    Start,
+    States,
+    Task,
+    URLabBatchEnv,
+    URLabEnv,
+    URLabVectorEnv,
+    Walk,
+)
+from urlab_client.server import ControllerConfig, SimulatedServer
+
+
+@pytest.fixture
+def made() -> Iterator[list[Any]]:
+    envs: list[Any] = []
+    yield envs
+    for env in envs:
+        env.close()
+
+
+@pytest.fixture(scope="module")
+def arms() -> Iterator[list[str]]:
+    """Addresses of two servers."""
+    with SimulatedServer("arm", play=True) as one, SimulatedServer("arm", play=True) as two:
+        yield [f"{server.address}:{server.step_port}" for server in (one, two)]
+
+
+@pytest.fixture(scope="module")
+def walkers() -> Iterator[list[str]]:
+    """Addresses of two servers whose quadruped has the controller that `Walk` asks for."""
+    pd = {"quadruped": ControllerConfig(kp=60.0, kv=2.0)}
+    with (
+        SimulatedServer("quadruped", play=True, controllers=pd) as one,
+        SimulatedServer("quadruped", play=True, controllers=pd) as two,
+    ):
+        yield [f"{server.address}:{server.step_port}" for server in (one, two)]
+
+
+@pytest.mark.parametrize(("kind", "servers"), [(Reach, "arms"), (Walk, "walkers")])
+def test_all_three_environments_agree_bit_for_bit(
+    kind: type[Task], servers: str, made: list[Any], request: pytest.FixtureRequest
+) -> None:
+    addresses = request.getfixturevalue(servers)
+    wire = URLabVectorEnv(addresses, task=kind(), max_episode_steps=4)
+    batch = URLabBatchEnv(kind.scene_address, 2, task=kind(), max_episode_steps=4)
+    made += [wire, batch]
+    rng = np.random.default_rng(2)
+    actions = [rng.uniform(-0.4, 0.4, wire.action_space.shape).astype(np.float32) for _ in range(7)]
+
+    def rollout(env: Any) -> list[Any]:
+        seen: list[Any] = [env.reset(seed=6)[0]]
+        for action in actions:
+            *ours, infos = env.step(action)
+            seen += [*ours, infos["success"], infos["sim_time"]]
+        return seen
+
+    expected, found = rollout(wire), rollout(batch)
+    for a, b in zip(expected, found, strict=True):
+        assert np.array_equal(a, b)
+    wire.close()
+    single = URLabEnv.connect(addresses[0], task=kind(), max_episode_steps=4)
+    made.append(single)
+    observation, _ = single.reset(seed=6)
+    assert single.observation_space.contains(observation)
+    assert np.array_equal(observation, expected[0][0])
+    for i, action in enumerate(actions[:4]):
+        observation, reward, terminated, truncated, info = single.step(action[0])
+        ours = [row[0] for row in expected[1 + 6 * i : 7 + 6 * i]]
+        assert np.array_equal(observation, ours[0])
+        assert (reward, terminated, truncated, info["success"], info["sim_time"]) == tuple(ours[1:])
+    assert truncated
+
+
+def test_goals_starts_and_commands_vary_with_the_seed_alone(made: list[Any]) -> None:
+    env = URLabBatchEnv(Walk.scene_address, 3, task=Walk())
+    made.append(env)
+    first, _ = env.reset(seed=1)
+    again, _ = env.reset(seed=1)
+    other, _ = env.reset(seed=2)
+    assert np.array_equal(first, again)
+    assert np.array_equal(first[1:], other[:2]), "environment i has the seed s + i"
+    commands = first[:, -3:]
+    assert ((commands >= Walk.LOW) & (commands <= Walk.HIGH)).all()
+    assert len(np.unique(commands)) == 9
+    quaternions = first[:, 3:7]
+    assert len(np.unique(quaternions[:, 0])) == 3, "it looks another way each time"
+    np.testing.assert_allclose(np.linalg.norm(quaternions, axis=1), 1.0)
+
+
+def test_a_hand_at_its_target_is_a_success_and_ends_a_curriculums_episode(made: list[Any]) -> None:
+    class Near(Reach):
+        """Targets where the hand rests."""
+
+        def __init__(self) -> None:
+            self.ends: list[tuple[bool, int]] = []
+
+        def reset(self, rng: np.random.Generator, start: Start) -> None:
+            data = self.scene.data
+            data.qpos[:] = start.qpos
+            mujoco.mj_kinematics(self.scene.model, data)
+            start.goal["target"] = data.site_xpos[self.scene.id("site", "arm/grip")] + rng.choice([0.0, 0.5])
+
+        def ended(self, success: bool, steps: int) -> None:
+            self.ends.append((success, steps))
+
+    task = Near()
+    env = URLabBatchEnv("sim://arm", 4, task=task, max_episode_steps=2)
+    made.append(env)
+    observations, _ = env.reset(seed=[0, 1, 2, 3])
+    near = np.linalg.norm(observations[:, -3:], axis=1) < 0.03
+    assert 0 < near.sum() < 4
+    still = np.zeros(env.action_space.shape, dtype=np.float32)
+    for _ in range(2):
+        _, rewards, _, truncated, infos = env.step(still)
+        assert infos["success"].tolist() == near.tolist()
+        assert (rewards > 0).tolist() == near.tolist()
+    assert truncated.all()
+    assert task.ends == [(bool(success), 2) for success in near]
+
+
+def test_poses_and_contacts_are_those_of_the_state(made: list[Any]) -> None:
+    class Stand(Walk):
+        seen: ClassVar[list[States]] = []
+
+        def reward(self, states: States, actions: Any) -> Any:
+            self.seen.append(states)
+            return np.zeros(len(states))
+
+    env = URLabBatchEnv(Walk.scene_address, 2, task=Stand())
+    made.append(env)
+    env.reset(seed=0)
+    for _ in range(30):
+        env.step(np.zeros(env.action_space.shape, dtype=np.float32))
+    states, model = Stand.seen[-1], env.model
+    data = mujoco.MjData(model)
+    for i in range(2):
+        data.qpos[:] = states.qpos[i]
+        mujoco.mj_forward(model, data)
+        assert np.array_equal(states.body_position("quadruped/FL_calf")[i], data.body("quadruped_FL_calf").xpos)
+    for foot in ("quadruped/FL_calf", "quadruped/FL_foot"):
+        assert states.touching(foot).all()
+        assert states.touching(foot, "quadruped/floor").all()
+    assert not states.touching("geom:quadruped/FL_calf").any(), "the shin, not the foot of the body with its name"
+    assert not states.touching("quadruped/trunk").any()
+    assert not states.touching("quadruped/FL_calf", "quadruped/FR_calf").any()
+    with pytest.raises(KeyError, match=r"no body 'quadruped/tail'; there are: .*quadruped_trunk"):
+        states.body_position("quadruped/tail")
+    with pytest.raises(ValueError, match="has no free joint"):
+        Start(states.scene, states.qpos[0]).place("quadruped/FL_calf", [0, 0, 0])
+
+
+@pytest.mark.parametrize("task_id", ["urlab/Reach-v0", "urlab/Walk-v0"])
+def test_shipped_tasks_are_registered_and_pass_gymnasiums_checker(task_id: str) -> None:
+    env = gymnasium.make(task_id)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*(infinity|symmetric and normalized|render modes).*")
+        check_env(env.unwrapped, skip_render_check=True)
+    env.close()
+
+
+def test_what_a_task_settles_is_refused_beside_it(arms: list[str], made: list[Any]) -> None:
+    with pytest.raises(ValueError, match="a task settles reset_noise"):
+        URLabBatchEnv("sim://arm", 1, task=Reach(), reset_noise=0.1)
+    with pytest.raises(ValueError, match="a task settles reward_fn"):
+        URLabVectorEnv(arms, task=Reach(), reward_fn=lambda *_: 0)
+
+    class Wrong(Reach):
+        n_observed: ClassVar[int] = 5
+
+    env = URLabBatchEnv("sim://arm", 1, task=Wrong())
+    made.append(env)
+    with pytest.raises(ValueError, match=r"Wrong.observe\(\) returned 6 numbers; n_observed is 5"):
+        env.reset()
