@@ -40,8 +40,8 @@ BUFFER_BYTES = 64 * 1024 * 1024
 """Default limit of a stream's buffer, bytes."""
 
 
-class _Source(Protocol[T_co]):
-    """Where a stream's messages come from and what they mean."""
+class Source(Protocol[T_co]):
+    """Where a stream's messages come from and what they mean: all that a stream knows of it."""
 
     name: str
 
@@ -70,7 +70,7 @@ class _Source(Protocol[T_co]):
         ...
 
 
-class _StreamChannel(MessageHandler, Generic[T]):
+class _StreamHandler(MessageHandler, Generic[T]):
     """Buffer, reader and end of one stream. What receives holds it, and it does not hold the stream: a stream that is
     dropped without being closed can so be collected, and stops receiving then.
 
@@ -80,7 +80,7 @@ class _StreamChannel(MessageHandler, Generic[T]):
 
     def __init__(
         self,
-        source: _Source[T],
+        source: Source[T],
         buffer: StreamBuffer,
         *,
         tolerant: bool,
@@ -305,19 +305,19 @@ class _StreamChannel(MessageHandler, Generic[T]):
 
 
 class Stream(Generic[T]):
-    """Items the server publishes, as they come.
+    """Items that the server publishes, as they arrive.
 
-    It opens with the first use or on entering a `with` block, and reconnects by itself. Iteration ends when the
-    stream is closed here; when the client is closed, it raises `ClientClosed` after the items that had arrived.
+    It opens with the first use or on entering a `with` block, and reconnects automatically. Iteration ends when the
+    stream is closed; when the client is closed, it raises `ClientClosed` after the items that had arrived.
 
-    What waits for a busy reader is decided by the policy. `latest` keeps the newest item. `latest_per_key` keeps the
+    The policy decides which items wait for a busy reader. `latest` keeps the newest item. `latest_per_key` keeps the
     newest of each topic. `all` keeps everything up to a limit; beyond it the oldest items are lost and the next read
-    raises `StreamOverflow` once. The stream goes on after that, as after `URLabTimeoutError`.
+    raises `StreamOverflow` once. The stream continues after that, as after `URLabTimeoutError`.
 
-    Each item carries `seq`, `dropped` and `gap`, so that a reader sees what it missed. What is lost before it reaches
-    this process, in the queues of the server or the network, cannot be seen: the wire has no numbers.
+    Each item carries `seq`, `dropped` and `gap`, so that a reader sees what it missed. Losses before an item
+    reaches this process, in the queues of the server or the network, are invisible: the wire has no numbers.
 
-    One reader at a time; `latest`, `stats` and `closed` are for everybody. An item that nobody reads is not decoded.
+    One reader at a time; anyone may read `latest`, `stats` and `closed`. An item that nobody reads is not decoded.
 
     Example:
         async with client.state_stream() as states:
@@ -327,7 +327,7 @@ class Stream(Generic[T]):
 
     def __init__(
         self,
-        source: _Source[T],
+        source: Source[T],
         *,
         policy: str | StreamPolicy,
         buffer: int = BUFFER_ITEMS,
@@ -354,28 +354,28 @@ class Stream(Generic[T]):
             ValueError: Unknown policy, or a limit below 1.
         """
         kept = StreamBuffer(StreamPolicy(policy), buffer, buffer_bytes)
-        self._channel = _StreamChannel(
+        self._handler = _StreamHandler(
             source, kept, tolerant=tolerant, timeout=timeout, default_timeout=default_timeout
         )
         if eager:
-            self._channel.attach()
+            self._handler.attach()
 
     @property
     def closed(self) -> bool:
         """Whether it was closed here."""
-        return self._channel.closed
+        return self._handler.closed
 
     @property
     def stats(self) -> StreamStats:
         """Counters up to now."""
-        return self._channel.stats()
+        return self._handler.stats()
 
     def latest(self) -> T | None:
         """Return the newest item without waiting and without taking it away from the reader; None before the first.
 
         The reader gets the same object.
         """
-        return self._channel.latest()
+        return self._handler.latest()
 
     def receive_nowait(self) -> T | None:
         """Return the next item if one waits, else None, as before the stream is opened and after it is closed.
@@ -386,7 +386,7 @@ class Stream(Generic[T]):
             ClientClosed: The client was closed, and what had arrived is read.
         """
         try:
-            return self._channel.receive_nowait()
+            return self._handler.receive_nowait()
         except StopAsyncIteration:
             return None
 
@@ -405,17 +405,17 @@ class Stream(Generic[T]):
             URLabError: The stream was closed.
         """
         try:
-            return await self._channel.receive(timeout)
+            return await self._handler.receive(timeout)
         except StopAsyncIteration:
             raise self._was_closed() from None
 
     async def aclose(self) -> None:
         """Stop receiving and drop what waits. A reader's iteration ends. Idempotent."""
-        self._channel.close()
+        self._handler.close()
 
     async def __aenter__(self) -> Self:
         try:
-            self._channel.open()
+            self._handler.open()
         except StopAsyncIteration:
             raise self._was_closed() from None
         return self
@@ -423,19 +423,19 @@ class Stream(Generic[T]):
     async def __aexit__(
         self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self._channel.close()
+        self._handler.close()
 
     def __aiter__(self) -> Self:
         return self
 
     async def __anext__(self) -> T:
         """Return the next item; see `receive` for what it raises."""
-        return await self._channel.next()
+        return await self._handler.next()
 
     def __del__(self) -> None:
-        channel: _StreamChannel[T] | None = getattr(self, "_channel", None)  # None if the constructor failed
-        if channel is not None:
-            channel.abandon()
+        handler: _StreamHandler[T] | None = getattr(self, "_handler", None)  # None if the constructor failed
+        if handler is not None:
+            handler.abandon()
 
     def _was_closed(self) -> URLabError:
         return URLabError("The stream was closed.", hint="Open a new one.")

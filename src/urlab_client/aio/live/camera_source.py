@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from urlab_client.aio.live.camera_switch import CameraSwitch
-from urlab_client.aio.live.source import SharedMemorySource, SocketSource
+from urlab_client.aio.live.source import PublishedSource
 from urlab_client.aio.transport.regions import Place, Regions, SharedPicture
 from urlab_client.aio.transport.subscriber import MessageHandler, Subscription, Subscriptions
 from urlab_client.protocol import doorbell
@@ -20,7 +20,7 @@ from urlab_client.protocol.pixels import decode_camera
 from urlab_client.protocol.shm import camera_file
 from urlab_client.protocol.topics import camera_filter, resolve_endpoint
 
-__all__ = ["CameraSource", "HasCamera", "SharedCameraSource"]
+__all__ = ["CameraSource", "HasCamera"]
 
 FIRST_PICTURE_S = 30.0
 """How long a server may take for its first picture: it looks for OpenGL before."""
@@ -45,13 +45,16 @@ class HasCamera(Protocol):
         ...
 
 
-class CameraSource(SocketSource):
-    """The pictures of one camera.
+class CameraSource(PublishedSource):
+    """The pictures of one camera, from its region or from its socket.
+
+    A picture from the region is converted when somebody looks at it, straight into an array of the user's.
 
     Args:
         subscriptions: The client's.
         view: The camera.
         host: Tells under which name or address the server was reached.
+        regions: As of the base class.
         live: Tells whether the server is in live mode, as far as is known.
         switch: Switches the camera on and off; None where it always streams.
         asked: Whether the user asked for these pictures, rather than having them received in the background.
@@ -74,40 +77,41 @@ class CameraSource(SocketSource):
         view: HasCamera,
         host: Callable[[], str],
         *,
+        regions: Regions | None = None,
         live: Callable[[], bool] = lambda: True,
         switch: CameraSwitch | None = None,
         asked: bool = True,
     ) -> None:
-        super().__init__(subscriptions)
+        super().__init__(subscriptions, regions)
         self.view = view
         self._host = host
         self._live = live
         self._switch = switch
         self._asked = asked
         self._users: set[MessageHandler] = set()
+        self._taken: SharedPicture | None = None
 
     def attach(self, handler: MessageHandler) -> None:
         """Begin to feed `handler`, from the event loop, and switch the camera on."""
         super().attach(handler)
-        self._use(handler)
-
-    def detach(self, handler: MessageHandler) -> None:
-        """Stop feeding `handler`. Idempotent."""
-        super().detach(handler)
-        self._leave(handler)
-
-    def _use(self, handler: MessageHandler) -> None:
         if self._switch is not None and handler not in self._users:
             self._users.add(handler)
             self._switch.use(self.view.info, asked=self._asked)
 
-    def _leave(self, handler: MessageHandler) -> None:
+    def detach(self, handler: MessageHandler) -> None:
+        """Stop feeding `handler`. Idempotent."""
+        super().detach(handler)
         if self._switch is not None and handler in self._users:
             self._users.discard(handler)
             self._switch.leave(self.view.info)
 
     def first_after(self, handler: MessageHandler) -> float:
-        """Return how long a server may take until it can draw, where it is there and in live mode; else 0."""
+        """Return how long a server may take until it can draw, where it is there and publishes; else 0.
+
+        Sockets bring pictures in live mode only, regions in every mode.
+        """
+        if self.region(handler) is not None:
+            return FIRST_PICTURE_S
         line = self._subscriptions.line(handler)
         return FIRST_PICTURE_S if line is not None and line.connected and self._live() else 0.0
 
@@ -116,65 +120,6 @@ class CameraSource(SocketSource):
         info = self.view.info
         topic = camera_filter(info.zmq_topic)
         return Subscription(resolve_endpoint(info.zmq_endpoint, self._host()), (topic,), topic.__eq__, pictures=True)
-
-    def decode(self, topic: bytes, payload: BytesLike) -> CameraSample:
-        """Read a picture. Raises `ProtocolError`."""
-        view = self.view
-        width, height = view.info.resolution
-        frame = decode_camera(payload, view.mode, width, height, where=topic.decode(errors="replace"))
-        return CameraSample(
-            camera=view.name,
-            mode=view.mode,
-            pixels=frame.pixels,
-            frame_id=frame.frame_id,
-            sim_time=frame.sim_time,
-            capture_time=frame.capture_time,
-        )
-
-
-class SharedCameraSource(SharedMemorySource, CameraSource):
-    """The pictures of one camera, from its region or from its socket.
-
-    A picture from the region is converted when somebody looks at it, straight into an array of the user's.
-
-    Args:
-        regions: The client's.
-        subscriptions: The client's.
-        view: The camera.
-        host: Tells under which name or address the server was reached.
-        live: Tells whether the server is in live mode, as far as is known.
-        switch: Switches the camera on and off; None where it always streams.
-        asked: Whether the user asked for these pictures, rather than having them received in the background.
-    """
-
-    def __init__(
-        self,
-        regions: Regions,
-        subscriptions: Subscriptions,
-        view: HasCamera,
-        host: Callable[[], str],
-        *,
-        live: Callable[[], bool] = lambda: True,
-        switch: CameraSwitch | None = None,
-        asked: bool = True,
-    ) -> None:
-        super().__init__(subscriptions, view, host, live=live, switch=switch, asked=asked)
-        self.regions = regions
-        self._taken: SharedPicture | None = None
-
-    def attach(self, handler: MessageHandler) -> None:
-        """See the base classes."""
-        super().attach(handler)
-        self._use(handler)
-
-    def detach(self, handler: MessageHandler) -> None:
-        """See the base classes."""
-        super().detach(handler)
-        self._leave(handler)
-
-    def first_after(self, handler: MessageHandler) -> float:
-        """See the base class; regions get pictures in every mode."""
-        return super().first_after(handler) if self.regions.path(handler) is None else FIRST_PICTURE_S
 
     def place(self) -> Place:
         """See the base class."""
@@ -196,8 +141,20 @@ class SharedCameraSource(SharedMemorySource, CameraSource):
     def decode(self, topic: bytes, payload: BytesLike) -> CameraSample:
         """Read a picture. Raises `ProtocolError`."""
         if not isinstance(payload, SharedPicture):
-            return super().decode(topic, payload)
-        decode = super().decode
-        found = payload.read(lambda slot: decode(topic, slot))
+            return self._sample(topic, payload)
+        found = payload.read(lambda slot: self._sample(topic, slot))
         self._taken = SharedPicture(payload.reader, found.sequence, len(payload))
         return found.payload
+
+    def _sample(self, topic: bytes, payload: BytesLike) -> CameraSample:
+        view = self.view
+        width, height = view.info.resolution
+        frame = decode_camera(payload, view.mode, width, height, where=topic.decode(errors="replace"))
+        return CameraSample(
+            camera=view.name,
+            mode=view.mode,
+            pixels=frame.pixels,
+            frame_id=frame.frame_id,
+            sim_time=frame.sim_time,
+            capture_time=frame.capture_time,
+        )

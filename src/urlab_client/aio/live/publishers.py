@@ -6,12 +6,12 @@ from collections.abc import Callable, Collection, Mapping
 
 import numpy as np
 
-from urlab_client.aio.live.camera_source import CameraSource, HasCamera, SharedCameraSource
+from urlab_client.aio.live.camera_source import CameraSource, HasCamera
 from urlab_client.aio.live.camera_switch import CameraSwitch
 from urlab_client.aio.live.derived_rows import DerivedRowSource, HasRows
 from urlab_client.aio.live.event_bus import EventBus
 from urlab_client.aio.live.row_source import RowSource
-from urlab_client.aio.live.state_source import OwnSteps, SharedStateSource, StateSource
+from urlab_client.aio.live.state_source import OwnSteps, StateSource
 from urlab_client.aio.transport.curve import ClientKeys
 from urlab_client.aio.transport.regions import Regions
 from urlab_client.aio.transport.server_regions import SharedMemoryRegions
@@ -93,12 +93,16 @@ class Publishers:
 
     def state(self, policy: str = StreamPolicy.LATEST) -> StateSource:
         """Return what brings snapshots to a stream of that policy."""
-        # A region keeps the newest only.
-        if self.regions is None or policy == StreamPolicy.ALL:
-            return StateSource(self.subscriptions, self._state_endpoint, self.own_steps, only_own=self._only_own)
-        return SharedStateSource(
-            self.regions, self.subscriptions, self._state_endpoint, self.own_steps, only_own=self._only_own
+        return StateSource(
+            self.subscriptions,
+            self._state_endpoint,
+            self.own_steps,
+            regions=self._regions_for(policy),
+            only_own=self._only_own,
         )
+
+    def _regions_for(self, policy: str) -> Regions | None:
+        return None if policy == StreamPolicy.ALL else self.regions  # a region keeps the newest only
 
     def _only_own(self) -> bool:
         return not (self._features().publishes_steps or self._live())
@@ -123,15 +127,11 @@ class Publishers:
 
     def camera(self, view: HasCamera, policy: str = StreamPolicy.LATEST, *, asked: bool = True) -> CameraSource:
         """Return what brings a camera's pictures to a stream of that policy; see `CameraSource`."""
-        if self.regions is None or policy == StreamPolicy.ALL:
-            return CameraSource(
-                self.subscriptions, view, self._host, live=self._live, switch=self.camera_switch, asked=asked
-            )
-        return SharedCameraSource(
-            self.regions,
+        return CameraSource(
             self.subscriptions,
             view,
             self._host,
+            regions=self._regions_for(policy),
             live=self._live,
             switch=self.camera_switch,
             asked=asked,
@@ -141,9 +141,7 @@ class Publishers:
         """Return a camera's newest picture in shared memory, None where there is none. From any thread."""
         if self.regions is None:
             return None
-        found = self.regions.view(
-            SharedCameraSource(self.regions, self.subscriptions, view, self._host, live=self._live)
-        )
+        found = self.regions.view(CameraSource(self.subscriptions, view, self._host).place())
         width, height = view.info.resolution
         if found is None or len(found[0].payload) < width * height * 4:
             return None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 
-from urlab_client.aio.live.source import SocketSource
+from urlab_client.aio.live.source import PublishedSource
 from urlab_client.aio.live.state_source import StateSource
 from urlab_client.aio.transport.subscriber import Subscription, Subscriptions
 from urlab_client.protocol.errors import ProtocolError
@@ -23,7 +23,7 @@ _OF_SCENE = frozenset({TopicKind.XPOS, TopicKind.XQUAT, TopicKind.QPOS, TopicKin
 _WITH_ID = frozenset({TopicKind.JOINT, TopicKind.SENSOR})
 
 
-class RowSource(SocketSource):
+class RowSource(PublishedSource):
     """The binary rows of the state socket.
 
     Args:

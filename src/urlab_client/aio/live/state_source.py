@@ -6,7 +6,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 
-from urlab_client.aio.live.source import SharedMemorySource, SocketSource
+from urlab_client.aio.live.source import PublishedSource
 from urlab_client.aio.transport.regions import Place, Regions
 from urlab_client.aio.transport.subscriber import MessageHandler, Subscription, Subscriptions
 from urlab_client.protocol import doorbell
@@ -18,7 +18,7 @@ from urlab_client.protocol.messages.streams import (
 from urlab_client.protocol.shm import STATE_FILE
 from urlab_client.protocol.topics import STATE_FULL
 
-__all__ = ["OwnSteps", "SharedStateSource", "StateSource"]
+__all__ = ["OwnSteps", "StateSource"]
 
 
 _ONLY_OWN = (
@@ -52,12 +52,13 @@ class OwnSteps:
             handler.on_drained()
 
 
-class StateSource(SocketSource):
-    """The snapshots of the state socket.
+class StateSource(PublishedSource):
+    """The snapshots of the state region, or of the state socket.
 
     Args:
         subscriptions: The client's.
         endpoint: Tells where the state socket is.
+        regions: As of the base class.
         own: What brings the states of the client's own steps, where the server publishes none of them.
         only_own: Tells whether nothing else comes, as things stand.
 
@@ -79,13 +80,16 @@ class StateSource(SocketSource):
         endpoint: Callable[[], str],
         own: OwnSteps | None = None,
         *,
+        regions: Regions | None = None,
         only_own: Callable[[], bool] = lambda: False,
     ) -> None:
-        super().__init__(subscriptions)
+        super().__init__(subscriptions, regions)
         self.subscriptions = subscriptions
         self.endpoint = endpoint
         self._own = OwnSteps() if own is None else own
         self._only_own = only_own
+        # The socket may be one ahead of the region. Two are never equal: each tells when it was built.
+        self._came = deque[BytesLike](maxlen=2)
 
     def attach(self, handler: MessageHandler) -> None:
         """Begin to feed `handler`, from the event loop."""
@@ -101,6 +105,19 @@ class StateSource(SocketSource):
         """See the base class."""
         return Subscription(self.endpoint(), (STATE_FULL,), STATE_FULL.__eq__)
 
+    def place(self) -> Place:
+        """See the base class."""
+        return Place(STATE_FILE, STATE_FULL, doorbell.STATE)
+
+    def wants(self, topic: bytes, payload: BytesLike) -> bool:
+        """Leave out what came already: where the region takes over from the socket, both bring it."""
+        if self._regions is None:
+            return True
+        if payload in self._came:
+            return False
+        self._came.append(payload)
+        return True
+
     def first_after(self, handler: MessageHandler) -> float:
         """Return how long the first snapshot may be in coming: where only steps bring any, for ever."""
         return math.inf if self._only_own() else super().first_after(handler)
@@ -113,48 +130,3 @@ class StateSource(SocketSource):
     def decode(self, topic: bytes, payload: BytesLike) -> StateSnapshot:
         """Read a snapshot. Raises `ProtocolError`."""
         return StateSnapshot.decode(payload, topic.decode())
-
-
-class SharedStateSource(SharedMemorySource, StateSource):
-    """The snapshots of the state region, or of the state socket.
-
-    Args:
-        regions: The client's.
-        subscriptions: The client's.
-        endpoint: Tells where the state socket is.
-    """
-
-    def __init__(
-        self,
-        regions: Regions,
-        subscriptions: Subscriptions,
-        endpoint: Callable[[], str],
-        own: OwnSteps | None = None,
-        *,
-        only_own: Callable[[], bool] = lambda: False,
-    ) -> None:
-        super().__init__(subscriptions, endpoint, own, only_own=only_own)
-        self.regions = regions
-        # The socket may be one ahead of the region. Two are never equal: each tells when it was built.
-        self._came = deque[BytesLike](maxlen=2)
-
-    def attach(self, handler: MessageHandler) -> None:
-        """See the base classes."""
-        super().attach(handler)
-        self._own.attach(handler)
-
-    def detach(self, handler: MessageHandler) -> None:
-        """See the base classes."""
-        super().detach(handler)
-        self._own.detach(handler)
-
-    def place(self) -> Place:
-        """See the base class."""
-        return Place(STATE_FILE, STATE_FULL, doorbell.STATE)
-
-    def wants(self, topic: bytes, payload: BytesLike) -> bool:
-        """Leave out what came already: where the region takes over from the socket, both bring it."""
-        if payload in self._came:
-            return False
-        self._came.append(payload)
-        return True

@@ -12,7 +12,7 @@ import logging
 import threading
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Protocol, TypeVar, cast
+from typing import TypeVar, cast
 
 from msgspec import Struct
 
@@ -31,7 +31,7 @@ from urlab_client.protocol.errors import ProtocolError, URLabError
 from urlab_client.protocol.layouts import BytesLike
 from urlab_client.protocol.shm import Publication
 
-__all__ = ["Place", "RegionSource", "Regions", "SharedPicture"]
+__all__ = ["Place", "Regions", "SharedPicture"]
 
 log = logging.getLogger("urlab_client.streams")
 
@@ -60,16 +60,11 @@ class Place(Struct, frozen=True):
     ring: bytes
 
 
-class RegionSource(Protocol):
-    """What can be received from a region and from a socket."""
+class _Wanted(Struct, frozen=True):
+    """What a handler is to have; see `Regions.attach`."""
 
-    def place(self) -> Place:
-        """Say which region. Raises `ProtocolError` where there can be none."""
-        ...
-
-    def subscription(self) -> Subscription:
-        """Say which socket, and what there."""
-        ...
+    subscription: Callable[[], Subscription]
+    place: Callable[[], Place]
 
 
 class SharedPicture:
@@ -175,7 +170,7 @@ class Regions:
     def __init__(self, memory: SharedMemoryRegions, subscriptions: Subscriptions) -> None:
         self._memory = memory
         self._subscriptions = subscriptions
-        self._sources: dict[MessageHandler, RegionSource] = {}
+        self._wanted: dict[MessageHandler, _Wanted] = {}
         self._readers: dict[str, _RegionReader] = {}
         self._refused: dict[str, str] = {}
         self._timer: asyncio.TimerHandle | None = None
@@ -185,23 +180,31 @@ class Regions:
         for ring in _WANTS:
             memory.rung[ring].append(self._look_at_all)
 
-    def attach(self, handler: MessageHandler, source: RegionSource) -> None:
-        """Let `handler` have what `source` describes, from the region if it is there, else from the socket."""
+    def attach(
+        self, handler: MessageHandler, subscription: Callable[[], Subscription], place: Callable[[], Place]
+    ) -> None:
+        """Let `handler` have what is published, from the region if it is there, else from the socket.
+
+        Args:
+            handler: What takes it.
+            subscription: Tells which socket, and what there.
+            place: Tells which region. Raises `ProtocolError` where there can be none.
+        """
         if self._closed:
             raise client_closed()
         self._loop = asyncio.get_running_loop()
-        reader = self._reader(source)
+        reader = self._reader(place)
         if reader is None or reader.silent:
-            self._subscriptions.attach(handler, source.subscription)
+            self._subscriptions.attach(handler, subscription)
         else:
             self._feed(reader, handler)
-        self._sources[handler] = source
+        self._wanted[handler] = _Wanted(subscription, place)
         if self._timer is None:
             self._timer = self._loop.call_later(_SUPERVISE_S, self._supervise)
 
     def detach(self, handler: MessageHandler) -> None:
         """Stop receiving for `handler`. Does nothing if it does not receive."""
-        if self._sources.pop(handler, None) is None:
+        if self._wanted.pop(handler, None) is None:
             return
         self._subscriptions.detach(handler)
         for reader in tuple(self._readers.values()):
@@ -228,9 +231,9 @@ class Regions:
         for reader in tuple(self._readers.values()):
             self._lose(reader)
 
-    def view(self, source: RegionSource) -> tuple[Publication[memoryview], Callable[[], bool]] | None:
+    def view(self, place: Place) -> tuple[Publication[memoryview], Callable[[], bool]] | None:
         """Return a live view of the newest publication and what tells whether it still holds; None without a region."""
-        reader = self._readers.get(source.place().file)
+        reader = self._readers.get(place.file)
         return None if reader is None else reader.view()
 
     def close(self) -> None:
@@ -243,18 +246,18 @@ class Regions:
         ended = [handler for reader in self._readers.values() for handler in reader.handlers]
         for reader in tuple(self._readers.values()):
             self._close_reader(reader)
-        self._sources.clear()
+        self._wanted.clear()
         for handler in ended:
             handler.on_end(client_closed)
 
     # Readers
 
-    def _reader(self, source: RegionSource) -> _RegionReader | None:
-        """Return the reader of a source's region, opening it if there is one with something in it."""
+    def _reader(self, wanted: Callable[[], Place]) -> _RegionReader | None:
+        """Return the reader of a region, opening it if there is one with something in it."""
         if self._away:
             return None
         try:
-            place = source.place()
+            place = wanted()
             known = self._readers.get(place.file)
             if known is not None:
                 return known
@@ -354,16 +357,16 @@ class Regions:
         reader.close()
 
     def _subscribe(self, handler: MessageHandler) -> None:
-        source = self._sources.get(handler)
-        if source is not None:
+        wanted = self._wanted.get(handler)
+        if wanted is not None:
             with contextlib.suppress(URLabError, ValueError):  # an invalid address is as silent as a closed port
-                self._subscriptions.attach(handler, source.subscription)
+                self._subscriptions.attach(handler, wanted.subscription)
 
     def _resume(self, reader: _RegionReader) -> None:
         """Take the handlers that had to do without back to a region that has come to life again."""
         reader.silent = False
-        for handler, source in self._sources.items():
-            if _file_of(source) == reader.place.file:
+        for handler, wanted in self._wanted.items():
+            if _file_of(wanted.place) == reader.place.file:
                 self._subscriptions.detach(handler)
                 reader.handlers[handler] = None
 
@@ -387,17 +390,17 @@ class Regions:
                     for handler in handlers:
                         self._subscribe(handler)
         self._settle_all()
-        if self._sources and self._loop is not None:
+        if self._wanted and self._loop is not None:
             self._timer = self._loop.call_later(_SUPERVISE_S, self._supervise)
         for reader in tuple(self._readers.values()):
-            if not self._sources:
+            if not self._wanted:
                 self._close_reader(reader)
 
     def _settle_all(self) -> None:
         """Take handlers that receive from sockets to their regions, where these are there by now."""
-        for handler, source in tuple(self._sources.items()):
+        for handler, wanted in tuple(self._wanted.items()):
             if self.path(handler) is None:
-                reader = self._reader(source)
+                reader = self._reader(wanted.place)
                 if reader is not None and not reader.silent:
                     self._subscriptions.detach(handler)
                     self._feed(reader, handler)
@@ -412,8 +415,8 @@ class Regions:
         return 0.0 if self._loop is None else self._loop.time()
 
 
-def _file_of(source: RegionSource) -> str | None:
+def _file_of(place: Callable[[], Place]) -> str | None:
     try:
-        return source.place().file
+        return place().file
     except ProtocolError:  # what a server calls its cameras may be anything
         return None
