@@ -21,6 +21,7 @@ from urlab_client import (
     OutcomeUnknown,
     ProtocolError,
     StepMode,
+    StepTimeout,
     UnknownArticulation,
     URLabRPCError,
     URLabTimeoutError,
@@ -686,3 +687,19 @@ async def test_the_state_stream_goes_on_outside_live_mode(served: SimulatedServe
                 await client.step(2)
             times = [(await anext(snapshots)).time for _ in range(3)]
         assert times == pytest.approx([0.004, 0.008, 0.012])
+
+
+async def test_a_step_that_timed_out_is_not_sent_again(served: SimulatedServer) -> None:
+    """Beta statement 97: whoever wants it again compares `forward().step` first."""
+    async with URLabClient(**served.client_options(), step_mode="direct") as client:
+        await client.discover()
+        before = (await client.step()).step
+        await client.runtime.set_paused(True)
+        core: Any = served._running._core  # type: ignore[union-attr]
+        core.play.running().engine._step_timeout_s = 0.05
+        sent = client.transport_stats.sent
+        with pytest.raises(StepTimeout):
+            await client.step()
+        assert client.transport_stats.sent == sent + 1
+        await client.runtime.set_paused(False)
+        assert (await client.runtime.forward()).step == before

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import pytest
 
 
 async def test_snapshots_arrive_and_the_robot_follows(connect: Any, serve: Any) -> None:
@@ -27,7 +26,6 @@ async def test_snapshots_arrive_and_the_robot_follows(connect: Any, serve: Any) 
             assert np.array_equal(client.data.qpos[:3], ball.qpos_array[:3])
 
 
-@pytest.mark.parametrize("dialect", ["alpha"])
 async def test_rows_on_demand(connect: Any, serve: Any) -> None:
     with serve("quadruped", play=True, unpaused=True) as server:
         client = connect(server, step_mode="live")

@@ -8,9 +8,9 @@ from pathlib import Path
 import mujoco
 import pytest
 
-from urlab_client import ImportFailed, UnknownOp, UploadProgress, URLabAsset, URLabClient
+from urlab_client import ImportFailed, UnknownOp, UploadProgress, URLabAsset, URLabClient, URLabTimeoutError
 from urlab_client.aio import URLabClient as AsyncClient
-from urlab_client.server import SimulatedServer
+from urlab_client.server import Delay, Drop, Faults, SimulatedServer
 
 MESH = "v 0 0 0\nv {0} 0 0\nv 0 {0} 0\nv 0 0 {0}\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
 ROBOT = """
@@ -89,3 +89,34 @@ def test_the_alpha_takes_no_models(robot: Path) -> None:
             client.scene.upload_model(robot)
         with pytest.raises(ImportFailed):
             client.scene.apply_scene("lab", [URLabAsset("crab", str(robot))])
+
+
+def test_a_model_goes_over_zmq_and_its_import_takes_its_time(robot: Path, memory: Path) -> None:
+    """Beta statements 81, 82 and 85."""
+    faults = Faults()
+    slow = faults.add(Delay(op="upload_model_commit", seconds=0.5))
+    with (
+        SimulatedServer("arm", play=True, dialect="beta", shm_dir=memory, faults=faults) as server,
+        URLabClient(**server.client_options(), transport="shm", step_mode="direct", rcv_timeout_ms=250) as client,
+    ):
+        client.discover()
+        client.step()
+        client.step()
+        before = client.transport_stats.over_shm
+        assert before > 0
+        assert client.scene.upload_model(robot).class_path
+        assert client.transport_stats.over_shm == before
+        assert slow.seen == 1
+
+
+def test_a_chunk_whose_reply_was_lost_is_not_sent_again(robot: Path) -> None:
+    """Beta statement 81."""
+    with (
+        SimulatedServer(dialect="beta", faults=Faults(Drop(op="upload_model_chunk"))) as server,
+        URLabClient(**server.client_options()) as client,
+    ):
+        client.discover()
+        sent = client.transport_stats.sent
+        with pytest.raises(URLabTimeoutError, match="upload_model_chunk"):
+            client.scene.upload_model(robot, timeout=0.5)
+        assert client.transport_stats.sent == sent + 2, "the manifest and one chunk"

@@ -2,8 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
 import zmq
 from beta_bench import Bench
+from raw_shm import RawRegion
+from waiting import eventually
+from wire import Wire
+
+from urlab_client.server import SimulatedServer
 
 
 def test_pictures_in_steps(playing: Bench) -> None:
@@ -48,3 +59,94 @@ def test_the_camera_switch(playing: Bench) -> None:
     assert topic == b"arm_a/cam "
     assert (payload[:4], len(payload)) == (b"UCM1", 64 * 48 * 4 + 40)
     assert int.from_bytes(payload[8:16], "little") == number
+
+
+@contextmanager
+def pictures(endpoint: str, topic: bytes) -> Iterator[zmq.Socket[bytes]]:
+    with zmq.Context() as context, context.socket(zmq.SUB) as socket:
+        socket.linger = 0
+        socket.rcvtimeo = 20_000
+        socket.subscribe(topic)
+        socket.connect(endpoint)
+        yield socket
+
+
+def number_of(message: list[bytes]) -> int:
+    return int.from_bytes(message[1][8:16], "little")
+
+
+def regions(bench: Bench) -> set[str]:
+    assert bench.server.shm_dir is not None
+    return {path.name for path in bench.server.shm_dir.glob("cam_*.shm")}
+
+
+def test_a_picture_of_a_later_snapshot(playing: Bench) -> None:
+    """Generation 2 statement 27."""
+    last = playing.step()["frame_id"]
+    for _ in range(3):
+        reply = playing.step(include_cameras={"arm_a/cam": {"frame_id": last}})
+        assert reply["cameras"]["arm_a/cam"]["frame_id"] >= last
+        last = reply["frame_id"]
+
+
+def test_cameras_are_off_until_they_are_switched_on(playing: Bench) -> None:
+    """Generation 2 statements 34 and 44."""
+    (told, _) = playing.wire.hello()["articulations"]
+    assert regions(playing) == set()
+    with pictures(told["camera_topics"]["arm_a/cam"]["zmq_endpoint"].replace("0.0.0.0", "127.0.0.1"), b"") as socket:
+        for _ in range(3):
+            playing.step(include_cameras=True, render="sync")
+        before = playing.step()["frame_id"]
+        playing.wire.ask("set_camera_streaming", cameras={"arm_a/cam": True})
+        assert number_of(socket.recv_multipart()) >= before, "nothing came before it was switched on"
+    eventually(lambda: regions(playing) == {"cam_arm_a_cam.shm"})
+    playing.play()
+    assert regions(playing) == set()
+
+
+def test_a_region_has_room_for_the_header(playing: Bench) -> None:
+    """Generation 2 statements 37, 41 and 42."""
+    both: dict[str, Any] = {"cameras": {"arm_a/cam": {"zmq": True, "shm": True}}}
+    told = playing.wire.ask("set_camera_streaming", **both)["cameras"]["arm_a/cam"]
+    assert playing.server.shm_dir is not None
+    region = RawRegion(playing.server.shm_dir / "cam_arm_a_cam.shm")
+    try:
+        assert region.header[2] == 64 * 48 * 4 + 44
+        eventually(lambda: region.sequence > 0)
+        assert len(region.read()[1]) == 64 * 48 * 4 + 40
+        before = region.sequence
+        assert playing.wire.ask("set_camera_streaming", **both)["cameras"]["arm_a/cam"] == told
+        assert region.sequence >= before
+    finally:
+        region.close()
+    with pictures(told["zmq_endpoint"], b"arm_a/cam ") as socket:
+        playing.wire.ask("set_camera_streaming", cameras={"arm_a/cam": {"zmq": True}})
+        assert regions(playing) == set()
+        reply = playing.step()
+        message = next(m for m in iter(socket.recv_multipart, None) if number_of(m) >= reply["frame_id"])
+        assert np.frombuffer(message[1], "<f8", count=1, offset=16)[0] == reply["time"]
+
+
+WIDE = """
+<mujoco model="wide"><worldbody><light pos="0 0 3"/>
+  <body><joint/><geom size=".01"/><camera name="cam" pos="0 0 0" xyaxes="1 0 0 0 0 1" fovy="45"/></body>
+  <body pos="0 10 {height}"><joint/><geom size=".05" rgba="1 1 1 1"/></body>
+</worldbody></mujoco>"""
+
+
+def test_the_field_of_view_is_the_vertical_one(tmp_path: Path) -> None:
+    """Generation 2 statement 43."""
+    seen = []
+    for degrees in (22.0, 23.0):
+        path = tmp_path / f"wide_{degrees:g}.xml"
+        path.write_text(WIDE.format(height=10 * np.tan(np.radians(degrees))))
+        with (
+            SimulatedServer(path, play=True, dialect="beta", camera_size=(640, 480)) as server,
+            Wire(server) as wire,
+        ):
+            wire.hello()
+            (frame,) = wire.ask("step", include_cameras=True, render="sync")["cameras"].values()
+            pixels = np.frombuffer(frame["data"], np.uint8).reshape(480, 640, 4)[:, :, :3]
+            background = np.median(pixels.reshape(-1, 3), axis=0)
+            seen.append(bool((np.abs(pixels - background).max(axis=2) > 20).any()))
+    assert seen == [True, False]

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import re
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import pytest
 from beta_bench import ME, OTHER, Bench, Clock
+from wire import Wire
 
 from urlab_client.server.lease import DriverLease
 
@@ -152,3 +155,27 @@ def test_a_lease_ends_in_silence(playing: Bench) -> None:
     playing.wire.hello()
     playing.wire.ask("pie_status")
     playing.wire.ask("acquire_lease", ttl_s=0)
+
+
+def test_a_storm_of_claims(playing: Bench) -> None:
+    """Of fifty clients at once one gets the robot, the others are told whose it is, and the server goes on."""
+
+    def claim(number: int) -> dict[str, Any]:
+        with Wire(playing.server) as wire:
+            fields = {"articulation": "arm_a", "control_owner": f"client-{number}"}
+            return wire.raw({"op": "claim_control", "session_id": playing.wire.session_id, **fields})
+
+    with ThreadPoolExecutor(50) as pool:
+        replies = list(pool.map(claim, range(50)))
+    granted = [reply for reply in replies if reply["op"] == "claim_control_ok"]
+    refused = [reply for reply in replies if reply["op"] == "error"]
+    assert (len(granted), len(refused)) == (1, 49)
+    assert {(reply["code"], reply["owner"]) for reply in refused} == {("control_claimed", granted[0]["owner"])}
+    playing.step(**playing.drive(owner=granted[0]["owner"]))
+
+
+def test_a_claim_of_a_robot_that_is_not_there(playing: Bench) -> None:
+    assert playing.refused("claim_control", articulation="nobody")[0] == "unknown_articulation"
+    assert playing.refused("claim_control", articulation="")[0] == "missing_field"
+    assert playing.refused("claim_control", articulation=7)[0] in {"missing_field", "unknown_articulation"}
+    assert playing.refused("step", **playing.drive()) == ("not_control_owner", "(unclaimed)")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 import zmq
 from beta_bench import ME, Bench
 from test_meta import DATA, by_name, mismatches
+from wire import Wire
 
 from urlab_client.server import SimulatedServer
 
@@ -253,3 +255,27 @@ def test_numbers_of_a_new_play_session_begin_anew(bench: Bench) -> None:
         if mode != "live":
             assert numbers == [1, 2, 3, 4, 5]
         next(reply for reply in bench.wire.until("step", qpos=pose) if reply["frame_id"] >= 6)
+
+
+MESHED = """
+<mujoco model="crab"><asset><mesh name="claw" file="claw.obj"/></asset>
+  <worldbody><body><joint name="hip"/><geom type="mesh" mesh="claw"/></body></worldbody>
+  <actuator><motor joint="hip"/></actuator></mujoco>
+"""
+
+
+def test_a_scene_can_be_built_from_what_comes_with_it(tmp_path: Path) -> None:
+    """Beta statement 86."""
+    (tmp_path / "claw.obj").write_text("v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n")
+    (tmp_path / "crab.xml").write_text(MESHED)
+    crab = tmp_path / "crab.xml"
+    with SimulatedServer(crab, "arm", crab, play=True, dialect="beta") as server, Wire(server) as wire:
+        reply = wire.hello(include_assets=True)
+    scene, assets = reply["mjcf_compiled"], reply["vfs_assets"]
+    texts = [scene, *(content.decode() for name, content in assets.items() if name.endswith(".xml"))]
+    files = {file for text in texts for file in re.findall(r'file="([^"]+)"', text)}
+    assert files
+    assert files <= assets.keys()
+    built = mujoco.MjModel.from_xml_string(scene, assets)
+    sent = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": reply["mjb"]})
+    assert (built.nq, built.nv, built.nu) == (sent.nq, sent.nv, sent.nu)

@@ -168,6 +168,7 @@ def test_a_handshake_whose_model_cannot_fit_opens_no_session(server: SimulatedSe
 def test_a_reply_that_turns_out_too_large_says_so_and_whether_it_was_executed(
     base: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Generation 2 statement 17."""
     monkeypatch.setattr("urlab_client.server.open_server.MAX_REPLY_BYTES", 200)
     with (
         SimulatedServer("ball", play=True, shm_dir=base) as server,

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from raw_shm import RawShm
 from wire import Wire
 
 from urlab_client.server import SimulatedServer
@@ -203,3 +204,16 @@ def test_the_cache_gives_way(tmp_path: Path) -> None:
             wire.refused("upload_model_commit", upload_id=upload)  # the mesh is missing, the upload is closed
         assert sum(file.stat().st_size for file in (tmp_path / "Uploads" / "cache").iterdir()) <= 2 * len(XML) + 1
         assert wire.ask("upload_model_manifest", **manifest(XML))["need_xml"] is True
+
+
+def test_a_large_chunk_goes_over_zmq_alone(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Beta statement 63."""
+    data = bytes(2 * 2**20)
+    base = tmp_path_factory.getbasetemp()
+    with SimulatedServer(dialect="beta", saved_dir=tmp_path, shm_dir=base) as server, Wire(server) as wire:
+        wire.hello()
+        assert server.shm_dir is not None
+        with RawShm(server.shm_dir, bell=True) as shm:
+            assert shm.requests.header[2] < len(data), "it does not fit into a slot"
+        upload = wire.ask("upload_model_manifest", **manifest(zeros_bin=data))["upload_id"]
+        assert wire.ask("upload_model_chunk", **chunk(upload, data, "zeros.bin"))["complete"]
