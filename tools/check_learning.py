@@ -65,6 +65,23 @@ def sb3_ppo() -> str:
     return "256 steps"
 
 
+def sb3_batch() -> str:
+    """PPO on a batch of 16 through `Sb3VecEnv`: it learns for a moment, and its ends carry the last observation."""
+    sb3: Any = import_module("urlab_client.integrations.gym.sb3")
+    ppo: Any = import_module("stable_baselines3").PPO
+    modes: Any = import_module("gymnasium.vector").AutoresetMode
+    batch = gymnasium.make_vec("urlab/Reach-v0", num_envs=16, backend="batch", autoreset_mode=modes.SAME_STEP)
+    monitor: Any = import_module("stable_baselines3.common.vec_env").VecMonitor
+    envs = monitor(sb3.Sb3VecEnv(batch))
+    model = ppo("MlpPolicy", envs, n_steps=110, batch_size=440, n_epochs=2, seed=1, device="cpu")
+    model.learn(16 * 110)
+    lengths = {int(episode["l"]) for episode in model.ep_info_buffer}
+    model.get_env().close()
+    if lengths != {100}:
+        raise AssertionError(f"episodes of {lengths} actions")
+    return f"{model.num_timesteps} steps, {len(model.ep_info_buffer)} episodes of 100 actions"
+
+
 def gym_async() -> str:
     """`AsyncVectorEnv` runs two environments in processes of its own, and each equals a single one."""
     envs = gymnasium.make_vec(ARM, num_envs=2, vectorization_mode="async")
@@ -183,6 +200,7 @@ np.savez(
 CHECKS: dict[str, tuple[str, Callable[[], str]]] = {
     "sb3-check-env": ("stable-baselines3", sb3_check_env),
     "sb3-ppo": ("stable-baselines3", sb3_ppo),
+    "sb3-batch": ("stable-baselines3", sb3_batch),
     "gym-async": ("gymnasium", gym_async),
     "rllib": ("ray", rllib),
 }

@@ -14,7 +14,9 @@ from urlab_client.server import SimulatedServer
 TARGET = Path(__file__).resolve().parent.parent / "docs" / "images" / "trot.webp"
 SIZE = (640, 320)
 FRAMES_PER_S = 20
-START_S, LENGTH_S = 1.0, 3.0
+START_X_M = -0.6
+"""So that it passes the middle, around which shadows are drawn."""
+START_S, LENGTH_S = 1.0, 2.0
 """From full stride on, and whole strides, so that the legs go on where the animation starts again."""
 
 
@@ -25,7 +27,7 @@ def main() -> int:
         URLabClient(**server.client_options(), step_mode="direct") as client,
     ):
         client.discover()
-        client.reset("home")
+        client.reset("home", per_articulation_qpos={"quadruped": {"root": START_X_M}})
         robot = client.articulations["quadruped"]
         trot = TrotController(robot)
         end = START_S + LENGTH_S
@@ -36,17 +38,20 @@ def main() -> int:
                 client.step()
             if client.sim_time < end - 1e-9:
                 x, y, _ = robot.root_pos_w
-                client.viewport.set_camera((x + 1.15, y - 1.05, 0.72), rotation_euler=(0.0, -17.0, -137.5), fov=48.0)
+                client.viewport.set_camera((x + 1.15, y - 1.05, 0.72), rotation_euler=(0.0, -19.0, -137.5), fov=46.0)
                 pictures.append(Image.fromarray(server.snapshot(SIZE)).convert("RGB"))
+    unfinished = TARGET.with_name(f".{TARGET.name}")
     pictures[0].save(
-        TARGET,
+        unfinished,
+        format="webp",
         save_all=True,
         append_images=pictures[1:],
         duration=round(1000 / FRAMES_PER_S),
         loop=0,
         quality=60,
-        method=6,
+        method=4,
     )
+    unfinished.replace(TARGET)
     print(f"{TARGET}: {len(pictures)} pictures, {TARGET.stat().st_size / 1024:.0f} KiB")
     return 0
 

@@ -138,7 +138,7 @@ class URLabEntity:
         return Pose(position=(x, y, z), quaternion=(qw, qx, qy, qz))
 
     def describe(self) -> EntityDescription | ArticulationDescription:
-        """Return what it is and where it is, as of the last reply, in a form that becomes JSON as it is."""
+        """Return name, kind and pose, as of the last reply, in a form that encodes directly to JSON."""
         return EntityDescription(name=self.name, free_base=self.has_free_base, pose=self._place())
 
     def _pose(self) -> tuple[Floats, Floats]:
@@ -345,7 +345,7 @@ class URLabArticulation(URLabEntity):
         """Set some set-points by actuator name; the others keep their last value.
 
         Args:
-            values: Actuator name to set-point.
+            values: Actuator name to set-point; of an actuator with several inputs, the first.
             out_of_range: What becomes of a value outside its actuator's range; see `Actuator.set_control`.
 
         Raises:
@@ -355,7 +355,7 @@ class URLabArticulation(URLabEntity):
         """
         rule = OutOfRange(out_of_range)
         found = [(self.actuators[name], value) for name, value in values.items()]
-        checked = [(actuator.ctrl_local, actuator.checked(value, rule)) for actuator, value in found]
+        checked = [actuator.checked(value, rule) for actuator, value in found]
         if checked:
             self._record.drive()
         for where, value in checked:
@@ -375,9 +375,9 @@ class URLabArticulation(URLabEntity):
         return {name: np.asarray(reading) for name, reading in self._record.sensors.items()}
 
     def describe(self) -> ArticulationDescription:
-        """Return what it is made of, where it is and what it is told, as of the last reply.
+        """Return its parts, its state and its set-points, as of the last reply.
 
-        `msgspec.json.encode` and `msgspec.to_builtins` take the result as it is.
+        `msgspec.json.encode` and `msgspec.to_builtins` accept the result directly.
         """
         controller = self._record.controller
         with self._record.mirror.lock:
@@ -439,9 +439,9 @@ class URLabArticulation(URLabEntity):
     async def move_to(self, targets: Mapping[str, float], *, tolerance: float = 0.01, timeout: float = 10.0) -> float:
         """Move joints to positions with their position servos, and return when they have settled there.
 
-        Sets the set-points at once, without a path between, and steps in `direct` and `puppet`, watches in `live`. A
-        joint has settled when it is within the tolerance and so slow that it would stay there for 0.1 s. Other
-        set-points stay as they are, and these stay afterwards.
+        Sets the set-points at once, without an intermediate path, and then steps in `direct` and `puppet` or watches
+        in `live`. A joint has settled when it is within the tolerance and so slow that it would stay there for 0.1 s.
+        Other set-points do not change, and the new ones stay in force afterwards.
 
         Args:
             targets: Joint name to position, radians or metres.
@@ -452,17 +452,17 @@ class URLabArticulation(URLabEntity):
             Seconds of simulation time that it took.
 
         Raises:
-            NotSettled: Time is up; `.remaining` says how far each joint still has to go, the message what
-                `explain()` found. A servo that gravity pulls down may need a larger tolerance.
+            NotSettled: Time is up; `.remaining` has the distance that each joint still has to go, and the message
+                contains what `explain()` found. A servo that works against gravity may need a larger tolerance.
             KeyError: The articulation has no such joint; nothing was set.
             ValueError: A target is outside the range of its joint or actuator, or not finite, or nothing holds the
                 joint at a position; nothing was set.
-            URLabTimeoutError: Simulation time does not pass, as while paused in live mode.
+            URLabTimeoutError: Simulation time does not pass, for example while paused in live mode.
         """
         return await self._motion.move_to(self, targets, tolerance, timeout)
 
     async def claim(self, *, force: bool = False, ttl: float = CLAIM_S, timeout: Timeout = DEFAULT) -> None:
-        """Become the one client that controls the articulation, before the first write does it by itself.
+        """Become the only client that controls the articulation, before the first write does so automatically.
 
         A claim is renewed for as long as the client lives, and given up by `release()` and by closing the client. On a
         server whose robots have no owner this does nothing.
@@ -473,7 +473,7 @@ class URLabArticulation(URLabEntity):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            ControlClaimed: Another client controls it; `.owner` says which.
+            ControlClaimed: Another client controls it; `.owner` names it.
             ValueError: `ttl` is negative or not a number.
         """
         await self._session.control.claim(self.prefix, force=force, ttl=ttl, timeout=timeout)
@@ -490,9 +490,9 @@ class URLabArticulation(URLabEntity):
 
     @property
     def control_owner(self) -> str | None:
-        """Who controls it, as far as this client knows: `HOST/PROCESS/…` for this process, else the other's name.
+        """The client that controls it, as far as is known: `HOST/PROCESS/…` for this process, else the other's name.
 
-        None when nobody does, when it is not known, and on servers whose robots have no owner.
+        None if no client controls it, if it is not known, and on servers whose robots have no owner.
         """
         return self._session.control.owner_of(self.prefix)
 

@@ -63,14 +63,15 @@ _REVERT_S = 1.0
 class URLabClient(ClientState):
     """A session with one server.
 
-    Nothing is sent and nothing is started before the first call. Concurrent calls go one at a time.
+    The client sends and starts nothing before the first call. Concurrent calls run one at a time.
 
     Args:
         address: `tcp://host` or `ipc://path`, to which the ports are appended; `tcp://host:port` names the RPC port
-            itself. `sim://MODEL` starts a simulated server of its own in a child process and stops it on close.
+            itself. `sim://MODEL` starts a simulated server in a child process and stops it on close.
         step_mode: `auto`, `direct`, `puppet` or `live`.
         step_port: RPC port.
-        state_port: State stream, used in live mode. A server that tells another port than the default is followed.
+        state_port: State stream, used in live mode. The client uses another port instead of the default if the server
+            announces one.
         ctrl_port: Streaming control.
         info_port: Actuator and camera descriptions.
         mujoco_version_check: Raise `URLabVersionMismatch` when server and client MuJoCo builds differ; False warns and
@@ -267,22 +268,22 @@ class URLabClient(ClientState):
         observations: str | ObservationLevel | SessionLevel = SESSION_LEVEL,
         timeout: Timeout = DEFAULT,
     ) -> StepOk:
-        """Advance physics as the step mode says, and take over the state.
+        """Advance physics according to the step mode, and update the state.
 
         In `direct` the server steps `n_steps` times with the set-points in each articulation's `ctrl_array`. In
-        `puppet` the local model steps `n_steps` times (0: not at all) and the result is pushed. In `live` set-points
-        are handed over and the present state is read; physics runs by itself.
+        `puppet` the local model steps `n_steps` times (0: not at all) and the result is pushed. In `live` the client
+        sends the set-points and reads the current state; physics runs continuously.
 
         Args:
             n_steps: Physics steps, at least 1; at least 0 in `puppet`. Not used in `live`.
             include_cameras: True for the newest frame of every camera, or camera name to `sync` (rendered after the
-                step) or `latest`. A `sync` picture that came out older than the step is left out of the reply, as one
-                that did not come. Ignored in live mode by servers that draw in the other modes only.
+                step) or `latest`. A `sync` picture that is older than the step is omitted from the reply, like one
+                that did not arrive. Ignored in live mode by servers that draw in the other modes only.
             observations: Level of this reply alone; default the level of the session.
             timeout: Seconds to wait; None waits without limit.
 
         Returns:
-            The state; the same has been taken over into articulations, entities, cameras and `data`.
+            The state, which articulations, entities, cameras and `data` have already adopted.
 
         Raises:
             StepTimeout: The server did not finish within its 5 s; the steps are still queued there.
@@ -331,10 +332,10 @@ class URLabClient(ClientState):
             return await take_reset(self._state, turn, keyframe_name, seed, per_articulation_qpos or {})
 
     async def resync(self, *, timeout: Timeout = DEFAULT) -> Resync:
-        """Find out what became of steps, resets and mode changes whose replies were lost, and go on from there.
+        """Find out what happened to steps, resets and mode changes whose replies were lost, and continue from there.
 
-        To be called after `OutcomeUnknown`, after `URLabTimeoutError` of a step, or after a step was cancelled. Asks
-        the server for its step counter and time without stepping it, takes over the state, and opens a new session
+        Call it after `OutcomeUnknown`, after `URLabTimeoutError` of a step, or after a step was cancelled. Asks
+        the server for its step counter and time without stepping it, updates the state, and opens a new session
         when the old one is gone, or when a lost request may still be on its way: it is then refused when it arrives.
         No step and no reset is sent a second time; whether to repeat them is the caller's decision.
 
@@ -342,7 +343,7 @@ class URLabClient(ClientState):
             timeout: Seconds to wait; None waits without limit.
 
         Returns:
-            What was found; with nothing in doubt, just where the simulation stands.
+            What was found; if nothing was in doubt, only the state of the simulation.
 
         Raises:
             URLabConnectionError: The server is not back yet. What is in doubt stays so for the next attempt.
@@ -359,25 +360,26 @@ class URLabClient(ClientState):
             Simulation time that passed, seconds.
 
         Raises:
-            URLabTimeoutError: In live mode, simulation time stands still, as while paused; the message says why.
+            URLabTimeoutError: In live mode, simulation time stands still, for example while paused; the message says
+                why.
             ValueError: Negative, NaN or infinite; nothing was sent.
         """
         return await self._motion.run_for(seconds)
 
     async def wait_until(self, predicate: Callable[[], object], *, timeout: float = 10.0) -> float:
-        """Let simulation time pass, as `run_for` does, until something is so.
+        """Let simulation time pass, as `run_for` does, until a condition is true.
 
         Args:
-            predicate: Says whether it is. Called before the first step, and then each 10 ms of simulation time at the
-                latest, in live mode with each snapshot; it reads the client's state and must return at once.
+            predicate: The condition. Called before the first step, and then at least every 10 ms of simulation time,
+                in live mode with each snapshot; it reads the client's state and must return at once.
             timeout: Seconds of simulation time after which to give up.
 
         Returns:
             Simulation time that passed, seconds.
 
         Raises:
-            URLabTimeoutError: It was not so within that time, or simulation time stands still; the message says what
-                `explain()` found.
+            URLabTimeoutError: The condition was not true within that time, or simulation time stands still; the message
+                contains what `explain()` found.
             TypeError: The predicate returns an awaitable.
         """
         return await self._motion.wait_until(predicate, timeout)
@@ -393,9 +395,9 @@ class URLabClient(ClientState):
         """Stream the snapshots that the server publishes while play runs.
 
         One per physics tick in live mode, paused or not; one per step, else ten per second, in `direct`; ten per
-        second in `puppet`. Works beside everything else the client does, and costs the server nothing. A server that
-        publishes in live mode only, as the beta, is helped out in the other modes: there a snapshot comes with each of
-        this client's own steps.
+        second in `puppet`. Works alongside all other calls, and costs the server nothing. If a server publishes only
+        in live mode, as the beta does, the stream has one snapshot for each of this client's own steps in the other
+        modes.
 
         Args:
             policy: `latest`, or `all` within the buffer.
@@ -429,9 +431,9 @@ class URLabClient(ClientState):
     ) -> Stream[RowSample]:
         """Stream the small rows that the server publishes in live mode: one joint, sensor or free base each.
 
-        Where a server publishes whole snapshots alone, as the beta, rows are made of those: in live mode of what it
-        publishes, in the other modes of the replies to this client's own steps, with the readings of their level.
-        Accelerations are NaN then.
+        If a server publishes only whole snapshots, as the beta does, the client makes rows from those: in live mode
+        from what the server publishes, in the other modes from the replies to its own steps, with the readings of
+        their level. Accelerations are then NaN.
 
         Args:
             articulation: Key of the articulation; None for all there are, and the plain entities.
@@ -493,7 +495,7 @@ class URLabClient(ClientState):
     async def explain(self) -> Diagnosis:
         """Find out why a robot does not move: sockets, versions, play, pause, modes, controllers, set-points.
 
-        Takes a few seconds at most, raises nothing about what it finds, and changes nothing on the server.
+        Takes at most a few seconds, does not raise for problems that it finds, and changes nothing on the server.
         """
         return await diagnose(self._config, self._session, self._state)
 

@@ -305,19 +305,19 @@ class _StreamHandler(MessageHandler, Generic[T]):
 
 
 class Stream(Generic[T]):
-    """Items the server publishes, as they come.
+    """Items that the server publishes, as they arrive.
 
-    It opens with the first use or on entering a `with` block, and reconnects by itself. Iteration ends when the
-    stream is closed here; when the client is closed, it raises `ClientClosed` after the items that had arrived.
+    It opens with the first use or on entering a `with` block, and reconnects automatically. Iteration ends when the
+    stream is closed; when the client is closed, it raises `ClientClosed` after the items that had arrived.
 
-    What waits for a busy reader is decided by the policy. `latest` keeps the newest item. `latest_per_key` keeps the
+    The policy decides which items wait for a busy reader. `latest` keeps the newest item. `latest_per_key` keeps the
     newest of each topic. `all` keeps everything up to a limit; beyond it the oldest items are lost and the next read
-    raises `StreamOverflow` once. The stream goes on after that, as after `URLabTimeoutError`.
+    raises `StreamOverflow` once. The stream continues after that, as after `URLabTimeoutError`.
 
-    Each item carries `seq`, `dropped` and `gap`, so that a reader sees what it missed. What is lost before it reaches
-    this process, in the queues of the server or the network, cannot be seen: the wire has no numbers.
+    Each item carries `seq`, `dropped` and `gap`, so that a reader sees what it missed. Losses before an item
+    reaches this process, in the queues of the server or the network, are invisible: the wire has no numbers.
 
-    One reader at a time; `latest`, `stats` and `closed` are for everybody. An item that nobody reads is not decoded.
+    One reader at a time; anyone may read `latest`, `stats` and `closed`. An item that nobody reads is not decoded.
 
     Example:
         async with client.state_stream() as states:

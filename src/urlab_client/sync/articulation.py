@@ -108,7 +108,7 @@ class URLabEntity(Facade, twin=aio.URLabEntity):
         self._aio.apply_xfrc(force=force, torque=torque)
 
     def describe(self) -> EntityDescription | ArticulationDescription:
-        """Return what it is and where it is, as of the last reply, in a form that becomes JSON as it is."""
+        """Return name, kind and pose, as of the last reply, in a form that encodes directly to JSON."""
         return self._aio.describe()
 
 
@@ -255,7 +255,7 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
         """Set some set-points by actuator name; the others keep their last value.
 
         Args:
-            values: Actuator name to set-point.
+            values: Actuator name to set-point; of an actuator with several inputs, the first.
             out_of_range: What becomes of a value outside its actuator's range; see `Actuator.set_control`.
 
         Raises:
@@ -278,9 +278,9 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
         return self._aio.get_sensors()
 
     def describe(self) -> ArticulationDescription:
-        """Return what it is made of, where it is and what it is told, as of the last reply.
+        """Return its parts, its state and its set-points, as of the last reply.
 
-        `msgspec.json.encode` and `msgspec.to_builtins` take the result as it is.
+        `msgspec.json.encode` and `msgspec.to_builtins` accept the result directly.
         """
         return self._aio.describe()
 
@@ -315,9 +315,9 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
     def move_to(self, targets: Mapping[str, float], *, tolerance: float = 0.01, timeout: float = 10.0) -> float:
         """Move joints to positions with their position servos, and return when they have settled there.
 
-        Sets the set-points at once, without a path between, and steps in `direct` and `puppet`, watches in `live`. A
-        joint has settled when it is within the tolerance and so slow that it would stay there for 0.1 s. Other
-        set-points stay as they are, and these stay afterwards.
+        Sets the set-points at once, without an intermediate path, and then steps in `direct` and `puppet` or watches
+        in `live`. A joint has settled when it is within the tolerance and so slow that it would stay there for 0.1 s.
+        Other set-points do not change, and the new ones stay in force afterwards.
 
         Args:
             targets: Joint name to position, radians or metres.
@@ -328,17 +328,17 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
             Seconds of simulation time that it took.
 
         Raises:
-            NotSettled: Time is up; `.remaining` says how far each joint still has to go, the message what
-                `explain()` found. A servo that gravity pulls down may need a larger tolerance.
+            NotSettled: Time is up; `.remaining` has the distance that each joint still has to go, and the message
+                contains what `explain()` found. A servo that works against gravity may need a larger tolerance.
             KeyError: The articulation has no such joint; nothing was set.
             ValueError: A target is outside the range of its joint or actuator, or not finite, or nothing holds the
                 joint at a position; nothing was set.
-            URLabTimeoutError: Simulation time does not pass, as while paused in live mode.
+            URLabTimeoutError: Simulation time does not pass, for example while paused in live mode.
         """
         return self._portal.call(self._aio.move_to, targets, tolerance=tolerance, timeout=timeout)
 
     def claim(self, *, force: bool = False, ttl: float = CLAIM_S, timeout: Timeout = DEFAULT) -> None:
-        """Become the one client that controls the articulation, before the first write does it by itself.
+        """Become the only client that controls the articulation, before the first write does so automatically.
 
         A claim is renewed for as long as the client lives, and given up by `release()` and by closing the client. On a
         server whose robots have no owner this does nothing.
@@ -349,7 +349,7 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
-            ControlClaimed: Another client controls it; `.owner` says which.
+            ControlClaimed: Another client controls it; `.owner` names it.
             ValueError: `ttl` is negative or not a number.
         """
         self._portal.call(self._aio.claim, force=force, ttl=ttl, timeout=timeout)
@@ -364,8 +364,8 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
 
     @property
     def control_owner(self) -> str | None:
-        """Who controls it, as far as this client knows: `HOST/PROCESS/…` for this process, else the other's name.
+        """The client that controls it, as far as is known: `HOST/PROCESS/…` for this process, else the other's name.
 
-        None when nobody does, when it is not known, and on servers whose robots have no owner.
+        None if no client controls it, if it is not known, and on servers whose robots have no owner.
         """
         return self._aio.control_owner

@@ -177,19 +177,19 @@ class RuntimeNamespace(RuntimeOps):
     async def set_camera_streaming(
         self, cameras: Mapping[str, bool | CameraTransports], *, timeout: Timeout = DEFAULT
     ) -> dict[str, CameraStreaming]:
-        """Switch the streams of cameras on or off, for all clients alike, until play ends.
+        """Switch the streams of cameras on or off, for all clients, until play ends.
 
-        Iterating over `frames()` does so by itself, for as long as somebody iterates. What is set here goes before
-        that: a camera switched on here stays on when its streams end and when the client is closed. One switched off
-        here brings its open streams nothing more, until another stream of it is opened.
+        Iterating over `frames()` does so automatically, for as long as somebody iterates. This setting takes
+        precedence: a camera switched on here stays on when its streams end and when the client is closed. A camera
+        switched off here sends nothing more to its open streams, until another stream of it is opened.
 
         Args:
             cameras: Camera, by its name or as `<articulation>/<camera>`, to on or off, or to the transports it is to
-                use. Of those, what is not mentioned is switched off, unless nothing is mentioned.
+                use. Transports that are not mentioned are switched off, unless none is mentioned.
             timeout: Seconds to wait; None waits without limit.
 
         Returns:
-            Where the cameras stream now, by the names given; without those that the server does not have any more.
+            Where the cameras stream now, by the given names, without cameras that the server no longer has.
 
         Raises:
             KeyError: Unknown camera, or one that several articulations have; nothing was sent.
@@ -207,9 +207,9 @@ class RuntimeNamespace(RuntimeOps):
     async def set_camera_delay(
         self, cameras: Mapping[str, float | CameraDelay], *, timeout: Timeout = DEFAULT
     ) -> dict[str, CameraDelayInForce]:
-        """Let cameras show what they saw some time ago, as slow ones do, for all clients alike, until play ends.
+        """Delay the pictures of cameras, as slow cameras do, for all clients, until play ends.
 
-        Streams and `latest` pictures are late by it; `sync` pictures of a step are not.
+        The delay affects streams and `latest` pictures, but not `sync` pictures of a step.
 
         Args:
             cameras: Camera, by its name or as `<articulation>/<camera>`, to seconds, or to a latency with jitter.

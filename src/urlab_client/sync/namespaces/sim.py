@@ -31,8 +31,8 @@ class SimNamespace(Facade, twin=aio.SimNamespace):
     ) -> PIEStartResult:
         """Start play, wait until the model is compiled, and take over the handshake of the new play world.
 
-        Without `level_path`, a healthy session goes on and play is not restarted. Afterwards the step mode that the
-        client was made with is in force again; in live mode physics starts paused.
+        Without `level_path`, a healthy session continues and play does not restart. Afterwards the client's own step
+        mode is in force again; in live mode physics starts paused.
 
         Args:
             level_path: Level to open first, a full `/Game/` path: `/Game/Levels/lab` or `/Game/Levels/lab.lab`.
@@ -54,7 +54,7 @@ class SimNamespace(Facade, twin=aio.SimNamespace):
         )
 
     def stop(self, *, timeout: Timeout = DEFAULT) -> None:
-        """End play and wait until it has ended; a success without one. The session goes on, authoring works.
+        """End play and wait until it has ended; without play, succeed at once. The session continues.
 
         Args:
             timeout: Seconds to wait for each answer of the server; None waits without limit.

@@ -1,0 +1,137 @@
+"""A vector environment as Stable-Baselines3 takes them. Needs the extra `sb3`."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+
+from urlab_client.integrations._extras import need
+from urlab_client.integrations.gym.spaces import Observation
+from urlab_client.integrations.gym.vectorized import Vectorized
+
+need("stable_baselines3", extra="sb3")
+
+__all__ = ["Sb3VecEnv"]
+
+if TYPE_CHECKING:
+
+    class _VecEnv:
+        """What is used of `VecEnv`."""
+
+        _seeds: list[int | None]
+        reset_infos: list[dict[str, Any]]
+
+        def __init__(self, num_envs: int, observation_space: Any, action_space: Any) -> None: ...
+        def _reset_seeds(self) -> None: ...
+        def _reset_options(self) -> None: ...
+
+else:
+    _VecEnv = importlib.import_module("stable_baselines3.common.vec_env").VecEnv
+
+Indices = None | int | Sequence[int]
+
+
+class Sb3VecEnv(_VecEnv):
+    """A `URLabBatchEnv` or `URLabVectorEnv` for `PPO("MlpPolicy", Sb3VecEnv(env))`.
+
+    What an environment's `info` holds are the entries of `infos` at its index; at an episode's end also
+    `terminal_observation` and `TimeLimit.truncated`. An environment that failed ends its episode as truncated, with its
+    exception as `error`.
+
+    Args:
+        env: The environment, made with `autoreset_mode=AutoresetMode.SAME_STEP`. It closes with this one.
+
+    Raises:
+        ValueError: It has another autoreset mode.
+    """
+
+    def __init__(self, env: Vectorized) -> None:
+        if env.autoreset_mode is not AutoresetMode.SAME_STEP:
+            raise ValueError(
+                f"Stable-Baselines3 resets in the step that ends an episode: make the environment with "
+                f"autoreset_mode=AutoresetMode.SAME_STEP, not {env.autoreset_mode.name}"
+            )
+        self.env = env
+        self._actions: Any = None
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+
+    def reset(self) -> Observation:
+        """Start an episode in all environments, with the seeds of `seed()`."""
+        observations, infos = self.env.reset(seed=list(self._seeds))
+        self._reset_seeds()
+        self._reset_options()
+        self.reset_infos = [_info(infos, i) for i in range(self.env.num_envs)]
+        return observations
+
+    def step_async(self, actions: Any) -> None:
+        """Keep the actions for `step_wait`."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[Observation, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+        """Act; return observations, rewards, ends and an info for each environment."""
+        observations, rewards, terminated, truncated, infos = self.env.step(self._actions)
+        ended = terminated | truncated
+        each: list[dict[str, Any]] = []
+        for i in range(self.env.num_envs):
+            if ended[i]:
+                info = _info(infos["final_info"], i)
+                info["terminal_observation"] = infos["final_obs"][i]
+                info["TimeLimit.truncated"] = bool(truncated[i] and not terminated[i])
+            else:
+                info = _info(infos, i)
+            each.append(info)
+        return observations, rewards.astype(np.float32), ended, each
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.env.close()
+
+    def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
+        """Return each environment's picture, None without a render mode."""
+        pictures = cast("Any", self.env).render()
+        return [None] * self.env.num_envs if pictures is None else list(pictures)
+
+    def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
+        """Return an attribute, which all environments share."""
+        return [getattr(self.env, attr_name) for _ in self._chosen(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
+        """Set an attribute for all environments, which share it.
+
+        Raises:
+            ValueError: Only some are meant.
+        """
+        if len(self._chosen(indices)) != self.env.num_envs:
+            raise ValueError(f"{attr_name} is one for all environments: leave indices out")
+        setattr(self.env, attr_name, value)
+
+    def env_method(self, method_name: str, *args: Any, indices: Indices = None, **kwargs: Any) -> list[Any]:
+        """Refuse: the environments have no methods of their own.
+
+        Raises:
+            NotImplementedError: Always.
+        """
+        raise NotImplementedError(f"{method_name}: call it on .env, which is all environments at once")
+
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: Indices = None) -> list[bool]:
+        """Return False for each: nothing wraps them one by one."""
+        return [False for _ in self._chosen(indices)]
+
+    def _chosen(self, indices: Indices) -> Sequence[int]:
+        if indices is None:
+            return range(self.env.num_envs)
+        return [indices] if isinstance(indices, int) else indices
+
+
+def _info(infos: dict[str, Any], i: int) -> dict[str, Any]:
+    """Return what a vector environment says of one of its environments."""
+    said = {name: values for name, values in infos.items() if not name.startswith("_") and name not in _FINAL}
+    return {name: values[i] for name, values in said.items() if infos[f"_{name}"][i]}
+
+
+_FINAL = {"final_obs", "final_info"}
