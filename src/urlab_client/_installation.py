@@ -12,7 +12,6 @@ import sys
 from importlib.metadata import PackageNotFoundError, distribution, packages_distributions
 from typing import Any
 from urllib.parse import urlsplit
-from urllib.request import url2pathname
 
 __all__ = ["conflict", "install_command"]
 
@@ -51,6 +50,8 @@ def _source(extra: str) -> str:
     if "dir_info" not in recorded:  # PEP 610: installed from a folder
         return shlex.quote(f"{_OWN}[{extra}]")
     url: str = recorded["url"]
+    from urllib.request import url2pathname  # noqa: PLC0415 - brings HTTP and e-mail to every start of a server
+
     folder = url2pathname(urlsplit(url).path)
     editable = "-e " if recorded["dir_info"].get("editable") else ""
     return f"{editable}{shlex.quote(f'{folder}[{extra}]')}"

@@ -173,6 +173,7 @@ async def test_a_refused_step_leaves_no_doubt(client: URLabClient) -> None:
 
 
 async def test_steps_that_the_server_has_queued_stay_open(scripted: Any) -> None:
+    """Beta statement 97."""
     clock = {"time": 0.0, "step": 4.0, "sim_time": {"sec": 0.0, "nsec": 0.0}, "wall_time": {"sec": 0.0, "nsec": 0.0}}
     scripted.on("step", {"op": "error", "code": "step_timeout", "message": ""})
     scripted.on("forward", {"op": "forward_ok", **clock, "step": 0.0, "per_articulation": {}})
@@ -184,7 +185,12 @@ async def test_steps_that_the_server_has_queued_stay_open(scripted: Any) -> None
         with pytest.raises(StepTimeout):
             await client.step(3)
         found = await client.resync()
+        sent = []
+        while not scripted.seen.empty():
+            sent.append(scripted.seen.get_nowait()["op"])
     assert (found.steps_sent, found.steps_applied, found.settled) == (3, 0, False)
+    assert sent.count("step") == 1
+    assert sent.index("step") < sent.index("forward")
 
 
 @pytest.mark.parametrize("lose", [lose_the_reply, lose_the_request])

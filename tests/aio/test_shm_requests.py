@@ -156,6 +156,27 @@ async def test_a_reply_that_turned_out_too_large_is_asked_for_again_only_if_that
     assert plugin.seen == ["read_mocap_pose", "set_paused"]
 
 
+def shm_rpc(directory: Path) -> dict[str, Any]:
+    """What a handshake says of regions in a directory."""
+    names = {f"{end}_path": str(directory / f"{end}.shm") for end in ("req", "rep")}
+    return {"session": "live_p5559_7", **names, "req_stride": 1048576.0, "rep_stride": 1048576.0, "n_buffers": 2.0}
+
+
+async def test_regions_are_where_the_handshake_says(
+    connect: Any, plugin: PluginMemory, scripted: Any, directory: Path, tmp_path: Path
+) -> None:
+    """Generation 2 statement 58."""
+    hello = scripted.answers["hello"]({})
+    scripted.on("hello", hello | {"shm_session_dir": str(tmp_path / "elsewhere"), "shm_rpc": shm_rpc(directory)})
+    client = await shared(connect())
+    await client.step()
+    assert plugin.seen == ["step"]
+    for strange in ("req.shm", "", str(directory / ".." / "req.shm")):
+        scripted.on("hello", hello | {"shm_rpc": shm_rpc(directory) | {"req_path": strange}})
+        with pytest.raises(ProtocolError, match="shm_rpc"):
+            await client.discover()
+
+
 async def test_a_late_reply_is_not_taken_for_the_next_one(connect: Any, plugin: PluginMemory, scripted: Any) -> None:
     client = await shared(connect())
     scripted.on("step", None)

@@ -148,8 +148,13 @@ async def test_forces_of_actuators_with_several_inputs_and_outputs(connect: Any,
         (art,) = client.articulations.values()
         servo, wrist, elbow = art.actuators.values()
         assert [a.ctrl_local for a in (servo, wrist, elbow)] == [slice(0, 2), slice(2, 5), slice(5, 6)]
-        servo.set_control([0.5, 0.0])
-        elbow.set_control(0.25)
+        servo.set_control([0.25, 0.0])
+        servo.set_control(0.5)  # a number is the first input, the others stay
+        assert art.ctrl_array[:2].tolist() == [0.5, 0.0]
+        with pytest.raises(ValueError, match="takes 3 numbers"):
+            wrist.set_control([0.5, 0.0])
+        art.set_ctrl({"elbow": 0.25, "servo": 0.5})
+        assert art.ctrl_array.tolist() == [0.5, 0.0, 0.0, 0.0, 0.0, 0.25]
         reply = await client.step()
         assert reply.per_articulation["mimo"].actuator_force.tolist() == [1.5, 0.0, 0.0, 0.0, 0.25]
         assert [a.force for a in (servo, wrist, elbow)] == [1.5, 0.0, 0.25]

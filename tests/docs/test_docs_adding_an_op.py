@@ -52,7 +52,7 @@ def apply(tree: Path, block: Block) -> None:
 def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a copy of the repository after all edits, with everything generated."""
     copy = tmp_path_factory.mktemp("walkthrough")
-    for folder in ("src", "tools", "docs", "tests/data", "tests/protocol", "tests/server"):
+    for folder in ("src", "tools", "docs", "tests/data", "tests/protocol", "tests/server", "tests/support"):
         shutil.copytree(ROOT / folder, copy / folder, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(ROOT / "pyproject.toml", copy)
     for block in blocks(PAGE):

@@ -18,6 +18,7 @@ import anyio.to_thread
 import numpy as np
 import pytest
 
+from urlab_client import LeaseBusy, URLabClient
 from urlab_client.server import SimulatedServer
 
 pytestmark = pytest.mark.ray
@@ -162,10 +163,11 @@ def test_tasks_give_the_same_episodes_and_are_run_again_by_ray(expected: dict[in
     assert gone(tmp_path / "killed")
 
 
-def test_a_lease_comes_back_from_a_killed_worker(cluster: Any, tmp_path: Path) -> None:
+@pytest.mark.parametrize("dialect", ["alpha", "beta"])
+def test_a_lease_comes_back_from_a_killed_worker(cluster: Any, tmp_path: Path, dialect: Any) -> None:
     from urlab_client.cluster import LeaseLost, LeasePool, rollouts
 
-    with SimulatedServer("arm", play=True) as server:
+    with SimulatedServer("arm", play=True, dialect=dialect) as server:
         address = f"{server.address}:{server.step_port}"
         pool = LeasePool([address], name="arms", ttl=600)  # far longer than this test
         policy = dies_once(tmp_path / "killed")
@@ -179,6 +181,28 @@ def test_a_lease_comes_back_from_a_killed_worker(cluster: Any, tmp_path: Path) -
             assert (lease.address, pool.holders()) == (address, {address: "me"})
             with pytest.raises(LeaseLost, match="No address of 'arms' was free"), pool.lease("you", timeout=0.1):
                 pass
+        pool.close()
+
+
+def test_a_server_in_use_outside_the_pool_is_left_alone(cluster: Any) -> None:
+    from urlab_client.cluster import LeasePool
+
+    with (
+        SimulatedServer("arm", play=True, dialect="beta") as server,
+        URLabClient(**server.client_options()) as outside,
+        URLabClient(**server.client_options()) as client,
+    ):
+        pool = LeasePool([f"{server.address}:{server.step_port}"])
+        outside.discover()
+        theirs = outside.farm.acquire_lease("somebody else")
+        client.discover()
+        with pool.lease("me") as lease:
+            with pytest.raises(LeaseBusy), lease.of_server(client):
+                pass
+            client.farm.release_lease(theirs)
+            with lease.of_server(client), pytest.raises(LeaseBusy):
+                client.farm.acquire_lease("yet another")
+            client.farm.release_lease(client.farm.acquire_lease("free again"))
         pool.close()
 
 

@@ -410,6 +410,7 @@ class TestFiles:
             assert shm.safe_name(name) == name
 
     def test_directories(self) -> None:
+        """Beta statement 98."""
         base = PurePath(Path.cwd().anchor) / "Saved" / "URLabShm"
         session, live = base / "0b1c", base / "live"
         assert shm.region_directories(str(session), shm.STATE_FILE) == (session,)

@@ -345,7 +345,7 @@ class URLabArticulation(URLabEntity):
         """Set some set-points by actuator name; the others keep their last value.
 
         Args:
-            values: Actuator name to set-point.
+            values: Actuator name to set-point; of an actuator with several inputs, the first.
             out_of_range: What becomes of a value outside its actuator's range; see `Actuator.set_control`.
 
         Raises:
@@ -355,7 +355,7 @@ class URLabArticulation(URLabEntity):
         """
         rule = OutOfRange(out_of_range)
         found = [(self.actuators[name], value) for name, value in values.items()]
-        checked = [(actuator.ctrl_local, actuator.checked(value, rule)) for actuator, value in found]
+        checked = [actuator.checked(value, rule) for actuator, value in found]
         if checked:
             self._record.drive()
         for where, value in checked:

@@ -9,12 +9,14 @@ from contextlib import contextmanager, suppress
 from importlib import import_module
 from typing import Any, Final
 
-from urlab_client.protocol.errors import URLabError
+from urlab_client.protocol.errors import LeaseBusy, URLabError
+from urlab_client.sync.client import URLabClient
 
 __all__ = ["Lease", "LeaseLost", "LeasePool"]
 
 _ray: Any = import_module("ray")  # Any: Ray's hints leave every remote call unknown
 _REPLY_S: Final = 10.0
+_SERVER_LEASE_S: Final = 30.0  # without a request
 
 
 class LeaseLost(URLabError):
@@ -28,6 +30,7 @@ class Book:
         self._ttl = ttl
         self._holders: dict[str, tuple[str, float] | None] = dict.fromkeys(addresses)
         self._waiting: set[str] = set()
+        self._server_leases: dict[str, str] = {}
         self._changed = asyncio.Condition()
 
     async def take(self, holder: str, timeout: float) -> str | None:
@@ -71,6 +74,14 @@ class Book:
                     self._holders[address] = None
             self._changed.notify_all()
 
+    async def note_server_lease(self, address: str, lease_id: str) -> None:
+        """Remember the lease that a holder took of the server itself."""
+        self._server_leases[address] = lease_id
+
+    async def server_lease(self, address: str) -> str | None:
+        """Return the latest lease that a holder took of the server itself."""
+        return self._server_leases.get(address)
+
     async def holders(self) -> dict[str, str | None]:
         """Return the holder of each address, None where it is free."""
         self._expire()
@@ -109,6 +120,35 @@ class Lease:
         if not _ask(self._book.renew.remote(self._holder), _REPLY_S):
             raise LeaseLost(f"The lease of {self.address} ran out.", hint="Give the pool a longer ttl.")
         self._renewed = now
+
+    @contextmanager
+    def of_server(self, client: URLabClient) -> Generator[None]:
+        """Hold the server's own lease, where it has one, so that clients outside the pool see that it is in use.
+
+        Every step prolongs it, and it is given back at the end. One that was left by a holder who was killed is taken
+        over, and the robots with it: the pool says that nobody has the address any more.
+
+        Raises:
+            LeaseBusy: Somebody outside the pool uses the server.
+        """
+        if not client.server.features.leases:
+            yield
+            return
+        try:
+            lease_id = client.farm.acquire_lease(self._holder, ttl_s=_SERVER_LEASE_S)
+        except LeaseBusy as busy:
+            if not busy.lease_id or busy.lease_id != _ask(self._book.server_lease.remote(self.address), _REPLY_S):
+                raise
+            client.farm.release_lease(busy.lease_id)
+            lease_id = client.farm.acquire_lease(self._holder, ttl_s=_SERVER_LEASE_S)
+            for articulation in client.articulations.values():
+                articulation.claim(force=True)
+        try:
+            _ask(self._book.note_server_lease.remote(self.address, lease_id), _REPLY_S)
+            yield
+        finally:
+            with suppress(URLabError):  # with the server, or after a long pause, the lease is gone too
+                client.farm.release_lease(lease_id)
 
 
 class LeasePool:

@@ -41,6 +41,7 @@ class Worker:
         """Run one attempt of an episode.
 
         Raises:
+            LeaseBusy: Somebody outside the pool uses the leased server.
             URLabError: The server or the lease failed.
         """
         try:
@@ -48,7 +49,9 @@ class Worker:
                 return self._run(policy, job, None)
             with job.leases.lease(job.holder, timeout=self._lease_timeout) as lease:
                 try:
-                    return self._run(policy, job, lease)
+                    env = self._environment(lease.address)
+                    with lease.of_server(env.client):
+                        return self._run(policy, job, lease)
                 finally:
                     self.close()  # before somebody else gets the address
         except BaseException:

@@ -255,7 +255,7 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
         """Set some set-points by actuator name; the others keep their last value.
 
         Args:
-            values: Actuator name to set-point.
+            values: Actuator name to set-point; of an actuator with several inputs, the first.
             out_of_range: What becomes of a value outside its actuator's range; see `Actuator.set_control`.
 
         Raises:

@@ -110,30 +110,41 @@ class Actuator:
         """Set the set-point that the next step sends.
 
         Args:
-            v: The set-point; for actuators with several inputs a sequence.
+            v: The set-point. For an actuator with several inputs, a number is its first input, which `value` tells, and
+                the others stay; a sequence is all of them.
             out_of_range: What becomes of a value outside the actuator's range: `error` refuses it, `clamp` takes the
                 nearest value inside, `allow` sends it as it is. The range is the control range; while a PD controller
                 is in force it is that of the driven joint. Without a local model no range is known.
 
         Raises:
             TypeError: It is not a number.
-            ValueError: It is NaN, infinite, or, with `error`, out of range; nothing was set.
+            ValueError: It is NaN, infinite, as a sequence not as long as there are inputs, or, with `error`, out of
+                range; nothing was set.
         """
-        value = self.checked(v, OutOfRange(out_of_range))
+        where, value = self.checked(v, OutOfRange(out_of_range))
         self._record.drive()
-        self._record.ctrl[self.ctrl_local] = value
+        self._record.ctrl[where] = value
 
-    def checked(self, v: object, out_of_range: OutOfRange) -> float | Floats:
-        """Return what `set_control` would set; raises as it does."""
+    def checked(self, v: object, out_of_range: OutOfRange) -> tuple[slice, float | Floats]:
+        """Return what `set_control` would set, and where; raises as it does."""
         what = f"actuator {self.name!r} of {self._record.name!r}"
-        value = finite_array(what, v) if is_array(v) else finite(what, v)
+        where = self.ctrl_local
+        value: float | Floats
+        if is_array(v):
+            value = finite_array(what, v)
+            inputs = where.stop - where.start
+            if value.shape != (inputs,):
+                raise ValueError(f"{what} takes {inputs} numbers, got an array of shape {value.shape}. Nothing was set")
+        else:
+            value = finite(what, v)
+            where = slice(where.start, where.start + 1)
         if out_of_range is OutOfRange.ALLOW:
-            return value
-        low, high = (bounds[self.ctrl_local] for bounds in self._record.ranges())
+            return where, value
+        low, high = (bounds[where] for bounds in self._record.ranges())
         inside = np.clip(value, low, high)
         if out_of_range is OutOfRange.ERROR and np.any(inside != value):
             raise ValueError(f"{what} takes {_listed(low)} to {_listed(high)}, got {v}. Nothing was set")
-        return inside
+        return where, inside
 
     def set_point_for(self, position: float) -> float:
         """Return the set-point of a position servo that holds its joint at a position, but for what pulls at it.

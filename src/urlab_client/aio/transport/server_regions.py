@@ -6,13 +6,13 @@ import asyncio
 import logging
 import os
 from collections.abc import Callable
-from pathlib import Path
+from pathlib import Path, PurePath
 
 from urlab_client.aio.transport.poller import Doorbell, Poller
 from urlab_client.protocol import doorbell
 from urlab_client.protocol.errors import ProtocolError, URLabConnectionError
 from urlab_client.protocol.messages.session import HelloOk
-from urlab_client.protocol.shm import REQUEST_FILE, region_directories
+from urlab_client.protocol.shm import REPLY_FILE, REQUEST_FILE, region_directories
 
 __all__ = ["SharedMemoryRegions"]
 
@@ -33,6 +33,7 @@ class SharedMemoryRegions:
     def __init__(self, directory: str | os.PathLike[str] | None) -> None:
         self.directory: Path | None = None
         self.rung: dict[bytes, list[Callable[[], None]]] = {doorbell.STATE: [], doorbell.CAMERA: [], doorbell.REPLY: []}
+        self._told: dict[str, Path] = {}  # regions whose files the server names, whatever those are called
         self._given = None if directory is None else Path(directory).absolute()
         self._waiter: Poller | None = None
         self._bell: Doorbell | None = None
@@ -55,8 +56,12 @@ class SharedMemoryRegions:
 
         Raises:
             URLabConnectionError: The server says that play runs, and not where its regions are.
+            ProtocolError: It names a file that is not an absolute path.
         """
-        before = self.directory
+        before = self.directory, self._told
+        told = hello.shm_rpc
+        paths = {} if told is None else {REQUEST_FILE: told.req_path, REPLY_FILE: told.rep_path}
+        self._told = {file: _checked(path) for file, path in paths.items()}
         if self._given is not None:
             self.directory = self._given
         elif hello.shm_session_dir is not None:
@@ -66,7 +71,7 @@ class SharedMemoryRegions:
                 "discover: transport='shm', but the server names no directory of shared memory.",
                 hint="Start it with shared memory, or use transport='zmq'.",
             )
-        return self.directory != before
+        return (self.directory, self._told) != before
 
     def candidates(self, file: str) -> list[Path]:
         """Return where a region's file may be, best place first.
@@ -78,6 +83,8 @@ class SharedMemoryRegions:
             return []
         if self._given is not None:
             return [self._given / file]
+        if file in self._told:
+            return [self._told[file]]
         return [Path(directory) / file for directory in region_directories(self.directory, file)]
 
     def find(self, file: str) -> Path | None:
@@ -132,3 +139,9 @@ class SharedMemoryRegions:
         # Whoever waited for a ring looks once more and goes on without.
         for kind in self.rung:
             self._act(kind)()
+
+
+def _checked(path: str) -> Path:
+    if not path or "\0" in path or not PurePath(path).is_absolute() or ".." in PurePath(path).parts:
+        raise ProtocolError(f"hello: shm_rpc names the file {path!r}, expected an absolute path.", op="hello")
+    return Path(path)

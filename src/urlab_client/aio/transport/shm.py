@@ -40,6 +40,8 @@ log = logging.getLogger("urlab_client.transport")
 
 # Replies that grow with what happens in the scene, whatever size they had before.
 _UNBOUNDED = frozenset({"hello", "meta", "get_contacts", "list_keyframes", "replay_list_sessions"})
+# Pieces are larger than slots, and one that was executed without an answer may not be sent again.
+_UPLOADS = frozenset({"upload_model_manifest", "upload_model_chunk", "upload_model_commit"})
 # A reply may be so many times larger than the largest one of its kind seen before.
 _GROWTH = 8
 
@@ -190,6 +192,8 @@ class ShmTransport:
             return "upload"  # its chunks and its reply outgrow a slot
         if op.name in _UNBOUNDED:
             return "handshake" if op.needs is Needs.NOTHING else "reply may be too large"
+        if op.name in _UPLOADS:
+            return "upload"
         if op.name == "step" and b"include_cameras" in frame:
             return "pictures"
         return self._refused.get(op.name, "")

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import base64
 import logging
+from pathlib import Path
 
 import msgspec
 import mujoco
@@ -29,9 +30,11 @@ from urlab_client.protocol.messages.session import (
     ReplayProgress,
     Reset,
     ResetOk,
+    ShmRpcInfo,
     Step,
     StepOk,
 )
+from urlab_client.protocol.shm import REPLY_FILE, REQUEST_FILE, RPC_STRIDE
 from urlab_client.server.compile.scene_index import EntityIndex
 from urlab_client.server.core import ServerCore
 from urlab_client.server.handlers.control import check_owner
@@ -71,6 +74,8 @@ def handshake(server: ServerCore, session_id: str, *, include_assets: bool = Fal
     if server.instance is not None:
         reply.instance = server.instance()
     reply.shm_session_dir = server.shm_directory
+    if server.dialect.instance and server.shm_directory is not None:
+        reply.shm_rpc = _request_regions(Path(server.shm_directory))
     reply.entities = {}
     reply.global_cameras = {}
     running = server.play.current
@@ -88,6 +93,18 @@ def handshake(server: ServerCore, session_id: str, *, include_assets: bool = Fal
     if include_assets:
         _add_assets(reply, running)
     return reply
+
+
+def _request_regions(directory: Path) -> ShmRpcInfo:
+    return ShmRpcInfo(
+        session=directory.name,
+        req_path=str(directory / REQUEST_FILE),
+        rep_path=str(directory / REPLY_FILE),
+        req_event=f"Local\\URLab_{directory.name}_req_ready",
+        rep_event=f"Local\\URLab_{directory.name}_rep_ready",
+        req_stride=RPC_STRIDE,
+        rep_stride=RPC_STRIDE,
+    )
 
 
 def _articulation(server: ServerCore, name: str, control: ArticulationControl) -> ArticulationInfo:
