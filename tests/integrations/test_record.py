@@ -552,11 +552,14 @@ def test_a_file_that_takes_nothing_any_more_is_not_waited_for_without_end(
 def test_pictures_that_a_server_did_not_send_are_told(
     seeing: urlab_client.URLabClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(StepPictures, "take", lambda self, reply: setattr(reply, "cameras", {}))
+    take: Callable[..., None] = StepPictures.take
+    monkeypatch.setattr(
+        StepPictures, "take", lambda self, reply: take(self, reply) if reply.step > 3 else setattr(reply, "cameras", {})
+    )
 
     def drive() -> None:
         with record(seeing, tmp_path / "run.mcap", cameras=["arm/wrist"], camera_hz=500):
-            for _ in range(3):
+            for _ in range(5):
                 seeing.step()
 
     with pytest.warns(UserWarning, match="0 states and 3 pictures were lost"):
