@@ -158,7 +158,7 @@ def _pictures(width: int, height: int, rate: float) -> Iterator[Pair]:
                     Figure(
                         name="share of a core at 1000 640x480 pictures per second, by bytes",
                         value=statistics.median(processor) * 1000 * (640 * 480) / (width * height),
-                        at_most=1.0,
+                        at_most=0.3,
                     ),
                 ],
             )
