@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import time
 from collections.abc import Sequence
@@ -13,6 +14,7 @@ import msgspec
 from benchmarks.harness import Result, measure
 from benchmarks.machine import describe
 from benchmarks.rows import all_rows, one_row
+from benchmarks.rows.simulated import DIALECT
 
 
 def main() -> int:
@@ -24,8 +26,12 @@ def main() -> int:
     parser.add_argument("--against", type=Path, metavar="FILE", help="figures of another run to report the change from")
     parser.add_argument("--json", type=Path, default=Path("benchmarks.json"), help="file to write (%(default)s)")
     parser.add_argument("--seconds", type=float, help="seconds to measure each row, instead of 10, or 1 with --quick")
+    parser.add_argument(
+        "--dialect", choices=("alpha", "beta"), default="alpha", help="of the rows' simulated servers (%(default)s)"
+    )
     parser.add_argument("--list", action="store_true", help="list the rows and stop")
     options = parser.parse_args()
+    os.environ[DIALECT] = options.dialect
     if options.row:
         found = one_row(options.row)
         rows = [] if found is None else [found]

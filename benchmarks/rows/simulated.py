@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import statistics
 import subprocess
 import sys
@@ -23,7 +24,10 @@ from urlab_client.protocol.codec import decode_reply, encode_request, op_of
 from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.protocol.messages.session import Hello, HelloOk, Reset, Step
 
-__all__ = ["ROWS"]
+__all__ = ["DIALECT", "ROWS"]
+
+DIALECT = "URLAB_BENCHMARK_DIALECT"
+"""What the simulated servers of these rows speak; rows may run in processes of their own."""
 
 _JOINTS = 29
 _ROUNDS = 10
@@ -75,6 +79,7 @@ def _simulated(path: Path) -> Iterator[_Simulated]:
         "--play",
         "--json",
         "--until-eof",
+        f"--dialect={os.environ.get(DIALECT, 'alpha')}",
         *ports,
     ]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:

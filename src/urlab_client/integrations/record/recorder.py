@@ -106,7 +106,7 @@ class AsyncRecorder:
                 self._path,
                 ", ".join(missing),
             )
-        elif stats.dropped_states or stats.dropped_frames:
+        if stats.dropped_states or stats.dropped_frames:
             lost = f"{stats.dropped_states} states and {stats.dropped_frames} pictures"
             warnings.warn(f"{self._path}: {lost} were lost, see /recording/gaps in it.", stacklevel=2)
 
