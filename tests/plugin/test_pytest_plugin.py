@@ -124,7 +124,7 @@ def test_a_server_with_a_dead_thread_is_replaced_and_told_of(pytester: pytest.Py
         import pytest
 
         def strike(server=None):
-            (physics,) = [thread for thread in threading.enumerate() if thread.name == "urlab-physics"]
+            *_, physics = [thread for thread in threading.enumerate() if thread.name == "urlab-physics"]  # the newest
             ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(physics.ident), ctypes.py_object(SystemExit))
             physics.join()
 
