@@ -202,8 +202,10 @@ def step(server: ServerCore, request: Step) -> StepOk | bytes:
         return engine.step(request, lambda _: encode(level, engine.time, engine.step_count, engine.snapshots.number))
 
     def observe(mode: StepMode) -> tuple[StepOk, Film | None]:
-        stepped = forms or mode in (StepMode.DIRECT, StepMode.PUPPET)
-        film = running.cameras.capture(shots, running.engine.snapshots.number) if stepped else None
+        film = None
+        if forms or mode in (StepMode.DIRECT, StepMode.PUPPET):
+            draw = server.dialect.draws_for_steps
+            film = running.cameras.capture(shots, running.engine.snapshots.number, draw=draw)
         return _observe_step(running, level), film
 
     reply, film = running.engine.step(request, observe)

@@ -278,17 +278,18 @@ class CameraRenderer:
         """Return width and height of all cameras by `ARTICULATION/CAMERA`."""
         return {key: camera.info.resolution for key, camera in self._by_name.items()}
 
-    def capture(self, shots: Iterable[Shot], frame_id: int = 0) -> Film:
+    def capture(self, shots: Iterable[Shot], frame_id: int = 0, *, draw: bool = True) -> Film:
         """Copy the states that `frames` draws; the caller holds the engine's lock.
 
         Args:
             shots: What is asked for.
             frame_id: Number of the state's snapshot.
+            draw: Whether frames may be drawn; without, the ones that there are have to do.
 
         Returns:
             What to hand to `frames`.
         """
-        now = self._now()
+        now, draw = self._now(), draw and not self._broken
         jobs: list[Exposure] = []
         past: dict[Latency, Past] = {}
         cameras: list[_Camera] = []
@@ -298,9 +299,9 @@ class CameraRenderer:
                     cameras.append(shot.camera)
             elif shot.late not in past and (seen := shot.late.revealed(now)) is not None:
                 past[shot.late] = seen
-                if seen.frame is None and not self._broken:
+                if seen.frame is None and draw:
                     jobs.append(Exposure([shot.camera], self._past_state(seen), now.wall, seen.frame_id, seen))
-        if cameras and not self._broken:
+        if cameras and draw:
             jobs.append(Exposure(cameras, self._copy_state(), now.wall, frame_id if self._stamped else None))
         return Film(now.wall, time.time(), jobs, past)
 
