@@ -95,6 +95,7 @@ class ScriptedBeta(ScriptedServer):
         without: Ops that it does not list.
 
     Attributes:
+        capabilities: What its instance says it can do.
         owners: Owner by the robot's object name.
         time: Simulation time.
         frame: Number of the latest snapshot.
@@ -106,6 +107,7 @@ class ScriptedBeta(ScriptedServer):
 
     def __init__(self, *, skew: bool = False, reads_owner: bool = True, without: tuple[str, ...] = ()) -> None:
         self.skew = skew
+        self.capabilities = ["render_sync", "render_async", "shm_rpc", "model_upload", "content_cache"]
         self.reads_owner = reads_owner
         self.owners: dict[str, str] = {}
         self.session = ""
@@ -206,7 +208,7 @@ class ScriptedBeta(ScriptedServer):
             "manager_present": True,
             "busy": False,
             "urlab_version": "urlab/0.2",
-            "capabilities": ["render_sync", "render_async", "shm_rpc", "model_upload", "content_cache"],
+            "capabilities": list(self.capabilities),
         }
 
     def robot(self, name: str, actor_id: str, public: str) -> Reply:

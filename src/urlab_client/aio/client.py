@@ -277,8 +277,9 @@ class URLabClient(ClientState):
         Args:
             n_steps: Physics steps, at least 1; at least 0 in `puppet`. Not used in `live`.
             include_cameras: True for the newest frame of every camera, or camera name to `sync` (rendered after the
-                step) or `latest`. A `sync` picture that is older than the step is omitted from the reply, like one
-                that did not arrive. Ignored in live mode by servers that draw in the other modes only.
+                step) or `latest`. Where the server cannot render for a step, the step waits up to 3 s per camera for
+                its picture in the camera's stream. A `sync` picture that is older than the step is omitted from the
+                reply, like one that did not arrive. Ignored in live mode by servers that draw in the other modes only.
             observations: Level of this reply alone; default the level of the session.
             timeout: Seconds to wait; None waits without limit.
 

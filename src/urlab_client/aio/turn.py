@@ -138,6 +138,12 @@ class Turn:
             return _at_once(op, answer)
         return cast("Coroutine[Any, Any, R]", answer)  # only the editor's ops are ever answered with a job
 
+    def deadline(self, takes: float) -> float:
+        """Return the loop time until which this turn may wait for something that takes so long, in seconds."""
+        by = asyncio.get_running_loop().time() + takes
+        limit = None if self._timeout is DEFAULT else self._limits(self._op)[0]
+        return by if limit is None else min(by, limit)
+
     async def aside(self, work: Awaitable[T]) -> T:
         """Let requests that do not depend on the client's state pass while `work`, which sends nothing, is done."""
         self._give_line()

@@ -91,6 +91,7 @@ class Dialect:
         cameras_on: Cameras stream from the start of play.
         camera_headers: Streamed pictures begin with number, time and size.
         camera_forms: Pictures carry `frame_id` and `sim_time` in replies, live steps bring them, and steps can wait.
+        draws_for_steps: Steps draw the pictures that they bring; else they bring what was drawn before them.
         qualified_cameras: Cameras are called `<robot>/<camera>`, on topics, too, and under no other name.
         public_names: Robots are called by their actor id where they have one, and `actor_name` tells the object's.
         frame_ids: Steps are numbered by `frame_id`.
@@ -116,6 +117,7 @@ class Dialect:
     cameras_on: bool
     camera_headers: bool
     camera_forms: bool
+    draws_for_steps: bool
     qualified_cameras: bool
     public_names: bool
     frame_ids: bool
@@ -168,6 +170,7 @@ ALPHA: Final = Dialect(
     cameras_on=True,
     camera_headers=False,
     camera_forms=False,
+    draws_for_steps=True,
     qualified_cameras=False,
     public_names=False,
     frame_ids=False,
@@ -194,6 +197,7 @@ BETA: Final = Dialect(
     cameras_on=False,
     camera_headers=True,
     camera_forms=True,
+    draws_for_steps=True,
     qualified_cameras=True,
     public_names=True,
     frame_ids=True,

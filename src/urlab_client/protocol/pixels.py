@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from struct import Struct as Layout
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from msgspec import Struct
@@ -12,7 +12,16 @@ from numpy.typing import NDArray
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.layouts import BytesLike, damaged
 
-__all__ = ["CameraImage", "Pixels", "camera_header", "check_picture_size", "decode_camera", "encode_camera"]
+__all__ = [
+    "CameraImage",
+    "PictureStamp",
+    "Pixels",
+    "camera_header",
+    "check_picture_size",
+    "decode_camera",
+    "encode_camera",
+    "picture_stamp",
+]
 
 Pixels: TypeAlias = NDArray[np.uint8] | NDArray[np.float32]
 
@@ -38,6 +47,20 @@ class CameraImage(Struct, frozen=True, eq=False):
     frame_id: int | None = None
     sim_time: float | None = None
     capture_time: float | None = None
+
+
+class PictureStamp(NamedTuple):
+    """What the header of a picture says.
+
+    Attributes:
+        frame_id: The server's number of the frame.
+        sim_time: Simulation time of the frame, seconds.
+        size: Bytes of the header; the pixels follow.
+    """
+
+    frame_id: int
+    sim_time: float
+    size: int
 
 
 def check_picture_size(width: int, height: int) -> None:
@@ -95,6 +118,29 @@ def decode_camera(
         return CameraImage(pixels)
     _, _, frame_id, sim_time, _, _, *capture_time = header.unpack_from(payload)
     return CameraImage(pixels, frame_id, sim_time, *capture_time)
+
+
+def picture_stamp(payload: BytesLike, width: int, height: int, *, where: object = "") -> PictureStamp | None:
+    """Read the header of a picture without touching its pixels; None for bare pixels.
+
+    Args:
+        payload: Pixels, with or without header.
+        width: Columns, as the handshake says.
+        height: Rows.
+        where: Names the camera in errors.
+
+    Raises:
+        ProtocolError: If the payload does not have the size of such a picture.
+    """
+    header = _frame_header(payload, width, height, where)
+    if header is None:
+        size = width * height * 4
+        if len(payload) != size:
+            problem = f"{len(payload)} bytes, expected {size} ({width}x{height} pixels of 4 bytes)"
+            raise damaged("camera frame", where, problem, payload)
+        return None
+    _, _, frame_id, sim_time, *_ = header.unpack_from(payload)
+    return PictureStamp(frame_id, sim_time, header.size)
 
 
 def _target(mode: CameraMode | str, width: int, height: int, out: Pixels | None) -> Pixels:

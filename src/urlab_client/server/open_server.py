@@ -261,7 +261,11 @@ class OpenServer:
             manager_present=core is not None and core.play.manager_present,
             busy=core is not None and core.lease.held,
             urlab_version="" if core is None else core.dialect.urlab_version,
-            capabilities=["render_sync", "render_async", *(["shm_rpc"] if self._memory else []), "model_upload"],
+            capabilities=[
+                *(["render_sync", "render_async"] if core is not None and core.dialect.draws_for_steps else []),
+                *(["shm_rpc"] if self._memory else []),
+                "model_upload",
+            ],
         )
 
     def _content(self, config: ServerConfig) -> ContentRoot:

@@ -114,6 +114,11 @@ class CameraSwitch:
             finally:
                 self._follow()
 
+    async def settled(self) -> None:
+        """Wait until the server has been told of what is used now."""
+        if self._task is not None:
+            await asyncio.wait((self._task,))
+
     async def aclose(self, *, connected: bool) -> None:
         """Switch off what is on for streams alone, as far as the server listens. Idempotent."""
         self._closed = True

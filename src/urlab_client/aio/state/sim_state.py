@@ -16,6 +16,7 @@ import numpy as np
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.live.live_state import LatestPicture, LiveState
 from urlab_client.aio.live.publishers import Publishers
+from urlab_client.aio.live.step_streams import StepStreams
 from urlab_client.aio.model.articulation_state import MirroredArticulation, MirroredEntity
 from urlab_client.aio.model.mirror import Mirror, write_options
 from urlab_client.aio.motion import Motion
@@ -83,6 +84,7 @@ class SimState:
         pending: Requests whose replies were lost.
         stopping: Whether this client is ending play, so that its end is not news.
         observers: Who looks on, such as recorders.
+        step_streams: Where the pictures of steps are looked for if replies bring older ones.
     """
 
     def __init__(
@@ -96,6 +98,7 @@ class SimState:
     ) -> None:
         self.session = session
         self.publishers = publishers
+        self.step_streams = StepStreams(publishers)
         self.mirror = Mirror()
         self.objects = SceneObjects(session, publishers, self.mirror, motion)
         self.wanted_mode = wanted_mode

@@ -1,12 +1,14 @@
 """The pictures that a step brings: asked for by the names that mean one camera, handed back under the user's.
 
-For the client's `step`. A picture that was to show the state after the step, and shows an older one, is withheld.
+For the client's `step`. A picture that was to show the state after the step, and shows an older one, is withheld. On
+servers that cannot draw for a step, the picture is taken from the camera's stream instead.
 """
 
 from __future__ import annotations
 
+import asyncio
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Final
 
 from urlab_client.protocol.enums import CameraTiming
@@ -14,6 +16,7 @@ from urlab_client.protocol.messages.session import CameraFrame, Step, StepOk
 
 if TYPE_CHECKING:
     from urlab_client.aio.state.sim_state import SimState
+    from urlab_client.aio.turn import Turn
 
 __all__ = ["StepPictures"]
 
@@ -30,16 +33,21 @@ class StepPictures:
         state: The client's state, which knows the cameras.
         asked: What is wanted: all newest ones, none, or camera to `sync` or `latest`.
 
+    Attributes:
+        interruption: What broke off the wait for pictures.
+
     Raises:
         KeyError: There is no such camera, or several; nothing was sent.
     """
 
     def __init__(self, state: SimState, asked: bool | Mapping[str, str | None]) -> None:
+        self._state = state
         self._features = state.session.features
         self._wanted: dict[str, str | None] = {}
         self._shown: dict[str, str] = {}
         self._sync: set[str] = set()
-        self._all = False
+        self._all = self._listening = False
+        self.interruption: asyncio.CancelledError | None = None
         if asked is False:  # as nearly every step has it
             return
         names = state.objects.camera_names()
@@ -74,6 +82,68 @@ class StepPictures:
         if self._sync and self._features.renders_sync:
             request.render = "sync"
             request.camera_timeout_ms = 1000.0 * _RENDER_S
+
+    async def listen(self, turn: Turn) -> None:
+        """Receive the streams in which pictures are looked for, before the step is taken; at most for seconds.
+
+        Where cameras stream all the time, the first reply shows whether there is a need.
+        """
+        if not self._sync or self._features.renders_sync:
+            return
+        streams = self._state.step_streams
+        self._listening = self._features.camera_switch or streams.needed
+        if self._listening and self._listen(self._sync):
+            await turn.aside(streams.opened())
+
+    async def complete(self, turn: Turn, reply: StepOk) -> None:
+        """Bring the pictures of a reply under the user's names: without those that are too old, with those of streams.
+
+        The step is done by then, so its state is taken over before a cancellation shows: by `account`.
+        """
+        try:
+            await self._catch_up(turn, reply)
+        except asyncio.CancelledError as error:
+            self.interruption = error
+        self.take(reply)
+
+    def account(self, reply: StepOk, *, came: bool) -> None:
+        """Mark the cameras whose pictures did not come, after the reply was taken over.
+
+        Args:
+            reply: The reply.
+            came: Whether the step was one that brings pictures.
+
+        Raises:
+            CancelledError: The wait for pictures was broken off.
+        """
+        if came:
+            self._state.objects.note_missing_frames(self.names, reply)
+        if self.interruption is not None:
+            raise self.interruption
+
+    async def _catch_up(self, turn: Turn, reply: StepOk) -> None:
+        """Wait in the streams for the pictures that a reply has not, or in an older version, within their deadline."""
+        if not self._sync or self._features.renders_sync or reply.frame_id is None:
+            return
+        frames = reply.cameras or {}
+        late = [
+            name
+            for name in sorted(self._sync)
+            if name not in frames or self._too_old(name, frames[name], reply.frame_id)
+        ]
+        if not late:
+            return
+        streams = self._state.step_streams
+        streams.needed = True
+        if not self._listening:
+            self._listen(late)
+        found = await streams.pictures(late, reply.frame_id, turn.deadline(self.seconds))
+        if found:
+            reply.cameras = {**frames, **found}
+
+    def _listen(self, names: Iterable[str]) -> bool:
+        views = [(name, view) for name in names if (view := self._state.objects.camera(name)) is not None]
+        return self._state.step_streams.listen(views, self._state.hello)
 
     def take(self, reply: StepOk) -> None:
         """Bring the pictures of a reply under the user's names, without those that are too old."""

@@ -38,7 +38,7 @@ async def take_steps(state: SimState, turn: Turn, n_steps: int, cameras: Cameras
     mode = state.mode
     if n_steps < (0 if mode is StepMode.PUPPET else 1):
         raise ValueError(_too_few(n_steps, mode))
-    pictures = await _pictures(state, cameras, n_steps) if state.observers or cameras is not False else None
+    pictures = await _pictures(state, turn, cameras, n_steps) if state.observers or cameras is not False else None
     if mode is StepMode.LIVE and not state.mode_assumed:
         return await _live_step(state, turn, pictures)
     request, carried = _puppet_step(state, n_steps) if mode is StepMode.PUPPET else _direct_step(state, n_steps)
@@ -53,7 +53,7 @@ async def take_steps(state: SimState, turn: Turn, n_steps: int, cameras: Cameras
         if state.session.session_id == session:  # else it has the level of a handshake that was given up
             state.sent_level = level if state.session.features.level_sticks else state.level
         if pictures is not None:
-            pictures.take(reply)
+            await pictures.complete(turn, reply)
         state.absorb(reply, "step", into_mirror=mode is not StepMode.PUPPET)
     except BaseException as error:
         _note_failure(state, turn, error, 1 if mode is StepMode.PUPPET else n_steps, carried)
@@ -63,13 +63,13 @@ async def take_steps(state: SimState, turn: Turn, n_steps: int, cameras: Cameras
     if assumed:
         # A handshake that was given up and answered meanwhile let the server count anew.
         _learn_mode(state, request, reply, reply.step - (before if state.session.session_id == session else 0))
-        if state.mode is StepMode.PUPPET and mode is not StepMode.PUPPET:
+        if state.mode is StepMode.PUPPET and mode is not StepMode.PUPPET and not (pictures and pictures.interruption):
             return await take_steps(state, turn, n_steps, cameras, asked)  # all it has done is to set the clock
-    if pictures is not None and state.mode is not StepMode.LIVE:
-        state.objects.note_missing_frames(pictures.names, reply)
     if state.mode is StepMode.PUPPET:
         with state.mirror.lock:
             state.mirror.perturb(reply.perturbation)
+    if pictures is not None:
+        pictures.account(reply, came=state.mode is not StepMode.LIVE)
     return reply
 
 
@@ -83,8 +83,6 @@ def _note_failure(state: SimState, turn: Turn, error: BaseException, steps: int,
 
 
 async def _live_step(state: SimState, turn: Turn, pictures: StepPictures | None) -> StepOk:
-    if not state.session.features.live_pictures_in_steps:
-        pictures = None
     carried = take_wrenches(state)  # of no effect on servers that do not take them in this mode
     try:
         request = Step(per_articulation=live_commands(state, carried) or None)
@@ -92,14 +90,14 @@ async def _live_step(state: SimState, turn: Turn, pictures: StepPictures | None)
             pictures.ask(request)
         reply = await turn.call(request, takes=_seconds(pictures))
         if pictures is not None:
-            pictures.take(reply)
+            await pictures.complete(turn, reply)
         state.absorb(reply, "step")
     except BaseException as error:
         if not (turn.sent and leaves_open(error)):
             give_back(carried)
         raise
     if pictures is not None:
-        state.objects.note_missing_frames(pictures.names, reply)
+        pictures.account(reply, came=True)
     return reply
 
 
@@ -161,7 +159,7 @@ def _learn_mode(state: SimState, request: Step, reply: StepOk, advanced: int) ->
         )
 
 
-async def _pictures(state: SimState, cameras: Cameras, n_steps: int) -> StepPictures | None:
+async def _pictures(state: SimState, turn: Turn, cameras: Cameras, n_steps: int) -> StepPictures | None:
     """Return the pictures that a step is to bring, None for none, when observers have room for what it brings."""
     if state.mode is not StepMode.LIVE:
         for observer in state.observers:
@@ -170,7 +168,13 @@ async def _pictures(state: SimState, cameras: Cameras, n_steps: int) -> StepPict
     asked = cameras if isinstance(cameras, bool) else {name: str(CameraTiming(how)) for name, how in cameras.items()}
     if state.observers:
         asked = state.objects.with_cameras(asked, state.observed_cameras(n_steps))
-    return StepPictures(state, asked) or None
+    pictures = StepPictures(state, asked)
+    if not pictures or (
+        state.mode is StepMode.LIVE and not state.mode_assumed and not state.session.features.live_pictures_in_steps
+    ):
+        return None
+    await pictures.listen(turn)
+    return pictures
 
 
 def _too_few(n_steps: int, mode: StepMode) -> str:

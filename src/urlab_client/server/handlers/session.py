@@ -203,7 +203,7 @@ def step(server: ServerCore, request: Step) -> StepOk | bytes:
         return engine.step(request, lambda _: encode(level, engine.time, engine.step_count, engine.frame_id))
 
     def observe(mode: StepMode) -> tuple[StepOk, StepMode, Exposure | None]:
-        stepped = forms or mode in (StepMode.DIRECT, StepMode.PUPPET)
+        stepped = server.dialect.draws_for_steps and (forms or mode in (StepMode.DIRECT, StepMode.PUPPET))
         exposure = running.cameras.capture(shots, running.engine.frame_id) if stepped else None
         return _observe_step(running, level), mode, exposure
 
