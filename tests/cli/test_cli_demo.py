@@ -151,7 +151,7 @@ def test_a_robot_without_floor_and_actuators_gets_one_and_is_not_said_to_be_driv
         "<mujoco><worldbody><body pos='0 0 -5'><freejoint/>"
         "<geom type='box' size='.1 .1 .1'/></body></worldbody></mujoco>"
     )
-    assert main(["demo", str(model), "--steps", "400", "--no-render", "--output", str(tmp_path)]) == 0
+    assert main(["demo", str(model), "--steps", "200", "--no-render", "--output", str(tmp_path)]) == 0
     record = json.loads((tmp_path / "run.json").read_bytes())
     heights = [pose["position"][2] for run in record["runs"] for pose in run["final_base_poses"]]
     assert heights == pytest.approx([0.1, 0.1, 0.1], abs=0.01)
@@ -216,3 +216,68 @@ def test_the_gentle_controller_stays_inside_the_control_ranges() -> None:
     assert (low >= ranges[:, 0]).all()
     assert (high <= ranges[:, 1]).all()
     assert (high - low > 0.1 * np.ptp(ranges, axis=1)).all()
+
+
+ROBOT_WITHOUT_FLOOR = """
+<mujoco model="crab">
+  <asset><mesh name="claw" file="claw.obj"/></asset>
+  <worldbody>
+    <body name="shell" pos="0 0 0.1">
+      <freejoint/>
+      <geom size="0.1"/>
+      <body name="arm" pos="0.1 0 0.1"><joint name="hip"/><geom type="mesh" mesh="claw"/></body>
+    </body>
+  </worldbody>
+  <actuator><motor name="m" joint="hip"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.fixture
+def crab(tmp_path: Path) -> Path:
+    """A robot that can fall, brings no floor, and has a file beside it."""
+    folder = tmp_path / "models"
+    folder.mkdir()
+    (folder / "claw.obj").write_text("v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n")
+    (folder / "crab.xml").write_text(ROBOT_WITHOUT_FLOOR)
+    return folder / "crab.xml"
+
+
+def demo_on(server: SimulatedServer, *arguments: str | Path) -> int:
+    options = server.client_options()
+    address = f"{options['address']}:{options['step_port']}"
+    return main(["demo", *map(str, arguments), "--address", address, "--no-render"])
+
+
+def test_a_model_goes_over_the_wire_to_a_server_that_runs_already(crab: Path, tmp_path: Path) -> None:
+    output = tmp_path / "output"
+    with SimulatedServer("arm", play=True, dialect="beta") as server:
+        assert demo_on(server, "arm", "--steps", "8", "--output", output) == 0  # the next empties its levels
+        assert demo_on(server, crab, "--steps", "200", "--output", output) == 0
+        record = json.loads((output / "run.json").read_bytes())
+        assert record["address"].startswith("tcp://")
+        assert [run["steps"] for run in record["runs"]] == [200, 50]
+        assert [len(run["final_base_poses"]) for run in record["runs"]] == [1, 2]
+        for run in record["runs"]:
+            assert all(0.08 < pose["position"][2] < 0.15 for pose in run["final_base_poses"]), "there is a floor"
+        with URLabClient(**server.client_options()) as client:
+            client.discover()
+            robots = {actor.actor_id for actor in client.scene.snapshot().actors if actor.is_articulation}
+    assert robots == {"crab_1", "crab_2"}
+
+
+def test_a_server_that_cannot_be_given_the_model(
+    crab: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with SimulatedServer("arm", play=True) as server:
+        assert demo_on(server, crab, "--output", tmp_path / "output") == 2
+    out, err = capsys.readouterr()
+    assert (out, err.count("\n")) == ("", 1)
+    assert "takes no models over the wire" in err
+    assert str(crab) in err
+
+
+def test_an_address_that_would_start_a_server(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["demo", "--address", "sim://arm"])
+    assert "runs already" in capsys.readouterr().err

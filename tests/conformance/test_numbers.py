@@ -94,10 +94,10 @@ async def test_what_was_written_in_place_is_looked_at_before_it_is_sent(client: 
 
 
 @pytest.mark.mujoco("3.12")
-async def test_one_of_several_inputs_is_named_by_its_number(connect: Any, tmp_path: Path) -> None:
-    path = tmp_path / "bot.xml"
+async def test_one_of_several_inputs_is_named_by_its_number(connect: Any, serve: Any, models: Path) -> None:
+    path = models / "pid.xml"
     path.write_text(BOT.replace("<position", "<pid"))
-    with SimulatedServer(path, play=True) as server:
+    with serve(path, play=True) as server:
         client = connect(server, step_mode="direct")
         await client.discover()
         bot = client.articulations["bot"]

@@ -30,6 +30,7 @@ def run_policy(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str,
     return json.loads(said.out)
 
 
+@pytest.mark.long
 def test_the_trained_network_walks_where_zero_and_random_outputs_do_not(capsys: pytest.CaptureFixture[str]) -> None:
     found = run_policy(capsys, "--command", "0.5", "0", "0", "--compare")
     zero, random, policy = found["zero"], found["random"], found["policy"]
@@ -64,6 +65,7 @@ def test_the_trained_network_does_what_it_is_told(yaw_rate: float, vx: float) ->
     assert found.velocity_error < 0.12
 
 
+@pytest.mark.long
 def test_the_figures_beside_the_network_are_true(capsys: pytest.CaptureFixture[str]) -> None:
     figures = json.loads(NETWORK.with_suffix(".json").read_text())
     evaluation = figures["evaluation"]

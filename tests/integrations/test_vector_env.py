@@ -256,6 +256,7 @@ def test_wrong_arguments_start_nothing(arguments: Any, options: Any, reason: str
 
 
 @pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.long
 def test_older_releases_of_mujoco_step_a_batch_with_the_same_results(
     made: list[Any], monkeypatch: pytest.MonkeyPatch, threads: int
 ) -> None:
@@ -313,6 +314,7 @@ def test_a_tasks_rewards_are_the_same_from_servers_and_batch(task_id: str, made:
         assert np.array_equal(wire.step(action)[1], batch.step(action)[1])
 
 
+@pytest.mark.long
 def test_servers_and_batch_render_each_environment(servers: list[str], made: list[Any]) -> None:
     options: Any = {"render_mode": "rgb_array", "render_camera": "arm/overview", "keyframe": "home", "reset_noise": 0.3}
     wire, batch = URLabVectorEnv(servers, **options), URLabBatchEnv("sim://arm", 2, **options)

@@ -31,6 +31,7 @@ __all__ = [
     "make_client",
     "one_of",
     "port",
+    "running_address",
     "seconds",
 ]
 
@@ -258,6 +259,13 @@ def address(text: str) -> str:
     if text in bundled_models() or text.endswith((".xml", ".json")):
         raise argparse.ArgumentTypeError(f"{text!r} is a model, not an address; write sim://{text} to start a server")
     return f"tcp://{text}"
+
+
+def running_address(text: str) -> str:
+    """Parse the address of a server that runs already."""
+    if text.startswith("sim://"):
+        raise argparse.ArgumentTypeError(f"{text!r} would start a server; give the address of one that runs already")
+    return address(text)
 
 
 def one_of(*allowed: E) -> Callable[[str], E]:

@@ -1,11 +1,10 @@
 """`urlab demo`: a level authored, a robot driven through both clients, and what came of it on disk.
 
-Starts a simulated server of its own, so it needs nothing but this package.
+Starts a simulated server of its own, so it needs nothing but this package, or drives one that runs already.
 """
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import contextlib
 import hashlib
@@ -19,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from urlab_client.cli._arguments import Commands, count
+from urlab_client.cli._arguments import Commands, ServerArguments, add_keys, add_ports, count, running_address
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._files import replaced
 from urlab_client.cli._mujoco import import_mujoco
@@ -40,10 +39,11 @@ _ASYNC_SHARE = 4  # the async run takes a quarter of the steps
 _REPORT_EVERY = 20  # steps between two updates of the progress bar
 
 
-class DemoArguments(argparse.Namespace):
+class DemoArguments(ServerArguments):
     """What the command line says."""
 
     model: str
+    address: str | None
     output: Path
     steps: int
     no_render: bool
@@ -54,13 +54,14 @@ def add_parser(commands: Commands) -> None:
     parser = commands.add_parser(
         "demo",
         help="drive a robot end to end; keep a plot, a picture and the configuration",
-        description="Start a simulated server, author a level, drive a robot through the blocking client and two of "
-        "them through the async client, and write joints.png, last_state.png and run.json. Needs the extra "
-        "'urlab-client[demo]'.",
+        description="Start a simulated server, or take one that runs already, author levels, drive a robot through "
+        "the blocking client and two of them through the async client, and write joints.png, last_state.png and "
+        "run.json. Needs the extra 'urlab-client[demo]'.",
         examples=(
             ("urlab demo", "the bundled quadruped; results in urlab-demo/"),
             ("urlab demo robot.xml --steps 500 --output run1", "your own model"),
             ("urlab demo arm --no-render", "without a picture of the last state"),
+            ("urlab demo robot.xml --address tcp://lab-7", "on a server that runs already, whose play session it ends"),
         ),
     )
     parser.add_argument(
@@ -70,6 +71,16 @@ def add_parser(commands: Commands) -> None:
         metavar="MODEL",
         help="an MJCF file or the name of a bundled robot (default: %(default)s)",
     )
+    parser.add_argument(
+        "--address",
+        type=running_address,
+        metavar="ADDRESS",
+        help="HOST[:PORT], tcp://HOST[:PORT] or ipc://PATH of a server that runs already (default: start one). Play "
+        "ends there, and levels of the demo's own are opened; a model that is not on its disk is uploaded, if it "
+        "takes models",
+    )
+    add_ports(parser, state=False)
+    add_keys(parser)
     parser.add_argument(
         "--output", type=Path, default=Path("urlab-demo"), metavar="DIR", help="where to write (default: %(default)s)"
     )
@@ -81,14 +92,14 @@ def add_parser(commands: Commands) -> None:
         help="steps of the blocking run; the async run takes a quarter (default: %(default)s)",
     )
     parser.add_argument("--no-render", action="store_true", help="draw no picture of the last state")
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, mjcf_options=False)
 
 
 def run(arguments: DemoArguments) -> int:
     """Run the demonstration.
 
     Raises:
-        CommandError: The model or the output folder cannot be used.
+        CommandError: The model or the output folder cannot be used, or the server cannot be given the model.
         MissingExtra: A library is missing.
         URLabError: The server refused something.
     """
@@ -97,21 +108,22 @@ def run(arguments: DemoArguments) -> int:
 
     from urlab_client.cli.demo_controllers import NOTHING_DRIVEN  # noqa: PLC0415
     from urlab_client.cli.demo_runs import drive_one, drive_two  # noqa: PLC0415
+    from urlab_client.cli.demo_server import running_server, started_server  # noqa: PLC0415
     from urlab_client.cli.robot_file import read_robot  # noqa: PLC0415
-    from urlab_client.server.simulated import SimulatedServer  # noqa: PLC0415
 
     robot = read_robot(arguments.model)
     folder = _writable(arguments.output)
     steps, fewer = arguments.steps, max(1, arguments.steps // _ASYNC_SHARE)
     console = output()
-    server = SimulatedServer(model_roots=[robot.path.parent], mjcf_options=True)
-    with _warnings_of(robot), server, _progress(console) as progress:
-        one = drive_one(server, robot, steps, _bar(progress, "blocking client, one robot", steps))
-        two = asyncio.run(drive_two(server, robot, fewer, _bar(progress, "async client, two robots", fewer)))
+    address = arguments.address
+    place = started_server(robot) if address is None else running_server(robot, address, arguments)
+    with _warnings_of(robot), place as server, _progress(console) as progress:
+        one = drive_one(server, steps, _bar(progress, "blocking client, one robot", steps))
+        two = asyncio.run(drive_two(server, fewer, _bar(progress, "async client, two robots", fewer)))
     console.print(_table(robot, [one.outcome, two.outcome]))
     if not one.driven:
         console.print(f"{robot.name}: {NOTHING_DRIVEN}; gravity alone moves it.", soft_wrap=True, highlight=False)
-    written = _write(folder, robot, one, two, render=not arguments.no_render)
+    written = _write(folder, robot, one, two, address=address, render=not arguments.no_render)
     for file, note in written.items():
         console.print(f"{file}  {note}", soft_wrap=True, highlight=False)
     return 0
@@ -193,7 +205,9 @@ def _numbers(values: list[float]) -> str:
     return " ".join(f"{value:6.3f}" for value in values)
 
 
-def _write(folder: Path, robot: RobotFile, one: DemoRun, two: DemoRun, *, render: bool) -> dict[Path, str]:
+def _write(
+    folder: Path, robot: RobotFile, one: DemoRun, two: DemoRun, *, address: str | None, render: bool
+) -> dict[Path, str]:
     """Write the files and return what is in each, or why it is missing."""
     from urlab_client.cli.figures import plot_trace  # noqa: PLC0415
     from urlab_client.cli.picture import NoPicture, draw_state  # noqa: PLC0415
@@ -213,7 +227,7 @@ def _write(folder: Path, robot: RobotFile, one: DemoRun, two: DemoRun, *, render
         notes[picture] = "not drawn: --no-render"
     if drawn_by is None:
         picture.unlink(missing_ok=True)  # one of an earlier run would show another state
-    configuration = _configuration(robot, one, two) | {"opengl": drawn_by}
+    configuration = _configuration(robot, one, two) | {"address": address, "opengl": drawn_by}
     with replaced(record) as temporary:
         temporary.write_bytes(msgspec.json.format(msgspec.json.encode(configuration), indent=2) + b"\n")
     notes[record] = "versions, model, options, seed and results"

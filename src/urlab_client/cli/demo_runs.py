@@ -12,14 +12,13 @@ from msgspec import Struct
 
 from urlab_client import URLabAsset, URLabClient, URLabError, aio
 from urlab_client.cli.demo_controllers import DemoController, DemoRobot, NoController, make_demo_controller
+from urlab_client.cli.demo_server import LEVELS, DemoServer
 from urlab_client.cli.figures import Quantity, Trace
 from urlab_client.cli.robot_file import RobotFile
 from urlab_client.server.assets.bundled_robots import bundled_models
 
 if TYPE_CHECKING:
     import mujoco
-
-    from urlab_client.server.simulated import SimulatedServer
 
 __all__ = ["SEED", "DemoRun", "Outcome", "Pose", "drive_one", "drive_two"]
 
@@ -88,16 +87,12 @@ class DemoRun:
         return not all(isinstance(controller, NoController) for controller in self.controllers)
 
 
-def drive_one(server: SimulatedServer, robot: RobotFile, steps: int, advance: Advance) -> DemoRun:
+def drive_one(server: DemoServer, steps: int, advance: Advance) -> DemoRun:
     """Author a level with one robot and drive it through the blocking client."""
-    with URLabClient(**server.client_options(), step_mode="direct") as client:
+    robot = server.robot
+    with server.connect(URLabClient) as client:
         client.discover()
-        client.scene.create_level("demo_one")
-        client.scene.ensure_manager()
-        for asset in _assets(robot, 1):
-            blueprint = client.scene.import_xml(asset.xml)
-            client.scene.spawn_actor(blueprint, asset.actor_id, location=asset.location)
-        client.scene.save_level()
+        client.scene.apply_scene(LEVELS[0], _assets(robot, 1))
         level = client.scene.current_level()
         client.sim.start()
         client.reset(seed=SEED, per_articulation_qpos=_home(client, robot, 1))
@@ -120,11 +115,12 @@ def drive_one(server: SimulatedServer, robot: RobotFile, steps: int, advance: Ad
         return run
 
 
-async def drive_two(server: SimulatedServer, robot: RobotFile, steps: int, advance: Advance) -> DemoRun:
+async def drive_two(server: DemoServer, steps: int, advance: Advance) -> DemoRun:
     """Author a level with two robots and drive each from a task of its own, through one async client."""
-    async with aio.URLabClient(**server.client_options(), step_mode="direct") as client:
+    robot = server.robot
+    async with server.connect(aio.URLabClient) as client:
         await client.discover()
-        await client.scene.apply_scene("demo_two", _assets(robot, 2))
+        await client.scene.apply_scene(LEVELS[1], _assets(robot, 2))
         level = await client.scene.current_level()
         await client.sim.start()
         await client.reset(seed=SEED, per_articulation_qpos=_home(client, robot, 2))
