@@ -133,15 +133,16 @@ def main() -> int:
         logs = arguments.logs or Path(scratch)
         logs.mkdir(parents=True, exist_ok=True)
         prefixes: queue.SimpleQueue[Path] = queue.SimpleQueue()
-        for number in range(arguments.workers):
-            prefixes.put(prefix(arguments.interpreter.parent, number))
+        for path in copies(arguments.interpreter.parent, arguments.workers):
+            start(path, arguments.interpreter.parent)
+            prefixes.put(path)
 
         def one(file: str) -> Outcome:
-            prefix = prefixes.get()
+            path = prefixes.get()
             try:
-                return run(file, arguments.interpreter, prefix, logs / f"{file.replace('/', '_')}.log")
+                return run(file, arguments.interpreter, path, logs / f"{file.replace('/', '_')}.log")
             finally:
-                prefixes.put(prefix)
+                prefixes.put(path)
 
         outcomes: list[Outcome] = []
         with concurrent.futures.ThreadPoolExecutor(arguments.workers) as pool:
@@ -166,12 +167,22 @@ def main() -> int:
     return 1 if any(outcome.problems for outcome in outcomes) else 0
 
 
-def prefix(folder: Path, number: int) -> Path:
-    """Return a Wine of its own for a worker, with a server that gives way to what it serves."""
+def copies(folder: Path, number: int) -> list[Path]:
+    """Return a Wine for each worker: that of the interpreter, and copies of it."""
     original = folder / "prefix"
-    path = original if number == 0 else folder / f"prefix-{number}"
-    if not path.exists():
-        shutil.copytree(original, path, symlinks=True)
+    # Wine keeps the registry in memory until its server ends: a copy made before then crashes.
+    for option in ("-k", "-w"):
+        environment = {**os.environ, "WINEPREFIX": str(original)}
+        subprocess.run(["wineserver", option], env=environment, check=False)  # noqa: S603, S607
+    paths = [original, *(folder / f"prefix-{i}" for i in range(1, number))]
+    for path in paths:
+        if not path.exists():
+            shutil.copytree(original, path, symlinks=True)
+    return paths
+
+
+def start(path: Path, folder: Path) -> None:
+    """Start a Wine, with a server that gives way to what it serves."""
     environment = {**os.environ, "WINEPREFIX": str(path), "WINEDEBUG": "-all"}
     subprocess.run(["nice", "-n", "5", "wineserver", "-p"], env=environment, check=False)  # noqa: S607
     # Wine's services, and the desktop with the first window, start with the first program that asks for them and keep
@@ -183,7 +194,6 @@ def prefix(folder: Path, number: int) -> Path:
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
-    return path
 
 
 if __name__ == "__main__":
