@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zmq
-from beta_bench import ME, Bench
+from beta_bench import Bench
 from raw_shm import RawRegion
 from waiting import eventually
 from wire import Wire
@@ -153,9 +153,6 @@ def test_the_field_of_view_is_the_vertical_one(tmp_path: Path) -> None:
     assert seen == [True, False]
 
 
-STEP_S = 0.005
-
-
 def shown(bench: Bench, how: object = "latest", **fields: Any) -> dict[str, Any] | None:
     """Step once and return the reply's picture of the first robot's camera."""
     return bench.step(include_cameras={"arm_a/cam": how}, **fields).get("cameras", {}).get("arm_a/cam")
@@ -205,13 +202,16 @@ def test_a_step_does_not_choose_from_what_a_camera_withholds(playing: Bench) -> 
 
 def test_a_reset_forgets_what_a_camera_saw(playing: Bench) -> None:
     playing.wire.ask("set_camera_delay", cameras={"arm_a/cam": 0.02})
-    assert [shown(playing) for _ in range(5)][4] is not None
-    playing.claim()
-    playing.wire.ask("reset", control_owner=ME)
-    after = [shown(playing) for _ in range(5)]
-    assert after[:4] == [None] * 4
-    assert after[4] is not None
-    assert after[4]["sim_time"] == pytest.approx(STEP_S)
+    assert shown(playing) is None
+    assert [shown(playing) for _ in range(4)][3] is not None
+    playing.wire.ask("reset")
+    assert [shown(playing) for _ in range(3)] == [None] * 3
+    after = shown(playing)
+    assert after is not None
+    assert after["sim_time"] == 0
+    later = playing.wire.ask("reset", keyframe_name=f"{playing.a}_home")
+    assert later["time"] > 1
+    assert shown(playing) is None, "not even when the clock goes on to a later time"
 
 
 def test_a_delay_is_changed_and_taken_back(playing: Bench) -> None:
