@@ -76,8 +76,6 @@ ELSEWHERE = {
         (
             "claim_control",
             "release_control",
-            "set_camera_streaming",
-            "set_camera_delay",
             "op_status",
             "remove_actor",
             "upload_model_manifest",

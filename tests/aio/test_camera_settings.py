@@ -128,6 +128,27 @@ async def test_latencies(client: URLabClient, beta: ScriptedBeta) -> None:
     assert sent["arm_C_1/wrist"] == {"delay_s": 0.5, "jitter_s": 0.1, "clock": "wall", "max_fps": 30.0}
 
 
+async def test_a_camera_of_the_simulated_server_is_late(tmp_path: Path) -> None:
+    arm = tmp_path / "arm.xml"
+    arm.write_text(ROBOT)
+    async with (
+        SimulatedServer(arm, play=True, dialect="beta", camera_size=(16, 12)) as server,
+        URLabClient(**server.client_options(), live_pictures=False) as client,
+    ):
+        await client.discover()
+        await client.runtime.set_mode("direct")
+        await client.runtime.set_camera_delay({"wrist": 0.1})
+        early = await client.step(include_cameras={"wrist": "latest"})
+        assert not early.cameras
+        await client.step(n_steps=500)
+        latest = await client.step(include_cameras={"wrist": "latest"})
+        assert latest.cameras is not None
+        assert latest.cameras["wrist"].sim_time == pytest.approx(early.time)
+        now = await client.step(include_cameras={"wrist": "sync"})
+        assert now.cameras is not None
+        assert now.cameras["wrist"].frame_id == now.frame_id
+
+
 @pytest.mark.parametrize(
     "bad", [-0.1, math.nan, CameraDelay(jitter_s=-1), CameraDelay(clock="sun"), CameraDelay(max_fps=math.inf)]
 )

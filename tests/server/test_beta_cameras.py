@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import zmq
 from beta_bench import Bench
 from raw_shm import RawRegion
@@ -150,3 +151,102 @@ def test_the_field_of_view_is_the_vertical_one(tmp_path: Path) -> None:
             background = np.median(pixels.reshape(-1, 3), axis=0)
             seen.append(bool((np.abs(pixels - background).max(axis=2) > 20).any()))
     assert seen == [True, False]
+
+
+def shown(bench: Bench, how: object = "latest", **fields: Any) -> dict[str, Any] | None:
+    """Step once and return the reply's picture of the first robot's camera."""
+    return bench.step(include_cameras={"arm_a/cam": how}, **fields).get("cameras", {}).get("arm_a/cam")
+
+
+def sim_time_of(message: list[bytes]) -> float:
+    return float(np.frombuffer(message[1], "<f8", count=1, offset=16)[0])
+
+
+def test_a_delayed_camera(playing: Bench) -> None:
+    """Beta statement 54."""
+    other = f"{playing.b}/cam"
+    streams = playing.wire.ask("set_camera_streaming", cameras={"arm_a/cam": True, other: True})["cameras"]
+    told = playing.wire.ask("set_camera_delay", cameras={"ARM_A/cam": {"delay_s": 0.5, "seed": 7}, "nobody/cam": 1})
+    in_force = {"delay_s": 0.5, "jitter_s": 0.0, "clock": "sim", "on_state_change": True, "max_fps": 0.0}
+    assert told["cameras"] == {"arm_a/cam": in_force}
+    assert shown(playing) is None, "nothing that it saw is old enough"
+    seen: dict[float, dict[str, Any]] = {}
+    for _ in range(100):
+        reply = playing.step(include_cameras={"arm_a/cam": "sync"})
+        seen[round(reply["time"], 6)] = reply["cameras"]["arm_a/cam"]
+        assert reply["cameras"]["arm_a/cam"]["frame_id"] == reply["frame_id"]
+    reply = playing.step(include_cameras={"arm_a/cam": "latest", other: "latest"}, render="sync")
+    old = reply["cameras"]["arm_a/cam"]
+    assert old == seen[round(reply["time"] - 0.5, 6)]
+    assert reply["cameras"][other]["frame_id"] == reply["frame_id"], "the other camera is not delayed"
+    assert playing.step(include_cameras=True)["cameras"]["arm_a/cam"]["frame_id"] == old["frame_id"] + 1
+    reply = playing.step()
+    with (
+        pictures(streams["arm_a/cam"]["zmq_endpoint"], b"arm_a/cam ") as socket,
+        pictures(streams[other]["zmq_endpoint"], f"{other} ".encode()) as others,
+    ):
+        first = socket.recv_multipart()
+        for _ in range(3):
+            others.recv_multipart()  # not delayed by anything, it is sent over and over
+        assert sim_time_of(first) == pytest.approx(reply["time"] - 0.5)
+        later = playing.step(n_steps=20)
+        second = socket.recv_multipart()
+        assert number_of(second) > number_of(first), "what was sent is not sent again"
+        assert sim_time_of(second) == pytest.approx(later["time"] - 0.5)
+
+
+def test_a_step_does_not_choose_from_what_a_camera_withholds(playing: Bench) -> None:
+    """Beta statement 94."""
+    playing.wire.ask("set_camera_delay", cameras={"arm_a/cam": 10})
+    reply = playing.step(n_steps=10)
+    assert shown(playing, {"frame_id": reply["frame_id"]}) is None
+    assert shown(playing, {"frame_id": reply["frame_id"]}, wait_cameras=True) is None
+    assert shown(playing, "sync", n_steps=1) is not None
+    late = playing.step(n_steps=2000, include_cameras={"arm_a/cam": {"frame_id": 1e15}})
+    assert late["cameras"]["arm_a/cam"]["sim_time"] <= late["time"] - 10
+
+
+def test_a_reset_forgets_what_a_camera_saw(playing: Bench) -> None:
+    playing.wire.ask("set_camera_delay", cameras={"arm_a/cam": 0.02})
+    assert shown(playing) is None
+    assert [shown(playing) for _ in range(4)][3] is not None
+    playing.wire.ask("reset")
+    assert [shown(playing) for _ in range(3)] == [None] * 3
+    after = shown(playing)
+    assert after is not None
+    assert after["sim_time"] == 0
+    later = playing.wire.ask("reset", keyframe_name=f"{playing.a}_home")
+    assert later["time"] > 1
+    assert shown(playing) is None, "not even when the clock goes on to a later time"
+
+
+def test_a_delay_is_changed_and_taken_back(playing: Bench) -> None:
+    playing.wire.ask("set_camera_delay", cameras={"arm_a/cam": 0.05})
+    playing.step(n_steps=20)
+    assert shown(playing, n_steps=20) is not None
+    told = playing.wire.ask("set_camera_delay", cameras={"arm_a/cam": {"delay_s": 0.3, "max_fps": 10}})
+    assert told["cameras"]["arm_a/cam"]["max_fps"] == 10
+    told = playing.wire.ask("set_camera_delay", cameras={"arm_a/cam": -1})["cameras"]["arm_a/cam"]
+    assert (told["delay_s"], told["max_fps"]) == (0, 10), "a limit stays until one is given"
+    told = playing.wire.ask("set_camera_delay", cameras={"arm_a/cam": {"on_state_change": False}})["cameras"]
+    assert (told["arm_a/cam"]["on_state_change"], told["arm_a/cam"]["max_fps"]) == (False, 0)
+    reply = playing.step(include_cameras={"arm_a/cam": "latest"}, render="sync")
+    assert reply["cameras"]["arm_a/cam"]["frame_id"] == reply["frame_id"]
+    assert playing.core.play.current.engine.snapshots.hooks == [], "nothing is kept for cameras that are not late"
+
+
+def test_a_camera_with_a_limit_of_pictures(playing: Bench) -> None:
+    playing.wire.ask("set_camera_delay", cameras={"arm_a/cam": {"max_fps": 50}})
+    numbers = [frame["frame_id"] for _ in range(9) if (frame := shown(playing))]
+    assert [number - numbers[0] for number in numbers] == [0, 0, 0, 4, 4, 4, 4, 8, 8]
+
+
+@pytest.mark.parametrize("bad", [{"delay_s": float("nan")}, {"max_fps": 1e300}, {"clock": "sun"}])
+def test_a_delay_that_cannot_be_changes_nothing(playing: Bench, bad: dict[str, Any]) -> None:
+    cameras = {f"{playing.b}/cam": 5, "arm_a/cam": bad}
+    assert playing.refused("set_camera_delay", cameras=cameras)[0] == "bad_request"
+    reply = playing.step(include_cameras=True, render="sync")
+    assert {frame["frame_id"] for frame in reply["cameras"].values()} == {reply["frame_id"]}
+    assert playing.refused("set_camera_delay", cameras={})[0] == "bad_request"
+    assert playing.refused("set_camera_delay")[0] == "missing_field"
+    assert playing.wire.ask("set_camera_delay", cameras={"nobody/cam": 1})["cameras"] == {}

@@ -15,7 +15,6 @@ from urlab_client.protocol.enums import ObservationLevel, StepMode
 from urlab_client.protocol.messages.control import UNCLAIMED
 from urlab_client.protocol.messages.session import (
     ArticulationInfo,
-    CameraFrame,
     CameraInfo,
     ControllerInfo,
     EntityInfo,
@@ -42,7 +41,7 @@ from urlab_client.server.physics.controllers import ArticulationControl, float32
 from urlab_client.server.physics.observe import sim_clock, wall_clock
 from urlab_client.server.physics.play import Running
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.render.camera_renderer import Exposure
+from urlab_client.server.render.camera_renderer import Film
 from urlab_client.server.rpc.dispatch import handles
 
 logger = logging.getLogger("urlab_client.server")
@@ -200,26 +199,19 @@ def step(server: ServerCore, request: Step) -> StepOk | bytes:
         if server.session.json or running.engine.replay is not None or running.channels.declared:
             return running.engine.step(request, lambda _: _observe_step(running, level))
         engine, encode = running.engine, running.step_frames.encode
-        return engine.step(request, lambda _: encode(level, engine.time, engine.step_count, engine.frame_id))
+        return engine.step(request, lambda _: encode(level, engine.time, engine.step_count, engine.snapshots.number))
 
-    def observe(mode: StepMode) -> tuple[StepOk, StepMode, Exposure | None]:
-        stepped = server.dialect.draws_for_steps and (forms or mode in (StepMode.DIRECT, StepMode.PUPPET))
-        exposure = running.cameras.capture(shots, running.engine.frame_id) if stepped else None
-        return _observe_step(running, level), mode, exposure
+    def observe(mode: StepMode) -> tuple[StepOk, Film | None]:
+        film = None
+        if forms or mode in (StepMode.DIRECT, StepMode.PUPPET):
+            draw = server.dialect.draws_for_steps
+            film = running.cameras.capture(shots, running.engine.snapshots.number, draw=draw)
+        return _observe_step(running, level), film
 
-    reply, mode, exposure = running.engine.step(request, observe)
-    if forms or mode in (StepMode.DIRECT, StepMode.PUPPET):
-        reply.cameras = _wanted(request, running.cameras.frames(shots, exposure))
+    reply, film = running.engine.step(request, observe)
+    if film is not None:
+        reply.cameras = running.cameras.frames(shots, film)
     return reply
-
-
-def _wanted(request: Step, frames: dict[str, CameraFrame] | None) -> dict[str, CameraFrame] | None:
-    """Leave out pictures of snapshots before the ones that a request names."""
-    asked = request.include_cameras
-    if frames is None or isinstance(asked, bool):
-        return frames
-    least = {key: kind.get("frame_id", 0.0) for key, kind in asked.items() if isinstance(kind, dict)}
-    return {key: frame for key, frame in frames.items() if (frame.frame_id or 0) >= least.get(key, 0.0)} or None
 
 
 def _check_owners(server: ServerCore, running: Running, request: Step) -> None:
@@ -249,7 +241,7 @@ def _observe_step(running: Running, level: ObservationLevel) -> StepOk:
         wall_time=wall_clock(),
         per_articulation=observer.articulations(level),
         entities=observer.entities(),
-        frame_id=engine.frame_id if engine.dialect.frame_ids else None,
+        frame_id=engine.snapshots.number if engine.dialect.frame_ids else None,
         replay=None
         if engine.replay is None
         else ReplayProgress(current_frame=engine.replay.current_frame, total_frames=engine.replay.total_frames),

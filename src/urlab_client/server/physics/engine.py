@@ -24,7 +24,7 @@ from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.physics.articulations import Articulations
 from urlab_client.server.physics.controllers import ControllerConfig
 from urlab_client.server.physics.data_lock import DataLock, MujocoCall, Overdue, busy
-from urlab_client.server.physics.hooks import Hook, call_hooks
+from urlab_client.server.physics.hooks import Hook, Snapshots, call_hooks
 from urlab_client.server.physics.integrator import Integrator, shutting_down
 from urlab_client.server.physics.pacing import GIVE_WAY_S, IDLE_S, LivePacing
 from urlab_client.server.physics.physics_thread import PhysicsThread
@@ -61,8 +61,7 @@ class Engine:
             which may have to wait for the physics thread.
         dialect: What the server says in the way of one generation of the plugin.
         articulations: The articulations with their set-points, by what they are called in requests and replies.
-        frame_id: Number of the newest snapshot of the state; grows with each request that steps, and in live mode with
-            each iteration that moves.
+        snapshots: Numbers the states: one for each request that steps, and for each live iteration that moves.
         on_substep: Called under the lock after each integration step and each puppet push.
         on_tick: Called under the lock after each live iteration (also while paused) and each direct request, and about
             ten times a second while a stepped mode idles. A hook of either list that raises is logged and removed.
@@ -115,7 +114,7 @@ class Engine:
         self._mode = self._pinned or StepMode.LIVE
         self._paused = paused
         self._step_count = 0
-        self.frame_id = 0
+        self.snapshots = Snapshots()
         self._live_pushed: list[int] = []
         self._fault: str | None = None
         self._player: Player | None = None
@@ -311,6 +310,7 @@ class Engine:
             except Exception as error:
                 raise self._fail(error) from error
             self._step_count = 0
+            self.snapshots.restart()
             self._fault = None
             self._kick()
 
@@ -422,7 +422,7 @@ class Engine:
 
     def _count(self, n_steps: int) -> None:
         self._step_count += n_steps
-        self.frame_id += 1
+        self.snapshots.take()
         self._tick_due = bool(self.on_tick)
 
     def _push(self, request: Step) -> None:
@@ -436,7 +436,7 @@ class Engine:
             raise self._fail(error) from error
         call_hooks(self.on_substep)
         self._step_count += 1
-        self.frame_id += 1
+        self.snapshots.take()
 
     def _fail(self, error: Exception) -> Refusal:
         """Pause after a physics error and return the refusal that tells of it."""
@@ -490,7 +490,7 @@ class Engine:
         self.articulations.apply_controls()
         if not self._paused:
             self._integrator.advance_live()
-            self.frame_id += 1
+            self.snapshots.take()
         self.articulations.clear_wrenches(self._live_pushed)
         self._live_pushed.clear()
         self._tick()

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
-__all__ = ["Hook", "call_hooks"]
+__all__ = ["Hook", "Snapshots", "call_hooks"]
 
 logger = logging.getLogger("urlab_client.server")
 
@@ -21,3 +22,28 @@ def call_hooks(hooks: list[Hook]) -> None:
             logger.exception("%r failed and is not called again", hook)
             if hook in hooks:
                 hooks.remove(hook)
+
+
+@dataclass(eq=False)
+class Snapshots:
+    """Numbers the snapshots of the state.
+
+    Attributes:
+        number: Number of the newest.
+        episode: How often the state was reset.
+        hooks: Called for each, and at each reset. One that raises is logged and removed.
+    """
+
+    number: int = 0
+    episode: int = 0
+    hooks: list[Hook] = field(default_factory=list[Hook])
+
+    def take(self) -> None:
+        """Count one more."""
+        self.number += 1
+        call_hooks(self.hooks)
+
+    def restart(self) -> None:
+        """Note that the state was reset; it keeps the number."""
+        self.episode += 1
+        call_hooks(self.hooks)

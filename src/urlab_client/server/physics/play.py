@@ -9,13 +9,14 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Final
 
 from urlab_client.protocol.enums import PIEState
+from urlab_client.protocol.messages.cameras import CameraDelayInForce
 from urlab_client.server.compile.failure import CompileFailed
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.limits import Limits
@@ -78,6 +79,21 @@ class Running:
     def sessions(self) -> ReplaySessions:
         """The recorded sessions."""
         return ReplaySessions(self.scene, self.recordings, self.limits)
+
+    def delay_cameras(self, wanted: Mapping[str, tuple[CameraDelayInForce, int]]) -> None:
+        """Set latencies of cameras, with the seeds of their jitter, by `ARTICULATION/CAMERA`."""
+        hooks = self.engine.snapshots.hooks
+        with self.engine.lock:
+            for key, (settings, seed) in wanted.items():
+                self.cameras.delay(key, settings, seed)
+            if self._see in hooks:
+                hooks.remove(self._see)
+            if self.cameras.delays:
+                hooks.append(self._see)
+                self._see()
+
+    def _see(self) -> None:
+        self.cameras.see(self.engine.snapshots.number, self.engine.snapshots.episode)
 
     def close(self, timeout: float = 1.0) -> bool:
         """End it within about `timeout` seconds; return False when something was still busy then."""

@@ -24,17 +24,19 @@ from numpy.typing import NDArray
 
 from urlab_client.protocol.dialects import ALPHA, Dialect
 from urlab_client.protocol.enums import CameraMode
+from urlab_client.protocol.messages.cameras import CameraDelayInForce
 from urlab_client.protocol.messages.session import CameraChoice, CameraFrame
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.compile.scene_index import SceneCamera
 from urlab_client.server.render.drawing import RenderQuality, Stage
+from urlab_client.server.render.latency import Instant, Latency, Past
 from urlab_client.server.render.opengl import RenderingUnavailable, need_backend, search_backend
 from urlab_client.server.render.tints import Tints
 from urlab_client.server.render.viewport_picture import ViewportPicture
 from urlab_client.server.system.health import Health
 from urlab_client.server.system.thread_join import ended
 
-__all__ = ["CameraRenderer", "Exposure", "Painting", "Shot"]
+__all__ = ["CameraRenderer", "Exposure", "Film", "Painting", "Shot"]
 
 logger = logging.getLogger("urlab_client.server")
 
@@ -46,6 +48,13 @@ LATEST_S: Final = 1.0 / 30.0
 FRAMES_DEADLINE_S: Final = 30.0
 """Longest wait for the frames of a step; the first ones include the search for OpenGL."""
 
+_VISIBLE: Final = (
+    mujoco.mjtState.mjSTATE_FULLPHYSICS.value
+    | mujoco.mjtState.mjSTATE_MOCAP_POS.value
+    | mujoco.mjtState.mjSTATE_MOCAP_QUAT.value
+)
+"""The parts of a state that pictures depend on."""
+
 MAX_FAILED: Final = 3
 """After so many failures in a row drawing is given up until the next play session."""
 
@@ -56,6 +65,7 @@ class _Camera:
     mode: CameraMode
     frame: CameraFrame | None = None
     drawn_at: float = -float("inf")
+    latency: Latency | None = None
 
     def stale(self, now: float) -> bool:
         return self.frame is None or now - self.drawn_at > LATEST_S
@@ -69,11 +79,15 @@ class Shot:
         key: The camera as the request names it, the frame's key in the reply.
         camera: The camera.
         sync: Draw the state after the step, rather than hand over the latest frame.
+        late: What delays the frame.
+        least: Number of the first snapshot that is good enough.
     """
 
     key: str
     camera: _Camera
     sync: bool
+    late: Latency | None = None
+    least: float = 0.0
 
 
 @dataclass(eq=False)
@@ -85,6 +99,7 @@ class Exposure:
         data: The state.
         taken_at: When it was the state, monotonic seconds.
         frame_id: Number of its snapshot; None in dialects whose pictures do not tell.
+        past: What gets the frame instead of the one camera, which saw this some time ago.
         done: Set when the cameras have their frames, or never will.
     """
 
@@ -92,7 +107,41 @@ class Exposure:
     data: mujoco.MjData
     taken_at: float
     frame_id: int | None = None
+    past: Past | None = None
     done: threading.Event = field(default_factory=threading.Event)
+
+
+@dataclass(frozen=True)
+class Film:
+    """What the frames of a request come from.
+
+    Attributes:
+        taken_at: When it was captured, monotonic seconds.
+        captured: The same as Unix seconds.
+        jobs: What has to be drawn.
+        past: What delayed cameras show; those that have nothing to show yet are missing.
+    """
+
+    taken_at: float
+    captured: float
+    jobs: Sequence[Exposure]
+    past: Mapping[Latency, Past]
+
+    def frame(self, shot: Shot) -> CameraFrame | None:
+        """Return the frame for a shot, once `jobs` are done; None without one that is new enough."""
+        if shot.late is not None:
+            past = self.past.get(shot.late)
+            return None if past is None else past.frame
+        frame = shot.camera.frame
+        if frame is None or (frame.frame_id or 0) < shot.least:
+            return None
+        asked = any(shot.camera in job.cameras for job in self.jobs if job.past is None)
+        return None if shot.sync and asked and shot.camera.drawn_at < self.taken_at else frame
+
+    def capture_time(self, shot: Shot) -> float:
+        """Return when the camera saw what the frame for a shot shows, Unix seconds."""
+        past = None if shot.late is None else self.past.get(shot.late)
+        return self.captured if past is None else past.captured
 
 
 @dataclass(eq=False)
@@ -150,6 +199,7 @@ class CameraRenderer:
                 robot = names.get(index.key, index.key)
                 self._by_name[f"{robot}/{dialect.camera_part(info.name)}"] = camera
                 self._bare[dialect.camera_key(robot, info.name)] = camera  # of several, the last
+        self._episode = 0
         self._model: mujoco.MjModel | None = None
         self._spare: list[mujoco.MjData] = []  # making one takes longer than copying a state
         self._queue: queue.SimpleQueue[Exposure | Painting | None] = queue.SimpleQueue()
@@ -173,16 +223,62 @@ class CameraRenderer:
             fresh: Whether every picture is to show the state after the step.
         """
         if isinstance(include_cameras, bool):
-            return [Shot(key, camera, sync=fresh) for key, camera in self._bare.items()] if include_cameras else []
+            cameras = self._bare if include_cameras else {}
+            return [Shot(key, camera, sync=fresh, late=_late(camera)) for key, camera in cameras.items()]
         shots: list[Shot] = []
         for key, kind in include_cameras.items():
             camera = self._by_name.get(key) or self._bare.get(key)
             if camera is not None and kind is not None:
+                now = isinstance(kind, str) and kind.lower() == "sync"
+                late = None if now else _late(camera)
                 # A picture from some snapshot on is asked for: that of now is one, if there is any.
+                least = 0.0 if isinstance(kind, str) or not self._stamped else kind.get("frame_id", 0.0)
                 later = self._stamped and not isinstance(kind, str)
-                sync = fresh or later or (isinstance(kind, str) and kind.lower() == "sync")
-                shots.append(Shot(key, camera, sync=sync))
+                shots.append(Shot(key, camera, sync=fresh or later or now, late=late, least=least))
         return shots
+
+    def stream_shots(self, keys: Iterable[str]) -> list[Shot]:
+        """Return what the streams of cameras, by `ARTICULATION/CAMERA`, show; unknown ones are left out."""
+        cameras = {key: self._by_name[key] for key in keys if key in self._by_name}
+        return [Shot(key, camera, sync=True, late=_late(camera)) for key, camera in cameras.items()]
+
+    def latency(self, key: str) -> CameraDelayInForce | None:
+        """Return the latency of a camera as it was set; None if it was not."""
+        latency = self._by_name[key].latency
+        return None if latency is None else latency.settings
+
+    def delay(self, key: str, settings: CameraDelayInForce, seed: int) -> None:
+        """Set the latency of a camera, by `ARTICULATION/CAMERA`; the caller holds the engine's lock."""
+        camera = self._by_name[key]
+        camera.latency = Latency(settings, seed, camera.latency)
+
+    @property
+    def delays(self) -> bool:
+        """Whether a camera shows what it saw some time ago, so that `see` has to be called."""
+        return any(_late(camera) is not None for camera in self._by_name.values())
+
+    def see(self, frame_id: int, episode: int) -> None:
+        """Let the delayed cameras see the state; the caller holds the engine's lock.
+
+        Args:
+            frame_id: Number of its snapshot.
+            episode: Another than before, if the simulation was reset since.
+        """
+        now = self._now()
+        if episode != self._episode:
+            self._episode = episode
+            for camera in self._by_name.values():
+                if camera.latency is not None:
+                    camera.latency.forget()
+        late = [late for camera in self._by_name.values() if (late := _late(camera)) and not late.skips(now)]
+        if not late:
+            return
+        model, data = self._scene.model, self._scene.data
+        state = np.empty(mujoco.mj_stateSize(model, _VISIBLE))
+        mujoco.mj_getState(model, data, state, _VISIBLE)
+        captured = time.time()
+        for latency in late:
+            latency.see(frame_id, now, captured, state)
 
     def frame_bytes(self, include_cameras: CameraChoice) -> int:
         """Return the size of the pixels that a request's `include_cameras` asks for."""
@@ -193,39 +289,47 @@ class CameraRenderer:
         """Return width and height of all cameras by `ARTICULATION/CAMERA`."""
         return {key: camera.info.resolution for key, camera in self._by_name.items()}
 
-    def capture(self, shots: Iterable[Shot], frame_id: int = 0) -> Exposure | None:
-        """Copy the state that `frames` draws; the caller holds the engine's lock.
+    def capture(self, shots: Iterable[Shot], frame_id: int = 0, *, draw: bool = True) -> Film:
+        """Copy the states that `frames` draws; the caller holds the engine's lock.
 
         Args:
             shots: What is asked for.
             frame_id: Number of the state's snapshot.
+            draw: Whether frames may be drawn; without, the ones that there are have to do.
 
         Returns:
-            What to hand to `frames`; None if nothing has to be drawn.
+            What to hand to `frames`.
         """
-        now = time.monotonic()
-        cameras = list(dict.fromkeys(shot.camera for shot in shots if shot.sync or shot.camera.stale(now)))
-        if not cameras or self._broken:
-            return None
-        return Exposure(cameras, self._copy_state(), now, frame_id if self._stamped else None)
+        now, draw = self._now(), draw and not self._broken
+        jobs: list[Exposure] = []
+        past: dict[Latency, Past] = {}
+        cameras: list[_Camera] = []
+        for shot in shots:
+            if shot.late is None:
+                if shot.camera not in cameras and (shot.sync or shot.camera.stale(now.wall)):
+                    cameras.append(shot.camera)
+            elif shot.late not in past and (seen := shot.late.revealed(now)) is not None:
+                past[shot.late] = seen
+                if seen.frame is None and draw:
+                    jobs.append(Exposure([shot.camera], self._past_state(seen), now.wall, seen.frame_id, seen))
+        if cameras and draw:
+            jobs.append(Exposure(cameras, self._copy_state(), now.wall, frame_id if self._stamped else None))
+        return Film(now.wall, time.time(), jobs, past)
 
-    def frames(self, shots: Sequence[Shot], job: Exposure | None) -> dict[str, CameraFrame] | None:
+    def frames(self, shots: Sequence[Shot], film: Film) -> dict[str, CameraFrame] | None:
         """Draw what has to be drawn and return the frames by the request's keys; None without any.
 
         Without OpenGL, or when drawing fails or takes too long, cameras are left out; the log says why.
 
         Args:
             shots: What is asked for.
-            job: What `capture` returned.
+            film: What `capture` returned.
         """
-        if job is not None and self._submit(job) and not job.done.wait(FRAMES_DEADLINE_S):
+        deadline = time.monotonic() + FRAMES_DEADLINE_S
+        drawing = [job for job in film.jobs if self._submit(job)]
+        if not all(job.done.wait(max(0.0, deadline - time.monotonic())) for job in drawing):
             logger.warning("no camera images within %g s; continuing without them", FRAMES_DEADLINE_S)
-        frames = {
-            shot.key: shot.camera.frame
-            for shot in shots
-            if shot.camera.frame is not None and (not shot.sync or job is None or shot.camera.drawn_at >= job.taken_at)
-        }
-        return frames or None
+        return {shot.key: frame for shot in shots if (frame := film.frame(shot)) is not None} or None
 
     def capture_viewport(self, picture: ViewportPicture) -> Painting:
         """Copy the state that `paint` draws; the caller holds the engine's lock."""
@@ -283,6 +387,14 @@ class CameraRenderer:
             data = mujoco.MjData(self._model)
         mujoco.mj_copyData(data, self._model, self._scene.data)
         return data
+
+    def _past_state(self, past: Past) -> mujoco.MjData:
+        data = self._copy_state()  # whatever the past does not hold is as it is now
+        mujoco.mj_setState(self._scene.model, data, past.state, _VISIBLE)
+        return data
+
+    def _now(self) -> Instant:
+        return Instant(float(self._scene.data.time), time.monotonic())
 
     def _submit(self, job: Exposure | Painting) -> bool:
         with self._lock:
@@ -349,5 +461,12 @@ class CameraRenderer:
             frame = stage.draw(job.data, camera.info, camera.mode)
             if job.frame_id is not None:
                 frame.frame_id, frame.sim_time = job.frame_id, float(job.data.time)
+            if job.past is not None:
+                job.past.frame = frame
+                continue
             camera.frame = frame
             camera.drawn_at = job.taken_at
+
+
+def _late(camera: _Camera) -> Latency | None:
+    return camera.latency if camera.latency is not None and camera.latency.withholds else None

@@ -11,7 +11,7 @@ import contextlib
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import zmq
@@ -24,6 +24,7 @@ from urlab_client.protocol.pixels import camera_header
 from urlab_client.protocol.topics import camera_filter
 from urlab_client.server.physics.play import Running
 from urlab_client.server.refusal import Refusal
+from urlab_client.server.render.camera_renderer import Film, Shot
 from urlab_client.server.system.health import Health
 from urlab_client.server.system.thread_join import ended
 from urlab_client.server.transport.curve_authentication import CurveKeys, ZapAuthenticator
@@ -116,6 +117,7 @@ class CameraStreams:
         self._dialect = dialect
         self._zmq_on: set[str] = set()
         self._shm_on: set[str] = set()
+        self._sent: dict[str, int | None] = {}
         self._host = host
         self._memory = memory
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
@@ -158,6 +160,7 @@ class CameraStreams:
             if self._stopping.is_set():
                 return
             self._running = running
+            self._sent.clear()
             for stream in self._streams[1:]:
                 stream.socket.close()
             del self._streams[1:]
@@ -252,22 +255,21 @@ class CameraStreams:
         shared = [] if self._memory is None else self._memory.wanted_cameras()
         if not (topics or shared):
             return
-        shots = running.cameras.shots(dict.fromkeys([*topics, *shared], "sync"))
+        shots = running.cameras.stream_shots(dict.fromkeys([*topics, *shared]))
         try:
             with running.engine.lock:
-                exposure = running.cameras.capture(shots, running.engine.frame_id)
-                captured = time.time()
+                film = running.cameras.capture(shots, running.engine.snapshots.number)
         except Refusal:  # physics is busy; the next time, then
             return
-        frames = running.cameras.frames(shots, exposure) or {}
+        payloads = self._payloads(running, shots, film)
         if self._memory is not None:
             with self._lock:
-                for key, frame in frames.items() if self._running is running else ():
-                    self._memory.publish_picture(key, self._headed(frame, captured))
+                for key, payload in payloads.items() if self._running is running else ():
+                    self._memory.publish_picture(key, payload)
         images: dict[str, bytes] = {}
-        for key in filter(frames.__contains__, topics):
+        for key in filter(payloads.__contains__, topics):
             try:
-                image = self._filtered(topics[key], self._headed(frames[key], captured))
+                image = self._filtered(topics[key], payloads[key])
             except Exception as error:  # noqa: BLE001 - the other cameras are none the worse
                 self._skip(f"an image of '{key}' is not published", error)
                 continue
@@ -278,6 +280,22 @@ class CameraStreams:
                 for stream in self._streams:
                     if stream.key in images:
                         stream.socket.send_multipart([stream.topic, images[stream.key]], zmq.DONTWAIT)
+
+    def _payloads(self, running: Running, shots: Sequence[Shot], film: Film) -> dict[str, bytes]:
+        """Draw, and return what is to be sent."""
+        frames = running.cameras.frames(shots, film) or {}
+        captured = {shot.key: film.capture_time(shot) for shot in shots}
+        with self._lock:
+            if self._running is not running:
+                return {}
+            news = {key: frame for key, frame in frames.items() if self._is_news(running, key, frame)}
+        return {key: self._headed(frame, captured[key]) for key, frame in news.items()}
+
+    def _is_news(self, running: Running, key: str, frame: CameraFrame) -> bool:
+        """Whether a picture is to be sent, as far as the camera is to send only what has changed."""
+        latency = running.cameras.latency(key)
+        before, self._sent[key] = self._sent.get(key), frame.frame_id
+        return latency is None or not latency.on_state_change or before != frame.frame_id
 
     def _headed(self, frame: CameraFrame, captured: float) -> bytes:
         if not self._dialect.camera_headers:
