@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zmq
-from beta_bench import ME, Bench
+from beta_bench import Bench
 from raw_shm import RawRegion
 from waiting import eventually
 from wire import Wire
@@ -153,9 +153,6 @@ def test_the_field_of_view_is_the_vertical_one(tmp_path: Path) -> None:
     assert seen == [True, False]
 
 
-STEP_S = 0.005
-
-
 def shown(bench: Bench, how: object = "latest", **fields: Any) -> dict[str, Any] | None:
     """Step once and return the reply's picture of the first robot's camera."""
     return bench.step(include_cameras={"arm_a/cam": how}, **fields).get("cameras", {}).get("arm_a/cam")
@@ -167,7 +164,8 @@ def sim_time_of(message: list[bytes]) -> float:
 
 def test_a_delayed_camera(playing: Bench) -> None:
     """Beta statement 54."""
-    streams = playing.wire.ask("set_camera_streaming", cameras={"arm_a/cam": {"zmq": True}})["cameras"]["arm_a/cam"]
+    other = f"{playing.b}/cam"
+    streams = playing.wire.ask("set_camera_streaming", cameras={"arm_a/cam": True, other: True})["cameras"]
     told = playing.wire.ask("set_camera_delay", cameras={"ARM_A/cam": {"delay_s": 0.5, "seed": 7}, "nobody/cam": 1})
     in_force = {"delay_s": 0.5, "jitter_s": 0.0, "clock": "sim", "on_state_change": True, "max_fps": 0.0}
     assert told["cameras"] == {"arm_a/cam": in_force}
@@ -177,14 +175,19 @@ def test_a_delayed_camera(playing: Bench) -> None:
         reply = playing.step(include_cameras={"arm_a/cam": "sync"})
         seen[round(reply["time"], 6)] = reply["cameras"]["arm_a/cam"]
         assert reply["cameras"]["arm_a/cam"]["frame_id"] == reply["frame_id"]
-    reply = playing.step(include_cameras={"arm_a/cam": "latest", f"{playing.b}/cam": "latest"}, render="sync")
+    reply = playing.step(include_cameras={"arm_a/cam": "latest", other: "latest"}, render="sync")
     old = reply["cameras"]["arm_a/cam"]
     assert old == seen[round(reply["time"] - 0.5, 6)]
-    assert reply["cameras"][f"{playing.b}/cam"]["frame_id"] == reply["frame_id"], "the other camera is not delayed"
+    assert reply["cameras"][other]["frame_id"] == reply["frame_id"], "the other camera is not delayed"
     assert playing.step(include_cameras=True)["cameras"]["arm_a/cam"]["frame_id"] == old["frame_id"] + 1
     reply = playing.step()
-    with pictures(streams["zmq_endpoint"], b"arm_a/cam ") as socket:
+    with (
+        pictures(streams["arm_a/cam"]["zmq_endpoint"], b"arm_a/cam ") as socket,
+        pictures(streams[other]["zmq_endpoint"], f"{other} ".encode()) as others,
+    ):
         first = socket.recv_multipart()
+        for _ in range(3):
+            others.recv_multipart()  # not delayed by anything, it is sent over and over
         assert sim_time_of(first) == pytest.approx(reply["time"] - 0.5)
         later = playing.step(n_steps=20)
         second = socket.recv_multipart()
@@ -205,13 +208,16 @@ def test_a_step_does_not_choose_from_what_a_camera_withholds(playing: Bench) -> 
 
 def test_a_reset_forgets_what_a_camera_saw(playing: Bench) -> None:
     playing.wire.ask("set_camera_delay", cameras={"arm_a/cam": 0.02})
-    assert [shown(playing) for _ in range(5)][4] is not None
-    playing.claim()
-    playing.wire.ask("reset", control_owner=ME)
-    after = [shown(playing) for _ in range(5)]
-    assert after[:4] == [None] * 4
-    assert after[4] is not None
-    assert after[4]["sim_time"] == pytest.approx(STEP_S)
+    assert shown(playing) is None
+    assert [shown(playing) for _ in range(4)][3] is not None
+    playing.wire.ask("reset")
+    assert [shown(playing) for _ in range(3)] == [None] * 3
+    after = shown(playing)
+    assert after is not None
+    assert after["sim_time"] == 0
+    later = playing.wire.ask("reset", keyframe_name=f"{playing.a}_home")
+    assert later["time"] > 1
+    assert shown(playing) is None, "not even when the clock goes on to a later time"
 
 
 def test_a_delay_is_changed_and_taken_back(playing: Bench) -> None:

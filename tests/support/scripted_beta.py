@@ -103,6 +103,7 @@ class ScriptedBeta(ScriptedServer):
         streaming: Whether a camera streams over ZeroMQ and over shared memory, by its name.
         jobs: Running jobs: polls left, and the result.
         running: Polls that answer `running` before a job ends.
+        uploads: Bytes of the open upload's files that have arrived, by name.
     """
 
     def __init__(self, *, skew: bool = False, reads_owner: bool = True, without: tuple[str, ...] = ()) -> None:
@@ -121,6 +122,7 @@ class ScriptedBeta(ScriptedServer):
         self.ctrl: dict[str, list[float]] = {name: [0.0] for name, _, _ in ROBOTS}
         self.streaming: dict[str, tuple[bool, bool]] = {}
         self.jobs: dict[str, list[Any]] = {}
+        self.uploads: dict[str, bytes] = {}
         self.started = 0
         self.running = 2
         self.direct_results: dict[str, Callable[[Request], Reply]] = {}
@@ -442,6 +444,35 @@ class ScriptedBeta(ScriptedServer):
                 "imported_now": True,
             }
         )
+
+    # Models over the wire: one upload, of which everything is missing.
+
+    def _upload_model_manifest(self, request: Request) -> Reply:
+        self.uploads.clear()
+        return {
+            "op": "upload_model_manifest_ok",
+            "upload_id": "upload_1",
+            "need_xml": True,
+            "need_assets": [asset["name"] for asset in request["assets"]],
+        }
+
+    def _upload_model_chunk(self, request: Request) -> Reply:
+        name = request.get("name") or "<xml>"
+        data = self.uploads[name] = self.uploads.get(name, b"") + request["data"]
+        return {
+            "op": "upload_model_chunk_ok",
+            "name": name,
+            "received": float(len(data)),
+            "complete": len(data) == request["total"],
+        }
+
+    def _upload_model_commit(self, request: Request) -> Reply:
+        return {
+            "op": "upload_model_commit_ok",
+            "imported": True,
+            "blueprint_class_path": "/Game/MuJoCoImports/model.model_C",
+            "blueprint_short_name": "model",
+        }
 
     def _remove_actor(self, request: Request) -> Reply:
         if request["target"] == "nobody":

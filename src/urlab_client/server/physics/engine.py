@@ -61,8 +61,7 @@ class Engine:
             which may have to wait for the physics thread.
         dialect: What the server says in the way of one generation of the plugin.
         articulations: The articulations with their set-points, by what they are called in requests and replies.
-        snapshots: Numbers the snapshots of the state, under the lock: one for each request that steps, and in live mode
-            for each iteration that moves.
+        snapshots: Numbers the states: one for each request that steps, and for each live iteration that moves.
         on_substep: Called under the lock after each integration step and each puppet push.
         on_tick: Called under the lock after each live iteration (also while paused) and each direct request, and about
             ten times a second while a stepped mode idles. A hook of either list that raises is logged and removed.
@@ -311,6 +310,7 @@ class Engine:
             except Exception as error:
                 raise self._fail(error) from error
             self._step_count = 0
+            self.snapshots.restart()
             self._fault = None
             self._kick()
 

@@ -30,13 +30,20 @@ class Snapshots:
 
     Attributes:
         number: Number of the newest.
-        hooks: Called for each. One that raises is logged and removed.
+        episode: How often the state was reset.
+        hooks: Called for each, and at each reset. One that raises is logged and removed.
     """
 
     number: int = 0
+    episode: int = 0
     hooks: list[Hook] = field(default_factory=list[Hook])
 
     def take(self) -> None:
         """Count one more."""
         self.number += 1
+        call_hooks(self.hooks)
+
+    def restart(self) -> None:
+        """Note that the state was reset; it keeps the number."""
+        self.episode += 1
         call_hooks(self.hooks)

@@ -93,7 +93,7 @@ class Running:
                 self._see()
 
     def _see(self) -> None:
-        self.cameras.see(self.engine.snapshots.number)
+        self.cameras.see(self.engine.snapshots.number, self.engine.snapshots.episode)
 
     def close(self, timeout: float = 1.0) -> bool:
         """End it within about `timeout` seconds; return False when something was still busy then."""

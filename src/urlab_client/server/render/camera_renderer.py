@@ -199,6 +199,7 @@ class CameraRenderer:
                 robot = names.get(index.key, index.key)
                 self._by_name[f"{robot}/{dialect.camera_part(info.name)}"] = camera
                 self._bare[dialect.camera_key(robot, info.name)] = camera  # of several, the last
+        self._episode = 0
         self._model: mujoco.MjModel | None = None
         self._spare: list[mujoco.MjData] = []  # making one takes longer than copying a state
         self._queue: queue.SimpleQueue[Exposure | Painting | None] = queue.SimpleQueue()
@@ -256,9 +257,19 @@ class CameraRenderer:
         """Whether a camera shows what it saw some time ago, so that `see` has to be called."""
         return any(_late(camera) is not None for camera in self._by_name.values())
 
-    def see(self, frame_id: int) -> None:
-        """Let the delayed cameras see the state, the snapshot of this number; the caller holds the engine's lock."""
+    def see(self, frame_id: int, episode: int) -> None:
+        """Let the delayed cameras see the state; the caller holds the engine's lock.
+
+        Args:
+            frame_id: Number of its snapshot.
+            episode: Another than before, if the simulation was reset since.
+        """
         now = self._now()
+        if episode != self._episode:
+            self._episode = episode
+            for camera in self._by_name.values():
+                if camera.latency is not None:
+                    camera.latency.forget()
         late = [late for camera in self._by_name.values() if (late := _late(camera)) and not late.skips(now)]
         if not late:
             return

@@ -87,6 +87,11 @@ class Latency:
         """Return whether a state of now comes too soon after the last one to be kept."""
         return bool(self.past) and 0.0 < self._at(now) - self.past[-1].at < self._spacing - _SLACK_S
 
+    def forget(self) -> None:
+        """Forget what the camera saw before a reset, after which the simulation's clock starts anew."""
+        if self.settings.clock == "sim":
+            self.past.clear()
+
     def see(self, frame_id: int, now: Instant, captured: float, state: NDArray[np.float64]) -> None:
         """Keep a state, and forget those that are not going to be shown any more.
 
@@ -98,7 +103,7 @@ class Latency:
         """
         at, past = self._at(now), self.past
         if past and at < past[-1].at:
-            past.clear()  # a reset: what came after this moment has not happened
+            past.clear()  # pushed back in time: what came after this moment has not happened
         if past and at == past[-1].at:
             past.pop()
         past.append(Past(frame_id, at, self._random.uniform(-1.0, 1.0), captured, state))
