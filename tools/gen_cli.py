@@ -83,9 +83,9 @@ def _help(parser: argparse.ArgumentParser, action: argparse.Action) -> str:
 
 
 def _text(text: str) -> str:
-    """Return text in which words of the shell are code and nothing is taken for HTML."""
+    """Return text in which words of the shell are code and nothing is taken for HTML or a link."""
     text = re.sub(r"(?<![\w`-])(--[a-z][a-z-]*)", r"`\1`", " ".join(text.split()))
-    text = text.replace("<option>", "`<option>`")
+    text = text.replace("<option>", "`<option>`").replace("[", r"\[")
     return f"{text[:1].upper()}{text[1:]}"
 
 

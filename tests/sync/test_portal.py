@@ -98,6 +98,22 @@ class TestCall:
             threads = [thread for thread in set(threading.enumerate()) - before if thread.name == "urlab-io"]
         assert [thread.daemon for thread in threads] == [True]
 
+    def test_the_thread_ends_with_its_portal_though_a_signal_strikes_the_finalizer(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def struck() -> None:
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(_loop, "_ORPHAN_S", 0.05)
+        monkeypatch.setattr(sys, "unraisablehook", lambda _: None)
+        portal = Portal()
+        thread = io_thread(portal)
+        monkeypatch.setattr(_loop, "DeferredSignals", struck)
+        del portal
+        gc.collect()
+        thread.join(DEADLINE_S)
+        assert not thread.is_alive()
+
     def test_the_loop_goes_on_between_calls(self, portal: Portal) -> None:
         ticked = threading.Event()
 

@@ -56,6 +56,10 @@ _LONGEST_PAUSE = 0.08
 # Seconds after which the thread is asked again for the turn.
 _CLAIM_SLICE = 0.05
 
+# Seconds between two looks whether there still is a portal. A signal handler that raises in the collector's callback,
+# before that defers signals, takes the portal's end away from it.
+_ORPHAN_S = 5.0
+
 _log = logging.getLogger("urlab_client.sync")
 
 
@@ -110,9 +114,13 @@ class CallerDrivenLoop:
 
     Args:
         at_stop: Makes the coroutine that releases what lives on the loop; None if there is nothing.
+        owner: Refers to the portal: the loop ends when that is gone.
     """
 
-    def __init__(self, at_stop: Callable[[], Coroutine[Any, Any, object]] | None) -> None:
+    def __init__(
+        self, at_stop: Callable[[], Coroutine[Any, Any, object]] | None, owner: Callable[[], object | None]
+    ) -> None:
+        self._owner = owner
         # Not new_event_loop(): the user's loop policy is about the user's loop, and pyzmq needs a selector on Windows.
         self._loop = CallerLoop()
         self._thread = threading.Thread(target=self._run, name="urlab-io", daemon=True)
@@ -402,7 +410,10 @@ class CallerDrivenLoop:
         self._loop.stop()
 
     async def _main(self) -> None:
-        await self._stop_requested.wait()
+        stop = asyncio.ensure_future(self._stop_requested.wait())
+        while not (await asyncio.wait((stop,), timeout=_ORPHAN_S))[0]:
+            if self._owner() is None:
+                self._request_stop()
         if self._at_stop is not None:
             await _in_bounded_time(asyncio.ensure_future(self._at_stop()))
 
