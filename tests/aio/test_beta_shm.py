@@ -14,7 +14,7 @@ from urlab_client.server import SimulatedServer
 
 
 async def test_requests_go_through_the_files_that_the_handshake_names(tmp_path: Path) -> None:
-    """Generation 2 statements 15 and 58."""
+    """Generation 2 statements 15, 16 and 58."""
     arm = tmp_path / "arm.xml"
     arm.write_text(ROBOT)
     async with (
@@ -24,6 +24,7 @@ async def test_requests_go_through_the_files_that_the_handshake_names(tmp_path: 
         await client.discover()
         told = (await client.call(Hello())).shm_rpc
         assert told is not None
+        assert told.n_buffers == 2
         for path, stride in ((told.req_path, told.req_stride), (told.rep_path, told.rep_stride)):
             size = await asyncio.to_thread(os.path.getsize, path)
             assert size == told.header_size + told.n_buffers * stride
