@@ -12,6 +12,7 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree as ET
 
 import pytest
@@ -21,6 +22,15 @@ from shell import DEADLINE_S, NOT_RUN, Shell, reason, same, steps
 SHELL = {"console", "sh"}
 READ = {"json": json.loads, "toml": tomllib.loads, "xml": ET.fromstring}
 """Languages of blocks that do nothing but must be well formed."""
+
+LONG = {
+    "README.md",
+    "docs/console.md",
+    "docs/environments.md",
+    "docs/howto/cameras.md",
+    "docs/simulated-server.md",
+}
+"""Pages whose code takes several seconds."""
 
 # Runs the blocks of a page as one program; a separator tells their outputs apart. Tracebacks name the page's lines.
 DRIVER = r"""
@@ -72,7 +82,12 @@ def run_python(page: Path, chosen: list[Block], folder: Path, **environment: str
     return done.stderr
 
 
-@pytest.mark.parametrize("page", [p for p in pages() if python_blocks(p) or shell_steps(p)], ids=shown)
+def page_param(page: Path) -> Any:
+    """Return a page as a parameter; what takes several seconds runs with the long tests."""
+    return pytest.param(page, id=shown(page), marks=[pytest.mark.long] if shown(page) in LONG else [])
+
+
+@pytest.mark.parametrize("page", [page_param(p) for p in pages() if python_blocks(p) or shell_steps(p)])
 def test_code_runs(page: Path, tmp_path: Path) -> None:
     # The commands come second, in the same folder, so that they find what the page's program has written.
     if chosen := python_blocks(page):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import math
+import time
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Literal, overload
 
@@ -40,6 +42,7 @@ __all__ = ["foxglove_view"]
 _JPEG_QUALITY = 80
 _NEWTON_M = 0.002  # length of a contact's arrow for each newton
 _BACKLOG = 64  # messages that may wait for one browser; older ones are dropped
+_JOINING_S = 1.0  # after a subscription, how long the newest moment is shown again
 
 
 class _Foxglove:
@@ -55,7 +58,7 @@ class _Foxglove:
         self._channels: dict[tuple[str, str], foxglove.Channel] = {}
         self._shapes: list[Shape] = []
         self._last: Moment | None = None
-        self._joined = False
+        self._joined = self._shown = -math.inf
 
     @property
     def address(self) -> str:
@@ -76,7 +79,7 @@ class _Foxglove:
         class Listener(ServerListener):
             def on_subscribe(self, client: Client, channel: ChannelView) -> None:
                 del client, channel
-                backend._joined = True
+                backend._joined = time.monotonic()
 
         self._context = foxglove.Context()
         self._scene_channel = SceneUpdateChannel("/scene", context=self._context)
@@ -104,7 +107,7 @@ class _Foxglove:
             self._server.clear_session()
         for key in [key for key in self._channels if key[1]]:
             self._channels.pop(key).close()  # the layout in its metadata is another one now
-        self._joined = True
+        self._joined = time.monotonic()
 
     def show(self, moment: Moment) -> None:
         """See `ViewBackend`."""
@@ -127,10 +130,13 @@ class _Foxglove:
 
     def idle(self) -> bool:
         """See `ViewBackend`."""
-        if self._joined and self._last is not None:
-            self._joined = False
+        # Or who joins while time stands still sees nothing. More than once: a subscription may be told of before it is
+        # in force.
+        now = time.monotonic()
+        if self._last is not None and now < self._joined + _JOINING_S and now >= self._shown + _JOINING_S / 4:
+            self._shown = now
             self._send_geometry(self._last.ns)
-            self.show(self._last)  # or who joins while time stands still sees nothing
+            self.show(self._last)
         return True
 
     def close(self) -> None:
