@@ -251,7 +251,7 @@ class LaunchedTransport:
         return ServerUnreachable(
             f"{f'{op.name}: ' if op else ''}the simulated server of {self._address} has ended with code "
             f"{process.returncode}. Nothing was sent.",
-            op=op and op.name,
+            op=op.name if op else None,
             hint="discover() starts another one.",
         )
 
