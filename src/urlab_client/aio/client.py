@@ -389,6 +389,7 @@ class URLabClient(ClientState):
         self,
         policy: str | StreamPolicy = "latest",
         *,
+        max_rate: float | None = None,
         buffer: int = BUFFER_ITEMS,
         buffer_bytes: int = BUFFER_BYTES,
         timeout: Timeout = DEFAULT,
@@ -402,17 +403,20 @@ class URLabClient(ClientState):
 
         Args:
             policy: `latest`, or `all` within the buffer.
+            max_rate: With `latest`, snapshots per second at most, each the newest by then. The rate does not drift: an
+                item that is taken late does not delay those after it. None for as many as come.
             buffer: Snapshots that may wait, with `all`.
             buffer_bytes: Bytes that may wait, with `all`.
             timeout: Seconds that iterating waits for each snapshot; by default the client's for the first one and then
                 without limit; None waits.
 
         Raises:
-            ValueError: Unknown policy, or an empty buffer.
+            ValueError: Unknown policy, an empty buffer, or a rate that is not above 0 or not for this policy.
         """
         return Stream(
             self._publishers.state(policy),
             policy=policy,
+            max_rate=max_rate,
             buffer=buffer,
             buffer_bytes=buffer_bytes,
             timeout=timeout,
@@ -474,16 +478,22 @@ class URLabClient(ClientState):
             default_timeout=self._publishers.default_timeout,
         )
 
-    def events(self, *, buffer: int = BUFFER_ITEMS) -> Stream[ClientEvent]:
+    def events(
+        self, *, kinds: Collection[str | type[ClientEvent]] = (), buffer: int = BUFFER_ITEMS
+    ) -> Stream[ClientEvent]:
         """Stream what happens to the connection, the session and play, from this call on.
 
         Args:
+            kinds: Which events, by class or by name: `connected`, `lost`, `reconnected`, `silent`, `answers`,
+                `session_opened`, `session_lost`, `play_started`, `play_ended`. Empty for all.
             buffer: Events that wait for a reader; the oldest give way, which shows in the next one's `dropped`.
 
         Raises:
             ClientClosed: The client was closed.
+            ValueError: There is no event of such a kind.
+            TypeError: `kinds` is a name by itself.
         """
-        return self._publishers.events.stream(buffer)
+        return self._publishers.events.stream(kinds, buffer)
 
     async def call(self, request: Request[R], *, timeout: Timeout = DEFAULT) -> R:
         """Send any request of `urlab_client.protocol.messages` and return its reply, without taking anything over.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from enum import StrEnum
 from typing import Any
 
@@ -58,6 +59,12 @@ class Diagnosis(Serializable, Struct, frozen=True):
     def healthy(self) -> bool:
         """Whether nothing keeps the robots from moving."""
         return all(finding.verdict is not Verdict.PROBLEM for finding in self.findings)
+
+    def __repr__(self) -> str:
+        counts = Counter(finding.verdict for finding in self.findings)
+        said = ", ".join(f"{counts[verdict]} {verdict}" for verdict in reversed(Verdict) if counts[verdict])
+        problems = [f"{one.subject}: {one.text}" for one in self.findings if one.verdict is Verdict.PROBLEM]
+        return f"<Diagnosis {said or 'empty'}{'; ' if problems else ''}{' '.join(problems)}>"
 
     def __str__(self) -> str:
         return "\n".join(f"{finding.verdict:<8}{finding.subject}: {finding.text}" for finding in self.findings)
