@@ -14,6 +14,7 @@ from waiting import until
 from urlab_client import CallOutcome, CallRecord, ServerUnreachable, UnknownKeyframe, URLabTimeoutError
 from urlab_client.protocol.codec import encode_request
 from urlab_client.protocol.messages.runtime import SetPaused
+from urlab_client.protocol.messages.session import Reset
 from urlab_client.server import Drop, Faults
 
 
@@ -34,7 +35,7 @@ async def test_each_request_is_told_with_its_size_time_and_outcome(connect: Any,
         await client.step(2)
         await client.runtime.set_paused(True)
         with pytest.raises(UnknownKeyframe):
-            await client.reset("nonsense")
+            await client.call(Reset(keyframe_name="nonsense"))
         told = [record for record in records if record.op != "claim_control"]
         assert [(record.op, record.outcome, record.error) for record in told] == [
             ("step", CallOutcome.OK, ""),
