@@ -85,7 +85,7 @@ class Session:
         self.confirmed = False
         self._transport = transport
         self._records = None if observe is None else CallRecords(observe, transport)
-        self._send = transport.request if self._records is None else self._records.request
+        self._way = self._records or transport
         self._default_timeout = default_timeout
         self._json = json
         self.control = Control(self)
@@ -268,7 +268,7 @@ class Session:
         try:
             try:
                 deadline, connect_by = limits
-                answer = await self._send(frame, op, deadline=deadline, connect_by=connect_by, late=late)
+                answer = await self._way.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
             except ConnectionLost as lost:
                 answer = await self._ask_again(frame, op, lost, limits)
             finally:
@@ -350,7 +350,7 @@ class Session:
             log.debug("%s: asking again, because the connection was lost", op.name)
             try:
                 deadline, connect_by = limits
-                return await self._send(frame, op, deadline=deadline, connect_by=connect_by, late=late)
+                return await self._way.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
             except ConnectionLost as again:
                 lost = again
             except ServerUnreachable as unreachable:
