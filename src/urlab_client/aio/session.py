@@ -84,8 +84,8 @@ class Session:
         self.on_refusal: Callable[[URLabRPCError], None] | None = None
         self.confirmed = False
         self._transport = transport
-        self._records = None if observe is None else CallRecords(observe, transport)
-        self._way = self._records or transport
+        self._call_records = None if observe is None else CallRecords(observe, transport)
+        self._way = self._call_records or transport
         self._default_timeout = default_timeout
         self._json = json
         self.control = Control(self)
@@ -246,14 +246,14 @@ class Session:
         """Send a request and return its answer; for whoever holds the line."""
         if self.features.claims and isinstance(request, ControlRequest):
             return self.control.send(request, self._ask, limits)
-        if self._records is not None:
-            return self._records.record(op, self._answer(request, op, limits))
+        if self._call_records is not None:
+            return self._call_records.record(op, self._answer(request, op, limits))
         return self._answer(request, op, limits)
 
     async def _ask(self, request: Request[R], limits: Limits) -> R:
         op = op_of(request)
         answer = self._answer(request, op, limits)
-        return at_once(op, await (answer if self._records is None else self._records.record(op, answer)))
+        return at_once(op, await (answer if self._call_records is None else self._call_records.record(op, answer)))
 
     async def _answer(self, request: Request[R], op: Op, limits: Limits, *, again: bool = False) -> R | OpStarted:
         # One coroutine, though it does several things: each one between a step and its socket costs every step.
@@ -365,7 +365,7 @@ class Session:
         if lock.acquire_nowait():
             return
         waiting = self._wait_for(lock, op, deadline)
-        await (waiting if self._records is None else self._records.queued(op, waiting))
+        await (waiting if self._call_records is None else self._call_records.queued(op, waiting))
 
     async def _wait_for(self, lock: Mutex, op: Op, deadline: float | None) -> None:
         if self._aside is not None:
