@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import warnings
+import itertools
 from collections.abc import Iterator
 from typing import Any, ClassVar
 
-import gymnasium
 import mujoco
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 from urlab_client.integrations.gym import (
+    FixedReach,
     Reach,
+    SpaceMapping,
     Start,
     States,
     Task,
@@ -22,6 +22,7 @@ from urlab_client.integrations.gym import (
     URLabVectorEnv,
     Walk,
 )
+from urlab_client.integrations.gym.spaces import FIELDS
 from urlab_client.server import ControllerConfig, SimulatedServer
 
 
@@ -164,18 +165,36 @@ def test_poses_and_contacts_are_those_of_the_state(made: list[Any]) -> None:
         Start(states.scene, states.qpos[0]).place("quadruped/FL_calf", [0, 0, 0])
 
 
-@pytest.mark.parametrize("task_id", ["urlab/Reach-v0", "urlab/Walk-v0"])
-def test_shipped_tasks_are_registered_and_pass_gymnasiums_checker(task_id: str) -> None:
-    env = gymnasium.make(task_id)
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", ".*(infinity|symmetric and normalized|render modes).*")
-        check_env(env.unwrapped, skip_render_check=True)
-    env.close()
+def test_an_argument_wins_over_the_task_and_what_is_judged_needs_not_be_observed(
+    arms: list[str], made: list[Any]
+) -> None:
+    """Every subset of the fields, on a server and in a batch: rewards are those of the whole observation."""
+    whole = URLabBatchEnv(arms[0], 1, task=FixedReach(), n_substeps=3, reset_noise=0.0, max_episode_steps=1)
+    made.append(whole)
+    expected = whole.reset()[0], *whole.step(np.full((1, 7), 0.2, dtype=np.float32))
+    assert whole.mapping.fields == FIELDS
+    assert expected[4].all(), "one action, as the argument says"
+    for count in range(1, len(FIELDS) + 1):
+        for fields in itertools.combinations(FIELDS, count):
+            options: Any = {"n_substeps": 3, "reset_noise": 0.0, "max_episode_steps": 1, "observations": fields}
+            batch = URLabBatchEnv(arms[0], 1, task=FixedReach(), **options)
+            single = URLabEnv.connect(arms[0], task=FixedReach(), **options)
+            made += [batch, single]
+            for at, ours, theirs in (
+                (0, batch.reset()[0], single.reset()[0]),
+                (1, batch.step(np.full((1, 7), 0.2, dtype=np.float32)), single.step(np.full(7, 0.2))),
+            ):
+                seen, alone = (ours, theirs) if at == 0 else (ours[0], theirs[0])
+                parts = [whole.mapping.field(expected[at], "arm", field) for field in fields]
+                assert np.array_equal(seen, np.concatenate(parts, axis=-1))
+                assert np.array_equal(seen[0], alone)
+            assert ours[1][0] == theirs[1] == expected[2][0] < 0
+            single.close()
+    with pytest.raises(ValueError, match=r"'sensors' is not observed: .*observations=\['qpos'\]"):
+        SpaceMapping(whole.model, {"arm": "arm_"}, ["qpos"]).field(np.zeros(8), "arm", "sensors")
 
 
 def test_what_a_task_settles_is_refused_beside_it(arms: list[str], made: list[Any]) -> None:
-    with pytest.raises(ValueError, match="a task settles reset_noise"):
-        URLabBatchEnv("sim://arm", 1, task=Reach(), reset_noise=0.1)
     with pytest.raises(ValueError, match="a task settles reward_fn"):
         URLabVectorEnv(arms, task=Reach(), reward_fn=lambda *_: 0)
 

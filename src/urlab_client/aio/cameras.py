@@ -84,6 +84,7 @@ class URLabCameraView:
         self,
         policy: str | StreamPolicy = "latest",
         *,
+        max_rate: float | None = None,
         buffer: int = BUFFER_ITEMS,
         buffer_bytes: int = BUFFER_BYTES,
         timeout: Timeout = DEFAULT,
@@ -92,6 +93,7 @@ class URLabCameraView:
 
         Args:
             policy: `latest`, or `all` within the buffer.
+            max_rate: With `latest`, pictures per second at most, each the newest by then; None for as many as come.
             buffer: Pictures that may wait, with `all`.
             buffer_bytes: Bytes that may wait, with `all`.
             timeout: Seconds that iterating waits for each picture; by default the client's for the first one, or 30
@@ -99,11 +101,12 @@ class URLabCameraView:
                 then without limit; None waits.
 
         Raises:
-            ValueError: Unknown policy, or an empty buffer.
+            ValueError: Unknown policy, an empty buffer, or a rate that is not above 0 or not for this policy.
         """
         return Stream(
             self._publishers.camera(self, policy),
             policy=policy,
+            max_rate=max_rate,
             buffer=buffer,
             buffer_bytes=buffer_bytes,
             timeout=timeout,

@@ -42,7 +42,7 @@ from urlab_client.aio.transport.curve import client_keys, is_local
 from urlab_client.aio.transport.server_regions import SharedMemoryRegions
 from urlab_client.aio.transport.shm import ShmTransport
 from urlab_client.protocol.base import Reply, Request
-from urlab_client.protocol.client_types import ClientConfig, Diagnosis, Resync
+from urlab_client.protocol.client_types import CallRecord, ClientConfig, Diagnosis, Resync
 from urlab_client.protocol.enums import CameraTiming, ObservationLevel, StepMode, Transport
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.runtime import SetMode
@@ -92,8 +92,12 @@ class URLabClient(ClientState):
             server and network those that nobody looks at; `frames()` is received all the same.
         claim_control: Take control of a robot with the first write to it, where robots have one owner. False is for
             those who look on, and for those who say `articulation.claim()`.
+        observe: Called with a `CallRecord` when a request is over, whatever became of it: op, bytes, time in the queue,
+            round trip, outcome. It runs on the client's event loop, so it must be quick and must not call the client;
+            what it raises is logged and changes nothing.
 
     Raises:
+        TypeError: `observe` is not a plain function.
         KeyFileError: A key file cannot be used.
         ValueError: The address or an option is malformed.
     """
@@ -119,6 +123,7 @@ class URLabClient(ClientState):
         trust_server: bool = False,
         live_pictures: bool = True,
         claim_control: bool = True,
+        observe: Callable[[CallRecord], object] | None = None,
     ) -> None:
         config = ClientConfig(
             address=address,
@@ -150,7 +155,9 @@ class URLabClient(ClientState):
         memory = SharedMemoryRegions(shm_dir) if Transport(transport) is Transport.SHM else None
         plain = transport_to(address, step_port, keys, shm=memory is not None)
         self._transport = plain if memory is None else ShmTransport(plain, memory)
-        session = Session(self._transport, default_timeout=rcv_timeout_ms / 1000, json=encoding == "json")
+        session = Session(
+            self._transport, default_timeout=rcv_timeout_ms / 1000, json=encoding == "json", observe=observe
+        )
         session.control = Control(session, wanted=claim_control)
         self._publishers = Publishers(
             lambda: self._transport.endpoint,
@@ -389,6 +396,7 @@ class URLabClient(ClientState):
         self,
         policy: str | StreamPolicy = "latest",
         *,
+        max_rate: float | None = None,
         buffer: int = BUFFER_ITEMS,
         buffer_bytes: int = BUFFER_BYTES,
         timeout: Timeout = DEFAULT,
@@ -402,17 +410,20 @@ class URLabClient(ClientState):
 
         Args:
             policy: `latest`, or `all` within the buffer.
+            max_rate: With `latest`, snapshots per second at most, each the newest by then. The rate does not drift: an
+                item that is taken late does not delay those after it. None for as many as come.
             buffer: Snapshots that may wait, with `all`.
             buffer_bytes: Bytes that may wait, with `all`.
             timeout: Seconds that iterating waits for each snapshot; by default the client's for the first one and then
                 without limit; None waits.
 
         Raises:
-            ValueError: Unknown policy, or an empty buffer.
+            ValueError: Unknown policy, an empty buffer, or a rate that is not above 0 or not for this policy.
         """
         return Stream(
             self._publishers.state(policy),
             policy=policy,
+            max_rate=max_rate,
             buffer=buffer,
             buffer_bytes=buffer_bytes,
             timeout=timeout,
@@ -474,16 +485,22 @@ class URLabClient(ClientState):
             default_timeout=self._publishers.default_timeout,
         )
 
-    def events(self, *, buffer: int = BUFFER_ITEMS) -> Stream[ClientEvent]:
+    def events(
+        self, *, kinds: Collection[str | type[ClientEvent]] = (), buffer: int = BUFFER_ITEMS
+    ) -> Stream[ClientEvent]:
         """Stream what happens to the connection, the session and play, from this call on.
 
         Args:
+            kinds: Which events, by class or by name: `connected`, `lost`, `reconnected`, `silent`, `answers`,
+                `session_opened`, `session_lost`, `play_started`, `play_ended`. Empty for all.
             buffer: Events that wait for a reader; the oldest give way, which shows in the next one's `dropped`.
 
         Raises:
             ClientClosed: The client was closed.
+            ValueError: There is no event of such a kind.
+            TypeError: `kinds` is a name by itself.
         """
-        return self._publishers.events.stream(buffer)
+        return self._publishers.events.stream(kinds, buffer)
 
     async def call(self, request: Request[R], *, timeout: Timeout = DEFAULT) -> R:
         """Send any request of `urlab_client.protocol.messages` and return its reply, without taking anything over.

@@ -27,6 +27,10 @@ class Namespace:
     def __init__(self, session: Session) -> None:
         self._session = session
 
+    def __repr__(self) -> str:
+        ops = sorted(name for name in dir(type(self)) if not name.startswith("_"))
+        return f"<{type(self).__name__} {self._session.transport.endpoint}: {', '.join(ops)}>"
+
     async def _call(self, request: Request[R], timeout: Timeout, on_progress: OnProgress | None = None) -> R:
         return await self._session.call(request, timeout=timeout, on_progress=on_progress)
 

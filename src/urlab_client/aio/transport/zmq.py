@@ -182,6 +182,12 @@ class ZmqTransport:
     async def follow(self, hello: HelloOk) -> None:
         """See `Transport.follow`: there is no other way."""
 
+    def fail_waiting(self, error: URLabError) -> None:
+        """Fail what waits, unsent, for a connection."""
+        for waiter in self._waiting:
+            if not waiter.done():
+                waiter.set_exception(error)
+
     async def aclose(self) -> None:
         """See `Transport.aclose`."""
         if self._closed:
@@ -190,9 +196,7 @@ class ZmqTransport:
         self._connected = False
         closed = ClientClosed(f"The client of {self._endpoint} was closed.", hint="Make a new client.")
         self._fail_sent(lambda _: closed)
-        for waiter in self._waiting:
-            if not waiter.done():
-                waiter.set_exception(closed)
+        self.fail_waiting(closed)
         if self._loop is None or self._socket is None or self._monitor is None or self._context is None:
             return
         if self._timer is not None:
@@ -418,11 +422,8 @@ class ZmqTransport:
         else:
             return
         self._given_up = event is not zmq.Event.HANDSHAKE_FAILED_NO_DETAIL
-        for waiter in self._waiting:
-            if not waiter.done():
-                waiter.set_exception(
-                    AuthenticationFailed(f"No session with {self._endpoint}: {why}. Nothing was sent.", hint=hint)
-                )
+        text = f"No session with {self._endpoint}: {why}. Nothing was sent."
+        self.fail_waiting(AuthenticationFailed(text, hint=hint))
 
     def _lose(self) -> None:
         self._take()  # what arrived before the line broke still counts

@@ -20,8 +20,9 @@ from urlab_client.integrations.gym.env import RewardFn, TerminationFn
 from urlab_client.integrations.gym.episode import client_defaults, compiled_prefixes, fields_of
 from urlab_client.integrations.gym.pictures import BatchPictures
 from urlab_client.integrations.gym.spaces import Field, Observation, SpaceMapping, SpaceMode
-from urlab_client.integrations.gym.starts import ResetNoise, noise_of
+from urlab_client.integrations.gym.starts import ResetNoise
 from urlab_client.integrations.gym.task import (
+    EpisodeSettings,
     Start,
     States,
     Task,
@@ -58,12 +59,12 @@ class URLabBatchEnv(Vectorized):
         num_envs: int,
         *,
         space_mode: SpaceMode = "flat",
-        observations: str | Sequence[str] = "standard",
+        observations: str | Sequence[str] | None = None,
         reward_fn: RewardFn | None = None,
         termination_fn: TerminationFn | None = None,
         max_episode_steps: int | None = None,
-        n_substeps: int = 1,
-        reset_noise: float | ResetNoise = 0.0,
+        n_substeps: int | None = None,
+        reset_noise: float | ResetNoise | None = None,
         keyframe: str | None = None,
         render_mode: Literal["rgb_array"] | None = None,
         render_camera: str | None = None,
@@ -96,24 +97,28 @@ class URLabBatchEnv(Vectorized):
             URLabError: The scene cannot be fetched.
             ValueError: An option out of range.
         """
-        if num_envs < 1 or n_substeps < 1:
-            raise ValueError("num_envs and n_substeps are at least 1")
-        noise = noise_of(reset_noise)
+        if num_envs < 1:
+            raise ValueError(f"num_envs must be at least 1, not {num_envs}")
         check_render_mode(render_mode)
-        check_alone(task, reward_fn=reward_fn, termination_fn=termination_fn, reset_noise=noise)
-        if task is not None:
-            observations, n_substeps, keyframe = task.observations, task.n_substeps, keyframe or task.keyframe
-            max_episode_steps = task.max_episode_steps if max_episode_steps is None else max_episode_steps
+        check_alone(task, reward_fn=reward_fn, termination_fn=termination_fn)
+        settings = EpisodeSettings.of(
+            task,
+            observations=observations,
+            n_substeps=n_substeps,
+            max_episode_steps=max_episode_steps,
+            keyframe=keyframe,
+            reset_noise=reset_noise,
+        )
         scene = _fetch(with_model_options(address), client_defaults(client_options))
         model, prefixes, controllers, exact = scene
-        mapping = SpaceMapping(model, prefixes, fields_of(observations), space_mode)
+        mapping = SpaceMapping(model, prefixes, fields_of(settings.observations), space_mode)
         super().__init__(
             num_envs=num_envs,
             mapping=mapping,
             observation_space=with_task(mapping.observation_space, task),
             reward_fn=reward_fn,
             termination_fn=termination_fn,
-            max_episode_steps=max_episode_steps,
+            max_episode_steps=settings.max_episode_steps,
             autoreset_mode=autoreset_mode,
             task=task,
         )
@@ -121,9 +126,9 @@ class URLabBatchEnv(Vectorized):
         self._goals: list[dict[str, Floats]] = [{} for _ in range(num_envs)]
         if task is not None:
             task.setup(TaskScene(model, mapping))
-        self._n_substeps = n_substeps
-        self._noise = noise
-        self._start_keyframe = keyframe
+        self._n_substeps = settings.n_substeps
+        self._noise = settings.reset_noise
+        self._start_keyframe = settings.keyframe
         self.render_mode = render_mode
         self._render_camera = render_camera
         self._pictures: BatchPictures | None = None

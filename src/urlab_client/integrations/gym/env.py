@@ -14,7 +14,7 @@ from urlab_client.aio.launch import with_model_options
 from urlab_client.integrations.gym.episode import EnvEpisode, client_defaults, first_camera
 from urlab_client.integrations.gym.spaces import Observation, SpaceMapping, SpaceMode
 from urlab_client.integrations.gym.starts import ResetNoise
-from urlab_client.integrations.gym.task import Task, check_alone
+from urlab_client.integrations.gym.task import EpisodeSettings, Task, check_alone
 from urlab_client.protocol.names import NameMap
 from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.articulation import URLabArticulation, URLabEntity
@@ -61,15 +61,15 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         client: URLabClient,
         *,
         space_mode: SpaceMode = "flat",
-        observations: str | Sequence[str] = "standard",
+        observations: str | Sequence[str] | None = None,
         reward_fn: RewardFn | None = None,
         termination_fn: TerminationFn | None = None,
         max_episode_steps: int | None = None,
         cameras: Sequence[str] = (),
-        n_substeps: int = 1,
+        n_substeps: int | None = None,
         render_mode: Literal["rgb_array"] | None = None,
         render_camera: str | None = None,
-        reset_noise: float | ResetNoise = 0.0,
+        reset_noise: float | ResetNoise | None = None,
         keyframe: str | None = None,
         task: Task | None = None,
         owns_client: bool = False,
@@ -80,20 +80,19 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
             client: A client after `discover()`, during play.
             space_mode: `flat` for one array, `dict` for dictionaries by articulation and field.
             observations: An observation level, `minimal` (qpos, qvel) or `standard` (adds ctrl, act, sensors), or a
-                sequence of those fields.
+                sequence of those fields. Where it is None, here and below, the task decides, or `standard`.
             reward_fn: Called with the observation before, the action, the observation after, and `info`; 0 without.
             termination_fn: Called with the observation after and `info`; episodes never end by themselves without.
-            max_episode_steps: Actions after which an episode is truncated; None for endless ones.
+            max_episode_steps: Actions after which an episode is truncated; endless ones for None without a task.
             cameras: Cameras whose frames are part of the observation, under `cameras`, as `ARTICULATION/CAMERA` or as
                 the name of a scene-level one; with `space_mode="dict"` only.
-            n_substeps: Physics steps per action.
+            n_substeps: Physics steps per action; 1 for None without a task.
             render_mode: None or `rgb_array`.
             render_camera: Camera that `render` shows; the first one of the scene by default.
             reset_noise: Largest deviation of joints at a reset: a `ResetNoise`, or radians for hinge joints alone. A
-                joint stays within its range.
+                joint stays within its range. No noise for None without a task.
             keyframe: Where episodes start, unless `reset` names another one; the initial state by default.
-            task: What the robot is to do. It settles observations, `n_substeps`, `max_episode_steps`, where episodes
-                start, rewards and ends; what it takes the place of is refused or not used.
+            task: What the robot is to do: where episodes start, after `keyframe` and `reset_noise`, rewards and ends.
             owns_client: Close the client with the environment.
 
         Raises:
@@ -103,24 +102,24 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         """
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or 'rgb_array', not {render_mode!r}")
-        check_alone(task, reward_fn=reward_fn, termination_fn=termination_fn, reset_noise=reset_noise)
-        if task is not None:
-            observations, n_substeps, keyframe = task.observations, task.n_substeps, keyframe or task.keyframe
-            max_episode_steps = task.max_episode_steps if max_episode_steps is None else max_episode_steps
-        if max_episode_steps is not None and max_episode_steps < 1:
-            raise ValueError(f"max_episode_steps must be at least 1 or None, not {max_episode_steps}")
+        check_alone(task, reward_fn=reward_fn, termination_fn=termination_fn)
+        settings = EpisodeSettings.of(
+            task,
+            observations=observations,
+            n_substeps=n_substeps,
+            max_episode_steps=max_episode_steps,
+            keyframe=keyframe,
+            reset_noise=reset_noise,
+        )
         self.client = client
         self.render_mode = render_mode
         self._rendered = () if render_mode is None else (render_camera or first_camera(aio_of(client)),)
         self._episode = EnvEpisode(
             aio_of(client),
             space_mode=space_mode,
-            observations=observations,
+            settings=settings,
             cameras=cameras,
             rendered=self._rendered,
-            n_substeps=n_substeps,
-            reset_noise=reset_noise,
-            keyframe=keyframe,
             task=task,
         )
         self.action_space = self.mapping.action_space
@@ -128,12 +127,12 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         model = client.model
         self.metadata = {
             **self.metadata,
-            "render_fps": 1.0 / (model.opt.timestep * n_substeps) if model else _FALLBACK_FPS,
+            "render_fps": 1.0 / (model.opt.timestep * settings.n_substeps) if model else _FALLBACK_FPS,
         }
         self.task = task
         self.reward_fn = reward_fn
         self.termination_fn = termination_fn
-        self._max_episode_steps = max_episode_steps
+        self._max_episode_steps = settings.max_episode_steps
         self._owns_client = owns_client
         self._observation: Observation = None
         self._elapsed = 0

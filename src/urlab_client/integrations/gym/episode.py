@@ -11,8 +11,7 @@ from gymnasium import spaces
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
 from urlab_client.integrations.gym.spaces import LEVELS, Field, Observation, Space, SpaceMapping, SpaceMode, dict_space
-from urlab_client.integrations.gym.starts import ResetNoise, noise_of
-from urlab_client.integrations.gym.task import Start, States, Task, TaskScene, add_observed, with_task
+from urlab_client.integrations.gym.task import EpisodeSettings, Start, States, Task, TaskScene, add_observed, with_task
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.enums import CameraMode, ObservationLevel, StepMode
 from urlab_client.protocol.errors import URLabError
@@ -61,12 +60,9 @@ class EnvEpisode:
         client: URLabClient,
         *,
         space_mode: SpaceMode,
-        observations: str | Sequence[str],
+        settings: EpisodeSettings,
         cameras: Sequence[str],
         rendered: Sequence[str],
-        n_substeps: int,
-        reset_noise: float | ResetNoise,
-        keyframe: str | None,
         task: Task | None = None,
     ) -> None:
         """Describe the episodes of a client.
@@ -74,12 +70,9 @@ class EnvEpisode:
         Args:
             client: The client.
             space_mode: `flat` or `dict`.
-            observations: `minimal`, `standard`, or a sequence of fields.
+            settings: What the episodes are like.
             cameras: Cameras whose frames come with each observation, `ARTICULATION/CAMERA` or a scene-level name.
             rendered: Further cameras whose frames are to be in `frames`.
-            n_substeps: Physics steps per action.
-            reset_noise: Largest deviation of joints at a reset; a number is for hinge joints, radians.
-            keyframe: Where episodes start, unless a reset names another one.
             task: What chooses the start, and adds to observations; set up here if it is not yet.
 
         Raises:
@@ -87,9 +80,6 @@ class EnvEpisode:
             KeyError: An unknown camera.
             ValueError: An option out of range.
         """
-        if n_substeps < 1:
-            raise ValueError(f"n_substeps must be at least 1, not {n_substeps}")
-        noise = noise_of(reset_noise)
         model = client.model
         if model is None or not client.articulations:
             raise URLabError(
@@ -104,7 +94,7 @@ class EnvEpisode:
         self.client = client
         self.frames: dict[str, Pixels] = {}
         self._model = model
-        fields = fields_of(observations)
+        fields = fields_of(settings.observations)
         self.mapping = SpaceMapping(model, compiled_prefixes(client), fields, space_mode)
         self._sensors = {key: [*self.mapping.layout(key).sensors] for key in self.mapping.keys}
         minimal = set(fields) <= set(LEVELS["minimal"])
@@ -112,9 +102,9 @@ class EnvEpisode:
         self._observed_cameras = tuple(cameras)
         self._level = ObservationLevel.MINIMAL if minimal else ObservationLevel.STANDARD
         self._cameras = {name: client_camera(client, name) for name in (*cameras, *rendered)}
-        self._n_substeps = n_substeps
-        self._noise = noise
-        self._keyframe = keyframe
+        self._n_substeps = settings.n_substeps
+        self._noise = settings.reset_noise
+        self._keyframe = settings.keyframe
         self._task = task
         self._goal: dict[str, Floats] = {}
         if task is not None:

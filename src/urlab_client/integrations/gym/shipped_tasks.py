@@ -1,7 +1,8 @@
-"""Tasks on the bundled robots, as `Task` has them: reaching a place, walking as told."""
+"""Tasks on the bundled robots: reaching a place, walking as told, and simpler ones whose goal is always the same."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -11,9 +12,50 @@ from urlab_client.integrations.gym.starts import ResetNoise
 from urlab_client.integrations.gym.task import Start, States, Task
 from urlab_client.protocol.base import Floats
 
-__all__ = ["Reach", "Walk"]
+__all__ = ["FixedReach", "Reach", "Run", "Walk"]
 
 Bools = NDArray[np.bool_]
+
+FALLEN_M: Final = 0.15
+"""Height of the trunk below which the quadruped has fallen, metres."""
+
+UPRIGHT: Final = 0.5
+"""Cosine of the tilt below which the quadruped has fallen."""
+
+
+class FixedReach(Task):
+    """The arm holds its hand at `TARGET_M`, always the same place; the reward is minus the distance in metres."""
+
+    TARGET_M: Final = np.array([0.35, 0.2, 0.4])
+
+    scene_address: ClassVar[str] = "sim://arm"
+    observations: ClassVar[str | Sequence[str]] = "standard"
+    reset_noise: ClassVar[float | ResetNoise] = 0.05
+
+    def reward(self, states: States, actions: Any) -> Floats:
+        """See `Task.reward`."""
+        return -np.linalg.norm(states.site_position("arm/grip") - self.TARGET_M, axis=1)
+
+
+class Run(Task):
+    """The quadruped goes along +x by torques, as fast as it can; an episode ends when it falls.
+
+    The reward is the speed of its trunk in m/s, plus half a point for standing, minus the effort.
+    """
+
+    scene_address: ClassVar[str] = "sim://quadruped"
+    observations: ClassVar[str | Sequence[str]] = "standard"
+    max_episode_steps: ClassVar[int | None] = 500
+    reset_noise: ClassVar[float | ResetNoise] = 0.05
+
+    def reward(self, states: States, actions: Any) -> Floats:
+        """See `Task.reward`."""
+        torques = self.scene.mapping.set_points(actions)["quadruped"]
+        return states.velocities("quadruped")[:, 0] + 0.5 - 2e-4 * np.sum(torques**2, axis=1)
+
+    def terminated(self, states: States) -> Bools:
+        """See `Task.terminated`."""
+        return _fallen(states)
 
 
 class Reach(Task):
@@ -68,8 +110,6 @@ class Walk(Task):
     LOW: Final = np.array([-0.2, -0.1, -0.4])
     HIGH: Final = np.array([0.6, 0.1, 0.4])
     CLOSE: Final = 0.2
-    FALLEN_M: Final = 0.15
-    UPRIGHT: Final = 0.5
 
     scene_address: ClassVar[str] = "sim://quadruped?controller=quadruped=pd,kp=60,kv=2"
     n_observed: ClassVar[int] = 3
@@ -94,9 +134,7 @@ class Walk(Task):
 
     def terminated(self, states: States) -> Bools:
         """See `Task.terminated`."""
-        _, x, y, _ = states.body_quaternion("quadruped/trunk").T
-        height = states.body_position("quadruped/trunk")[:, 2]
-        return (height < self.FALLEN_M) | (1.0 - 2.0 * (x**2 + y**2) < self.UPRIGHT)
+        return _fallen(states)
 
     def success(self, states: States) -> Bools:
         """See `Task.success`."""
@@ -110,3 +148,9 @@ class Walk(Task):
         ahead = velocity[:, 0] * np.cos(heading) + velocity[:, 1] * np.sin(heading)
         left = velocity[:, 1] * np.cos(heading) - velocity[:, 0] * np.sin(heading)
         return np.stack([ahead, left, velocity[:, 5]], axis=1)
+
+
+def _fallen(states: States) -> Bools:
+    _, x, y, _ = states.body_quaternion("quadruped/trunk").T
+    height = states.body_position("quadruped/trunk")[:, 2]
+    return (height < FALLEN_M) | (1.0 - 2.0 * (x**2 + y**2) < UPRIGHT)

@@ -127,7 +127,14 @@ class SpaceMapping:
         """Return the view of one field in an observation of either mode, shape (…, n).
 
         Reward and termination functions written with this and `[..., i]` serve single and vector environments.
+
+        Raises:
+            ValueError: The field is not observed.
         """
+        if field not in self.fields:
+            raise ValueError(
+                f"{field!r} is not observed: the environment was made with observations={list(self.fields)!r}"
+            )
         if self.mode == "dict":
             return observation[key][field]
         return observation[..., self._where[key, field]]

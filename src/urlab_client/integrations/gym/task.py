@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar, Final, cast
 
 import mujoco
 import numpy as np
@@ -13,10 +14,20 @@ from numpy.typing import NDArray
 
 from urlab_client.aio.model.mirror import model_names
 from urlab_client.integrations.gym.spaces import Observation, Space, SpaceMapping, dict_space
-from urlab_client.integrations.gym.starts import ResetNoise
+from urlab_client.integrations.gym.starts import ResetNoise, noise_of
 from urlab_client.protocol.base import Floats
 
-__all__ = ["Start", "States", "Task", "TaskScene", "add_observed", "check_alone", "joined", "with_task"]
+__all__ = [
+    "EpisodeSettings",
+    "Start",
+    "States",
+    "Task",
+    "TaskScene",
+    "add_observed",
+    "check_alone",
+    "joined",
+    "with_task",
+]
 
 Bools = NDArray[np.bool_]
 
@@ -240,14 +251,66 @@ def add_observed(observation: Observation, task: Task, observed: Floats) -> Obse
 
 
 def check_alone(task: Task | None, **others: object) -> None:
-    """Refuse arguments that a task takes the place of.
+    """Refuse functions that a task takes the place of.
 
     Raises:
         ValueError: Some are given beside a task.
     """
     given = [name for name, value in others.items() if value]
     if task is not None and given:
-        raise ValueError(f"a task settles {', '.join(given)}: override its method or attribute instead")
+        raise ValueError(f"a task settles {', '.join(given)}: override its method instead")
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeSettings:
+    """What episodes are like: as the arguments of an environment say, else its task, else the defaults.
+
+    Attributes:
+        observations: Observed fields or level.
+        n_substeps: Physics steps per action.
+        max_episode_steps: Actions per episode, or None.
+        keyframe: Where episodes start; the initial state for None.
+        reset_noise: Largest deviation of joints from there.
+    """
+
+    observations: str | Sequence[str]
+    n_substeps: int
+    max_episode_steps: int | None
+    keyframe: str | None
+    reset_noise: ResetNoise
+
+    @classmethod
+    def of(
+        cls,
+        task: Task | None,
+        *,
+        observations: str | Sequence[str] | None,
+        n_substeps: int | None,
+        max_episode_steps: int | None,
+        keyframe: str | None,
+        reset_noise: float | ResetNoise | None,
+    ) -> EpisodeSettings:
+        """Return the settings in force; None asks for those of the task, or the defaults.
+
+        Raises:
+            ValueError: A number is below 1, or noise negative.
+        """
+        defaults = _NO_TASK if task is None else task
+        settings = cls(
+            observations=defaults.observations if observations is None else observations,
+            n_substeps=defaults.n_substeps if n_substeps is None else n_substeps,
+            max_episode_steps=defaults.max_episode_steps if max_episode_steps is None else max_episode_steps,
+            keyframe=defaults.keyframe if keyframe is None else keyframe,
+            reset_noise=noise_of(defaults.reset_noise if reset_noise is None else reset_noise),
+        )
+        if settings.n_substeps < 1:
+            raise ValueError(f"n_substeps must be at least 1, not {settings.n_substeps}")
+        if settings.max_episode_steps is not None and settings.max_episode_steps < 1:
+            raise ValueError(f"max_episode_steps must be at least 1 or None, not {settings.max_episode_steps}")
+        return settings
+
+
+_NO_TASK: Final = EpisodeSettings("standard", 1, None, None, ResetNoise())
 
 
 class Task:
@@ -256,13 +319,16 @@ class Task:
     All methods but `reset` see n environments at once, n being 1 in a single one, and return arrays of n. An object
     serves one environment, single or vector.
 
+    The arguments of an environment that have the names of attributes here win over these.
+
     Attributes:
         scene_address: Where the scene comes from.
-        observations: Observed fields or level; see `URLabEnv`.
+        observations: Observed fields or level; see `URLabEnv`. What is judged does not depend on them.
         n_observed: Numbers that `observe` adds to an observation.
         n_substeps: Physics steps per action.
         max_episode_steps: Actions per episode, or None.
         keyframe: Where episodes start before `reset` changes that; the initial state for None.
+        reset_noise: Largest deviation of joints from there, before `reset` changes that; see `URLabEnv`.
         scene: The scene, from `setup` on.
     """
 
@@ -272,6 +338,7 @@ class Task:
     n_substeps: ClassVar[int] = 10
     max_episode_steps: ClassVar[int | None] = 200
     keyframe: ClassVar[str | None] = None
+    reset_noise: ClassVar[float | ResetNoise] = 0.0
     scene: TaskScene
 
     def setup(self, scene: TaskScene) -> None:

@@ -21,8 +21,8 @@ from urlab_client.aio.launch import SCHEME, with_model_options, with_start_timeo
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn
 from urlab_client.integrations.gym.episode import EnvEpisode, client_defaults, first_camera
 from urlab_client.integrations.gym.spaces import Observation, SpaceMode
-from urlab_client.integrations.gym.starts import ResetNoise, noise_of
-from urlab_client.integrations.gym.task import States, Task, check_alone, joined
+from urlab_client.integrations.gym.starts import ResetNoise
+from urlab_client.integrations.gym.task import EpisodeSettings, States, Task, check_alone, joined
 from urlab_client.integrations.gym.vectorized import Found, Indices, Vectorized, check_render_mode
 from urlab_client.protocol.errors import URLabError
 from urlab_client.sync._portal import Portal
@@ -144,13 +144,13 @@ class URLabVectorEnv(Vectorized):
         num_envs: int | None = None,
         *,
         space_mode: SpaceMode = "flat",
-        observations: str | Sequence[str] = "standard",
+        observations: str | Sequence[str] | None = None,
         reward_fn: RewardFn | None = None,
         termination_fn: TerminationFn | None = None,
         max_episode_steps: int | None = None,
         cameras: Sequence[str] = (),
-        n_substeps: int = 1,
-        reset_noise: float | ResetNoise = 0.0,
+        n_substeps: int | None = None,
+        reset_noise: float | ResetNoise | None = None,
         keyframe: str | None = None,
         render_mode: Literal["rgb_array"] | None = None,
         render_camera: str | None = None,
@@ -199,17 +199,19 @@ class URLabVectorEnv(Vectorized):
             if seconds <= 0:
                 raise ValueError(f"{name} must be above 0 seconds, not {seconds}")
         check_render_mode(render_mode)
-        check_alone(task, reward_fn=reward_fn, termination_fn=termination_fn, reset_noise=noise_of(reset_noise))
-        if task is not None:
-            observations, n_substeps, keyframe = task.observations, task.n_substeps, keyframe or task.keyframe
-            max_episode_steps = task.max_episode_steps if max_episode_steps is None else max_episode_steps
+        check_alone(task, reward_fn=reward_fn, termination_fn=termination_fn)
+        settings = EpisodeSettings.of(
+            task,
+            observations=observations,
+            n_substeps=n_substeps,
+            max_episode_steps=max_episode_steps,
+            keyframe=keyframe,
+            reset_noise=reset_noise,
+        )
         episode_options = {
             "space_mode": space_mode,
-            "observations": observations,
+            "settings": settings,
             "cameras": tuple(cameras),
-            "n_substeps": n_substeps,
-            "reset_noise": noise_of(reset_noise),
-            "keyframe": keyframe,
             "task": task,
         }
         self._step_timeout = step_timeout
@@ -233,7 +235,7 @@ class URLabVectorEnv(Vectorized):
             observation_space=first.observation_space,
             reward_fn=reward_fn,
             termination_fn=termination_fn,
-            max_episode_steps=max_episode_steps,
+            max_episode_steps=settings.max_episode_steps,
             autoreset_mode=autoreset_mode,
             task=task,
         )
