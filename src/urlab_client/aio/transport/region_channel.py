@@ -51,7 +51,11 @@ def opening_of(op: Op) -> bytes:
 
 
 class RegionChannel:
-    """The pair of request and reply region, for the one client that holds the lock."""
+    """The pair of request and reply region, for the one client that holds the lock.
+
+    Attributes:
+        limit: Largest payload that fits in both directions.
+    """
 
     def __init__(self, requests: Path, replies: Path) -> None:
         self.requests = MappedRegion(requests, writable=True, exclusive=True)
@@ -60,6 +64,7 @@ class RegionChannel:
         except BaseException:
             self.requests.close()
             raise
+        self.limit = min(self.requests.region.max_payload, self.replies.region.max_payload)
         session = requests.parent.name
         self._request_event = NamedEvent(f"Local\\URLab_{session}_req_ready")
         self.reply_event = NamedEvent(f"Local\\URLab_{session}_rep_ready")
@@ -68,11 +73,6 @@ class RegionChannel:
         self.seen = 0
         self._token = ""
         self._asked_at = 0.0
-
-    @property
-    def limit(self) -> int:
-        """Largest payload that fits in both directions."""
-        return min(self.requests.region.max_payload, self.replies.region.max_payload)
 
     def intact(self) -> bool:
         """Whether both regions are mapped in full still."""
