@@ -82,6 +82,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "aio": (
         "event_loop",
         "deadline",
+        "arguments",
         "session_level",
         "mutex",
         "stream_buffer",
