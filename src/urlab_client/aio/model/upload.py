@@ -87,7 +87,7 @@ def flatten(model: str | os.PathLike[str] | mujoco.MjSpec) -> FlatModel:
     from urlab_client._mujoco import flat_model  # noqa: PLC0415
 
     given = cast("Any", model)
-    if not isinstance(given, (str, os.PathLike, mujoco.MjSpec)):
+    if not isinstance(model, (str, os.PathLike, mujoco.MjSpec)):
         raise TypeError(f"upload_model: model takes a path or an MjSpec, got {given!r:.80}.")
     path = None if isinstance(given, mujoco.MjSpec) else Path(given)
     if path is not None and not path.is_file():
