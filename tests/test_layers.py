@@ -82,10 +82,12 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "aio": (
         "event_loop",
         "deadline",
+        "arguments",
         "session_level",
         "mutex",
         "stream_buffer",
         "transport",
+        "call_records",
         "launch",
         "control",
         "jobs",
