@@ -30,6 +30,7 @@ from urlab_client.protocol.messages.runtime import (
     ContactFilter,
     GetContacts,
     SetMode,
+    SetPaused,
     SetQpos,
     SetSimOptions,
     SetUserChannels,
@@ -49,6 +50,17 @@ class RuntimeNamespace(RuntimeOps):
     def __init__(self, session: Session, state: SimState) -> None:
         super().__init__(session)
         self._state = state
+
+    async def set_paused(self, paused: bool, *, timeout: Timeout = DEFAULT) -> bool:
+        """Pause or resume physics and return the state in force.
+
+        Args:
+            paused: True to pause.
+            timeout: Seconds to wait; None waits without limit.
+        """
+        state = self._state
+        state.paused = (await self._call(SetPaused(paused=paused), timeout)).paused
+        return state.paused
 
     async def set_qpos(self, target: str, qpos: Vector, *, by_name: bool = False, timeout: Timeout = DEFAULT) -> None:
         """Write joint positions of an articulation, run `mj_forward`, and mirror the result into `client.data`.
