@@ -243,7 +243,7 @@ class _Site:
             await socket.send_json({"type": "you", "viewer": viewer.key, "name": viewer.name})
             async with anyio.create_task_group() as tasks:
                 tasks.start_soon(self._send, socket, one, flow)
-                with contextlib.suppress(WebSocketDisconnect):
+                with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # gone, maybe while it is answered
                     await self._listen(socket, one, flow)
                 tasks.cancel_scope.cancel()
         finally:

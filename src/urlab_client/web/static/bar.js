@@ -1,6 +1,6 @@
 // The bar at the top: connection, age, time, play and stop, modes, who drives.
 
-import { $, choices, duration, h, text, toast } from "./dom.js";
+import { $, choices, confirmed, duration, h, text, toast } from "./dom.js";
 import { ask, clock, on, op } from "./link.js";
 
 export const now = { status: null, state: null, socket: false };
@@ -12,6 +12,7 @@ const LINKS = {
   lost: "Server lost",
   silent: "No reply",
   taken_over: "Taken over",
+  gone: "No console",
 };
 
 export const run = (running) => ask("POST", "api/run", { running });
@@ -64,7 +65,8 @@ export function makeBar() {
   ui.speedText = h("span", { class: "num" }, "100 %");
   ui.driver = h("span", { id: "driver", class: "pill" });
   ui.drive = h("button", { id: "drive", title: "Take the controls, or give them back (d)", onclick: drive }, "Take the controls");
-  ui.restart = h("button", { title: "Begin play, or begin again", onclick: restartPlay }, "Restart play");
+  ui.restart = confirmed({ id: "restart", title: "Begin play, or begin again" }, () => now.status?.playing ? "Restart play" : "Begin play",
+    () => now.status?.playing && "Lose this simulation?", restartPlay);
 
   $("bar").append(
     h("div", { class: "row" },
@@ -75,10 +77,11 @@ export function makeBar() {
         h("span", { title: "Simulation time" }, "time ", ui.time),
         h("span", { title: "Simulation time per real time" }, "pace ", ui.rate)),
       h("span", { class: "space" }),
-      ui.driver, ui.drive,
-      h("button", { class: "quiet", title: "A link for one more browser", onclick: invite }, "Invite"),
+      ui.driver,
+      h("span", { class: "acts" }, ui.drive,
+        h("button", { class: "quiet", title: "A link for one more browser", onclick: invite }, "Invite")),
       h("button", { class: "quiet", title: "Keys (?)", "aria-label": "Keys", onclick: () => $("help").showModal() }, "?")),
-    h("div", { class: "row controls" },
+    h("div", { class: "row controls acts" },
       ui.play, ui.stop,
       h("span", { class: "group" }, ui.step, ui.steps),
       h("span", { class: "group" }, ui.reset, ui.keyframe),
@@ -87,8 +90,8 @@ export function makeBar() {
       h("label", { class: "speed" }, "speed ", ui.speed, ui.speedText),
       ui.restart));
 
-  on("open", () => { now.socket = true; });
-  on("closed", () => { now.socket = false; banner(); });
+  on("open", () => { now.socket = true; now.since = null; });
+  on("closed", () => { now.socket = false; now.since = now.since ?? Date.now(); show(now.status); banner(); });
   on("status", (status) => { now.status = status; show(status); banner(); });
   on("state", (state) => { now.state = state; });
   on("world", async ({ world }) => {
@@ -107,10 +110,14 @@ export function makeBar() {
   }, 200);
 }
 
+/** Show how things stand; without a console that is nothing that could be relied on, or touched. */
 function show(status) {
-  document.body.dataset.link = status.link.state;
+  const link = now.socket ? status?.link.state : "gone";
+  document.body.dataset.link = link ?? "connecting";
+  text(ui.link, LINKS[link] ?? LINKS.connecting);
+  for (const part of [document.querySelector("main"), ...document.querySelectorAll("#bar .acts")]) part.inert = !now.socket;
+  if (!status || !now.socket) return;
   document.body.classList.toggle("watching", !status.mine && status.driver !== null);
-  text(ui.link, LINKS[status.link.state]);
   text(ui.address, status.address);
   text(ui.rate, status.moving ? `${status.rate.toFixed(2)}×` : "stopped");
   text(ui.play, status.running ? "❚❚ Pause" : "▶ Play");
@@ -129,25 +136,28 @@ function show(status) {
   ui.driver.dataset.who = status.mine ? "me" : status.driver === null ? "free" : "other";
   text(ui.drive, status.mine ? "Release" : "Take the controls");
   ui.drive.disabled = !status.mine && status.driver !== null;
-  text(ui.restart, status.playing ? "Restart play" : "Begin play");
+  if (!ui.restart.classList.contains("danger")) text(ui.restart, status.playing ? "Restart play" : "Begin play");
 }
+
+/** A duration that does not flicker. */
+const whole = (ms) => duration(Math.max(1, Math.round(ms / 1000)) * 1000).replace(".0 s", " s");
 
 function banner() {
   const link = now.status?.link;
   const box = $("banner");
   let said = null;
   let button = null;
+  let title = "";
   if (!now.socket) {
-    said = "The console itself does not answer. Trying again.";
+    said = `The console does not answer for ${whole(Date.now() - (now.since ?? Date.now()))}. Retrying. If it was started again, open its new link.`;
   } else if (link && link.state !== "connected") {
-    const since = duration(Date.now() + clock.offset - link.since * 1000);
-    const shown = now.state ? " What you see is the last that came." : "";
+    const since = whole(Date.now() + clock.offset - link.since * 1000);
     if (link.state === "taken_over") {
-      said = `Another program has taken the server over, ${since} ago. You still see what it does.`;
+      said = `Another program took the session over ${since} ago.`;
       button = h("button", { onclick: () => ask("POST", "api/connection", {}) }, "Take it back");
-    } else {
-      said = `No connection to the server for ${since}: ${link.reason || "trying"}. Trying again.${shown}`;
-    }
+    } else if (link.state === "silent") said = `The server has not answered for ${since}. Waiting.`;
+    else said = now.state ? `Server not reachable for ${since}. Retrying.` : `Connecting to the server for ${since}.`;
+    title = link.reason;
   } else if (now.status && !now.status.playing) {
     said = "No play session runs.";
     button = h("button", { onclick: restartPlay }, "Begin play");
@@ -156,6 +166,6 @@ function banner() {
   box.hidden = said === null;
   if (said !== null && box.dataset.said !== said) {
     box.dataset.said = said;
-    box.replaceChildren(h("span", {}, said), ...(button ? [button] : []));
+    box.replaceChildren(h("span", { title }, said), ...(button ? [button] : []));
   } else if (said === null) delete box.dataset.said;
 }

@@ -30,13 +30,16 @@ $("help").append(h("h2", {}, "Keys"),
 
 document.addEventListener("keydown", (event) => {
   if (event.ctrlKey || event.metaKey || event.altKey || event.repeat || $("help").open) return;
-  const field = event.target.closest("input:not([type=range]), select, textarea");
-  const button = event.key === " " && event.target.closest("button, summary");
+  const field = event.target.closest("input:not([type=range], [type=checkbox]), select, textarea");
+  const button = event.key === " " && event.target.closest("button, summary, [type=checkbox]");
   if ((field || button) && event.key !== "Escape") return;
   const found = KEYS.find(([key]) => key === event.key);
   if (!found) return;
   event.preventDefault();
   found[3]();
 });
+
+// A list keeps the keyboard after a choice was made in it, and would swallow the keys above.
+document.addEventListener("change", (event) => event.target.matches("select, input[type=file]") && event.target.blur());
 
 connect();
