@@ -86,6 +86,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "aio": (
         "event_loop",
         "deadline",
+        "arguments",
         "session_level",
         "mutex",
         "stream_buffer",

@@ -5,13 +5,13 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import operator
 import os
 from collections.abc import Callable, Collection, Mapping
 from types import TracebackType
 from typing import NoReturn, Self, TypeVar
 
 from urlab_client.aio.address import transport_to
+from urlab_client.aio.arguments import integer
 from urlab_client.aio.client_state import ClientState
 from urlab_client.aio.control import Control
 from urlab_client.aio.deadline import DEFAULT, Timeout
@@ -303,7 +303,7 @@ class URLabClient(ClientState):
             ValueError: A set-point is NaN or infinite, or in puppet mode something in `data`; nothing was sent.
             NoSession: `discover()` was not called, or was broken off; nothing was sent.
         """
-        n_steps = operator.index(n_steps)  # a hot op: its request is not checked again before it is sent
+        n_steps = integer("step: n_steps", n_steps)  # a hot op: its request is not checked again before it is sent
         level = None if observations is SESSION_LEVEL else ObservationLevel(observations)
         turn = self._session.turn(Step, timeout=timeout)
         if not turn.begin_at_once():  # which `async with` would take three coroutines for

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 
+from urlab_client.aio.arguments import mapping
 from urlab_client.aio.model.articulation_state import Carried, give_back
 from urlab_client.aio.session import Turn
 from urlab_client.aio.state.pending_outcomes import leaves_open
@@ -164,7 +165,11 @@ async def _pictures(state: SimState, turn: Turn, cameras: Cameras, n_steps: int)
         for observer in state.observers:
             await observer.ready()
     asked: bool | dict[str, str | None]
-    asked = cameras if isinstance(cameras, bool) else {name: str(CameraTiming(how)) for name, how in cameras.items()}
+    if isinstance(cameras, bool):
+        asked = cameras
+    else:
+        given = mapping("step: include_cameras", cameras, "camera names to 'latest' or 'sync', or a bool")
+        asked = {name: str(CameraTiming(how)) for name, how in given.items()}
     if state.observers:
         asked = state.objects.with_cameras(asked, state.observed_cameras(n_steps))
     pictures = StepPictures(state, asked)
