@@ -33,6 +33,7 @@ from urlab_client.protocol.messages.runtime import (
     ContactFilter,
     GetContacts,
     SetMode,
+    SetPaused,
     SetQpos,
     SetSimOptions,
     SetUserChannels,
@@ -58,6 +59,17 @@ class RuntimeNamespace(RuntimeOps):
     async def _call(self, request: Request[R], timeout: Timeout, on_progress: OnProgress | None = None) -> R:
         sent = for_the_server(request, self._state.objects, self._state.mirror.model)
         return as_written(await super()._call(sent, timeout, on_progress), request)
+
+    async def set_paused(self, paused: bool, *, timeout: Timeout = DEFAULT) -> bool:
+        """Pause or resume physics and return the state in force.
+
+        Args:
+            paused: True to pause.
+            timeout: Seconds to wait; None waits without limit.
+        """
+        state = self._state
+        state.paused = (await self._call(SetPaused(paused=paused), timeout)).paused
+        return state.paused
 
     async def set_qpos(self, target: str, qpos: Vector, *, by_name: bool = False, timeout: Timeout = DEFAULT) -> None:
         """Write joint positions of an articulation, run `mj_forward`, and mirror the result into `client.data`.
