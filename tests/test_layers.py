@@ -57,7 +57,7 @@ ALLOWED: dict[str, frozenset[str]] = {
     "": frozenset({"_installation", "sync", "enums", "protocol"}),
     "integrations": frozenset({"", "_installation", "_mujoco", "aio", "enums", "keys", "protocol", "server", "sync"}),
     "cluster": frozenset({"_installation", "integrations", "protocol", "sync"}),
-    "web": frozenset({"_installation", "aio", "protocol"}),
+    "web": frozenset({"_installation", "aio", "integrations", "protocol"}),
     "cli": frozenset(
         {
             "",

@@ -70,5 +70,5 @@ def test_the_commands_read_it(saved: Path, tmp_path: Path, capsys: pytest.Captur
 def test_a_file_that_only_begins_like_one_is_refused(tmp_path: Path) -> None:
     broken = tmp_path / "broken.json"
     broken.write_text('{"Frames": [')
-    with pytest.raises(RecordingError, match="broken.json"):
+    with pytest.raises(RecordingError, match=r"broken\.json"):
         read_run(broken).table()

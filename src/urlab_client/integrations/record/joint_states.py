@@ -71,7 +71,7 @@ class JointStatesRun(Run):
         sim_time = np.array([frame.time for frame in frames], dtype=np.float64)
         steps = np.diff(sim_time, prepend=sim_time[:1])
         layout = frames[0].layout if frames else None
-        names = {name: value for name, value in (layout.joints if layout else {}).items()}
+        names = dict(layout.joints) if layout else {}
         columns: dict[str, Column] = {}
         for field, kinds in (("qpos", _COORDINATES), ("qvel", _VELOCITIES)):
             labels = [

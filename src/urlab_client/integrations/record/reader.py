@@ -37,6 +37,7 @@ __all__ = ["Camera", "Column", "Run", "Summary", "Table", "Topic", "describe_top
 
 _NS = 1e9
 _GAP_FACTOR = 3.0
+_UNKNOWN = "neither an MCAP file nor a recording of the server."
 _Number = float | Literal["NaN", "Infinity", "-Infinity"]
 
 
@@ -402,12 +403,16 @@ class Run:
                     record = next(records, None)
                 except InvalidMagic as error:
                     if not entries and not schemas and file.tell() <= 8:
-                        raise RecordingError(f"{self.path}: neither an MCAP file nor a recording of the server.") from error
+                        raise RecordingError(
+                            f"{self.path}: neither an MCAP file nor a recording of the server."
+                        ) from error
                     self.damage = "the end of the file is missing"
                     return
                 except (McapError, ZstdError, struct.error, ValueError, OverflowError) as error:
                     if file.tell() < 8:
-                        raise RecordingError(f"{self.path}: neither an MCAP file nor a recording of the server.") from error
+                        raise RecordingError(
+                            f"{self.path}: neither an MCAP file nor a recording of the server."
+                        ) from error
                     self.damage = f"{type(error).__name__}: {error}" if str(error) else "the end of the file is missing"
                     return
                 if record is None:
