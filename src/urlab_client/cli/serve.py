@@ -213,7 +213,7 @@ def add_parser(commands: Commands) -> None:
         "--mjcf-options",
         action=argparse.BooleanOptionalAction,
         default=False,
-        help="honour the <option> of the first model; without it the plugin's defaults apply, with a warning",
+        help="honour the <option> of the first model; else the alpha ignores all, the beta merges them",
     )
     cameras = parser.add_argument_group("cameras")
     cameras.add_argument(

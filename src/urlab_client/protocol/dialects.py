@@ -103,7 +103,8 @@ class Dialect:
         auto_mode: `auto` is a step mode beside live, else another name of it.
         controls_float32: Set-points are rounded to single precision.
         options_float32: Options are kept in single precision and keywords in lower case.
-        options_merged: The `<option>` of an imported robot reaches the scene.
+        options_merged: The `<option>` of every imported robot reaches the scene.
+        robots_attached: The XML of the handshake attaches a document for each robot, else it is one flat model.
         instance: The handshake says which of several servers this is, and its own shared-memory regions.
         first_camera_port: Default port of the first camera.
         shapes: What replies look like, by their `op`, where that is not how `messages` declares them.
@@ -130,6 +131,7 @@ class Dialect:
     controls_float32: bool
     options_float32: bool
     options_merged: bool
+    robots_attached: bool
     instance: bool
     first_camera_port: int
     shapes: Callable[[], Mapping[str, Callable[[Any], Struct]]] = field(default=_no_shapes)
@@ -183,6 +185,7 @@ ALPHA: Final = Dialect(
     controls_float32=True,
     options_float32=True,
     options_merged=False,
+    robots_attached=False,
     instance=False,
     first_camera_port=5558,
 )
@@ -210,6 +213,7 @@ BETA: Final = Dialect(
     controls_float32=False,
     options_float32=False,
     options_merged=True,
+    robots_attached=True,
     instance=True,
     first_camera_port=5561,
     shapes=_beta_shapes,

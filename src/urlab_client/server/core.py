@@ -22,6 +22,7 @@ from urlab_client.protocol.enums import CameraMode, PIEState, StepMode
 from urlab_client.protocol.messages.session import ErrorReply, Hello, InstanceInfo, Step
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.assets.uploads import UPLOADS, Uploads
+from urlab_client.server.compile.mjcf_options import OptionPolicy
 from urlab_client.server.compile.scene import CompiledScene, compile_scene
 from urlab_client.server.compile.scene_index import ArticulationIndex
 from urlab_client.server.editor.jobs import EditorJobs
@@ -163,7 +164,7 @@ class ServerCore:
         def build() -> Running:
             scene = compile_scene(
                 actors,
-                honour_mjcf_options=self._honours_options,
+                options=self._options,
                 camera_size=physics.camera_size,
                 limits=self.limits,
             )
@@ -231,8 +232,10 @@ class ServerCore:
         )
 
     @property
-    def _honours_options(self) -> bool:
-        return self.physics.mjcf_options or self.dialect.options_merged
+    def _options(self) -> OptionPolicy:
+        if self.physics.mjcf_options:
+            return "first"
+        return "merged" if self.dialect.options_merged else "ignored"
 
     def authored_renderer(self) -> CameraRenderer:
         """Compile the level as it is now and return what draws it; the caller closes it.
@@ -241,7 +244,7 @@ class ServerCore:
             CompileFailed: MuJoCo rejects the level.
         """
         actors = self.world.freeze()
-        scene = compile_scene(actors, honour_mjcf_options=self._honours_options, limits=self.limits)
+        scene = compile_scene(actors, options=self._options, limits=self.limits)
         return self._camera_renderer(scene, actors, {}, {})
 
     def _camera_renderer(

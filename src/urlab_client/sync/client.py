@@ -14,10 +14,10 @@ from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.session_level import SESSION_LEVEL, SessionLevel
 from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS
 from urlab_client.protocol.base import Reply, Request
-from urlab_client.protocol.client_types import Diagnosis, Resync
+from urlab_client.protocol.client_types import CallRecord, Diagnosis, Resync
 from urlab_client.protocol.enums import CameraTiming, ObservationLevel, StepMode, Transport
 from urlab_client.protocol.messages.session import OpInfo, ResetOk, StepOk
-from urlab_client.protocol.messages.streams import ClientEvent, RowSample, StateSnapshot, StreamPolicy
+from urlab_client.protocol.messages.streams import CameraSample, ClientEvent, RowSample, StateSnapshot, StreamPolicy
 from urlab_client.protocol.topics import TopicKind
 from urlab_client.sync._facade import FacadeRoot
 from urlab_client.sync.client_state import ClientState
@@ -68,8 +68,12 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
             server and network those that nobody looks at; `frames()` is received all the same.
         claim_control: Take control of a robot with the first write to it, where robots have one owner. False is for
             those who look on, and for those who say `articulation.claim()`.
+        observe: Called with a `CallRecord` when a request is over, whatever became of it: op, bytes, time in the queue,
+            round trip, outcome. It runs on the client's event loop, so it must be quick and must not call the client;
+            what it raises is logged and changes nothing.
 
     Raises:
+        TypeError: `observe` is not a plain function.
         KeyFileError: A key file cannot be used.
         ValueError: The address or an option is malformed.
     """
@@ -98,6 +102,7 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
         trust_server: bool = False,
         live_pictures: bool = True,
         claim_control: bool = True,
+        observe: Callable[[CallRecord], object] | None = None,
     ) -> None:
         super().__init__(
             aio.URLabClient(
@@ -119,6 +124,7 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
                 trust_server=trust_server,
                 live_pictures=live_pictures,
                 claim_control=claim_control,
+                observe=observe,
             )
         )
 
@@ -302,6 +308,27 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
             TypeError: The predicate returns an awaitable.
         """
         return self._portal.call(self._aio.wait_until, predicate, timeout=timeout)
+
+    def capture(self, cameras: Collection[str] | None = None, *, timeout: Timeout = DEFAULT) -> dict[str, CameraSample]:
+        """Take pictures of several cameras now, in any step mode, without a step; see `URLabCameraView.capture`.
+
+        In `direct` and `puppet` mode, and while paused, all of them show the same moment.
+
+        Args:
+            cameras: Names, as `camera()` takes them; None for all there are.
+            timeout: Seconds to wait for all of them together; None waits without limit.
+
+        Returns:
+            The pictures by the names given.
+
+        Raises:
+            KeyError: There is no such camera, or there are several; nothing was sent.
+            TypeError: `cameras` is a name by itself.
+            PictureTimeout: Some came not in time; `.cameras` names them.
+            NoActiveManager: No play session runs.
+            ModeLocked: The project pins a mode in which pictures come with steps only.
+        """
+        return self._portal.call(self._aio.capture, cameras, timeout=timeout)
 
     def state_stream(
         self,

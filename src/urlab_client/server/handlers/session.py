@@ -90,7 +90,7 @@ def handshake(server: ServerCore, session_id: str, *, include_assets: bool = Fal
     reply.mjb_size = len(reply.mjb)
     reply.entities = {entity.name: _entity(entity) for entity in scene.entities}
     if include_assets:
-        _add_assets(reply, running)
+        _add_assets(reply, running, attached=server.dialect.robots_attached)
     return reply
 
 
@@ -150,11 +150,10 @@ def _entity(entity: EntityIndex) -> EntityInfo:
     )
 
 
-def _add_assets(reply: HelloOk, running: Running) -> None:
+def _add_assets(reply: HelloOk, running: Running, *, attached: bool) -> None:
     reply.vfs_assets = {}
     try:
-        reply.mjcf_compiled = running.scene.mjcf()
-        reply.vfs_assets = running.scene.assets()
+        reply.mjcf_compiled, reply.vfs_assets = running.scene.export(attached=attached)
     except (OSError, ValueError, mujoco.FatalError) as error:
         logger.warning("the scene cannot be written as MJCF, so the handshake goes without: %s", error)
 
