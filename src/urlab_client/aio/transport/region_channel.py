@@ -53,11 +53,16 @@ def opening_of(op: Op) -> bytes:
 class RegionChannel:
     """The pair of request and reply region, for the one client that holds the lock.
 
+    Args:
+        requests: File of the requests.
+        replies: File of the replies.
+        events: What their events are called on Windows.
+
     Attributes:
         limit: Largest payload that fits in both directions.
     """
 
-    def __init__(self, requests: Path, replies: Path) -> None:
+    def __init__(self, requests: Path, replies: Path, events: tuple[str, str]) -> None:
         self.requests = MappedRegion(requests, writable=True, exclusive=True)
         try:
             self.replies = MappedRegion(replies)
@@ -65,9 +70,7 @@ class RegionChannel:
             self.requests.close()
             raise
         self.limit = min(self.requests.region.max_payload, self.replies.region.max_payload)
-        session = requests.parent.name
-        self._request_event = NamedEvent(f"Local\\URLab_{session}_req_ready")
-        self.reply_event = NamedEvent(f"Local\\URLab_{session}_rep_ready")
+        self._request_event, self.reply_event = map(NamedEvent, events)
         # A client that died here may have left a request behind whose reply is still to come.
         self.dirty = True
         self.seen = 0
