@@ -42,8 +42,10 @@ ALLOWED: dict[str, frozenset[str]] = {
             "_windows",
             "keys",
             "protocol",
+            "randomise",
         }
     ),
+    "randomise": frozenset({"protocol"}),
     "enums": frozenset({"protocol"}),
     "_children": frozenset(),
     "_confined": frozenset(),
@@ -55,7 +57,9 @@ ALLOWED: dict[str, frozenset[str]] = {
     "_uninterrupted": frozenset(),
     "_windows": frozenset(),
     "": frozenset({"_installation", "sync", "enums", "protocol"}),
-    "integrations": frozenset({"", "_installation", "_mujoco", "aio", "enums", "keys", "protocol", "server", "sync"}),
+    "integrations": frozenset(
+        {"", "_installation", "_mujoco", "aio", "enums", "keys", "protocol", "randomise", "server", "sync"}
+    ),
     "cluster": frozenset({"_installation", "integrations", "protocol", "sync"}),
     "web": frozenset({"_installation", "aio", "protocol"}),
     "cli": frozenset(
@@ -69,6 +73,7 @@ ALLOWED: dict[str, frozenset[str]] = {
             "integrations",
             "keys",
             "protocol",
+            "randomise",
             "server",
             "sync",
             "web",

@@ -20,8 +20,10 @@ from urlab_client.protocol.codec import encode_reply
 from urlab_client.protocol.dialects import ALPHA, Dialect
 from urlab_client.protocol.enums import CameraMode, PIEState, StepMode
 from urlab_client.protocol.messages.session import ErrorReply, Hello, InstanceInfo, Step
+from urlab_client.randomise.declaration import MODEL_TEXT, Randomisation
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.assets.uploads import UPLOADS, Uploads
+from urlab_client.server.compile.failure import CompileFailed
 from urlab_client.server.compile.scene import CompiledScene, compile_scene
 from urlab_client.server.compile.scene_index import ArticulationIndex
 from urlab_client.server.editor.jobs import EditorJobs
@@ -61,6 +63,7 @@ class PhysicsConfig:
         mjcf_options: Honour the `<option>` of the first model.
         render_quality: How well cameras and the viewport are drawn.
         user_channels: First value of the user channels that the level declares, by `ROBOT/CHANNEL` or `scene/CHANNEL`.
+        randomise: What varies from reset to reset.
     """
 
     step_mode: StepMode = StepMode.AUTO
@@ -71,6 +74,7 @@ class PhysicsConfig:
     mjcf_options: bool = False
     render_quality: RenderQuality = "auto"
     user_channels: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    randomise: Randomisation | None = None
 
     def controller(self, index: ArticulationIndex) -> ControllerConfig | None:
         """Return the controller an articulation is to get: configured here, or else by the level or its MJCF."""
@@ -165,6 +169,7 @@ class ServerCore:
                 actors,
                 honour_mjcf_options=self._honours_options,
                 camera_size=physics.camera_size,
+                texts={} if physics.randomise is None else {MODEL_TEXT: physics.randomise.to_json()},
                 limits=self.limits,
             )
             self.compiled = _Compiled(actors, scene, copy.copy(scene.model.opt))
@@ -206,14 +211,19 @@ class ServerCore:
         controllers = {index.key: config for index in scene.articulations if (config := physics.controller(index))}
         for problem in unmatched_names(scene, physics):
             logger.warning("%s", problem)
-        engine = Engine(
-            scene,
-            pinned_mode=physics.step_mode,
-            paused=not physics.unpaused,
-            controllers=controllers,
-            health=self.health,
-            dialect=self.dialect,
-        )
+        try:
+            engine = Engine(
+                scene,
+                pinned_mode=physics.step_mode,
+                paused=not physics.unpaused,
+                controllers=controllers,
+                health=self.health,
+                dialect=self.dialect,
+                randomise=physics.randomise,
+            )
+        except ValueError as error:
+            raise CompileFailed(f"what is to vary: {error}") from None
+        varied = () if engine.variation is None else engine.variation.visible_fields
         channels = UserChannels(physics.user_channels)
         modes = {
             (index.key, camera.name): physics.camera_mode(index, camera.name)
@@ -224,7 +234,7 @@ class ServerCore:
             scene,
             engine.start(),
             Observer(scene, engine.articulations.controls, channels),
-            self._camera_renderer(scene, actors, modes, engine.articulations.names),
+            self._camera_renderer(scene, actors, modes, engine.articulations.names, varied),
             files,
             self.limits,
             channels,
@@ -250,10 +260,18 @@ class ServerCore:
         actors: Sequence[Actor],
         modes: Mapping[tuple[str, str], CameraMode],
         names: Mapping[str, str],
+        varied: Sequence[str] = (),
     ) -> CameraRenderer:
         classes = {actor.name: _kind(actor) for actor in actors}
         return CameraRenderer(
-            scene, modes, classes, self.physics.render_quality, self.health, names=names, dialect=self.dialect
+            scene,
+            modes,
+            classes,
+            self.physics.render_quality,
+            self.health,
+            names=names,
+            varied=varied,
+            dialect=self.dialect,
         )
 
     def stop_play(self) -> None:
