@@ -136,7 +136,7 @@ def test_attributes_of_a_newer_release_are_left_out_and_named() -> None:
         '<mujoco><worldbody><body><joint name="j" novelty="1 2"/><geom size="0.1" glow="3" name="g"/></body>'
         '<body><joint name="k" novelty="4"/><geom size="0.2"/></body></worldbody></mujoco>'
     )
-    model, left_out = _mujoco.without_newer_attributes(xml, mujoco.MjModel.from_xml_string)
+    model, left_out = _mujoco.without_newer_attributes(xml, {}, mujoco.MjModel.from_xml_string)
     assert left_out == ["joint.novelty", "geom.glow"]
     assert (model.njnt, model.ngeom) == (2, 2)
     assert model.geom("g").size[0] == 0.1
@@ -147,7 +147,7 @@ def test_attributes_with_keywords_of_a_newer_release_are_left_out_and_named() ->
         '<mujoco><worldbody><body name="novel"><joint name="novel" type="novel"/><geom size="0.1" name="novel"/></body>'
         '</worldbody><actuator><motor joint="novel" ctrllimited="novel" name="novel"/></actuator></mujoco>'
     )
-    model, left_out = _mujoco.without_newer_attributes(xml, mujoco.MjModel.from_xml_string)
+    model, left_out = _mujoco.without_newer_attributes(xml, {}, mujoco.MjModel.from_xml_string)
     assert left_out == ["motor.ctrllimited", "joint.type"]
     assert model.actuator("novel").trnid[0] == model.joint("novel").id
 
@@ -156,8 +156,21 @@ def test_attributes_with_keywords_of_a_newer_release_are_left_out_and_named() ->
 def test_whatever_else_a_newer_release_writes_is_an_error(body: str) -> None:
     with pytest.raises(ValueError, match=r"novel|size"):
         _mujoco.without_newer_attributes(
-            f"<mujoco><worldbody>{body}</worldbody></mujoco>", mujoco.MjModel.from_xml_string
+            f"<mujoco><worldbody>{body}</worldbody></mujoco>", {}, mujoco.MjModel.from_xml_string
         )
+
+
+def test_attributes_of_a_newer_release_are_left_out_of_attached_documents() -> None:
+    scene = (
+        '<mujoco><asset><model name="a_" file="a_model.xml"/><model name="b_" file="b_model.xml"/></asset><worldbody>'
+        '<frame><attach model="a_" prefix="a_"/></frame><frame><attach model="b_" prefix="b_"/></frame>'
+        "</worldbody></mujoco>"
+    )
+    robot = b'<mujoco><worldbody><body name="hand"><geom size="0.1" glow="3"/></body></worldbody></mujoco>'
+    files = {"a_model.xml": robot, "b_model.xml": robot, "notes.txt": b"\xff"}
+    model, left_out = _mujoco.without_newer_attributes(scene, files, mujoco.MjModel.from_xml_string)
+    assert left_out == ["geom.glow"]
+    assert (model.body("a_hand").id, model.body("b_hand").id) == (1, 2)
 
 
 NEWER = re.compile(

@@ -15,7 +15,7 @@ import importlib
 import re
 import tempfile
 import zipfile
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -292,20 +292,32 @@ def _unwritable() -> ValueError:
     )
 
 
-def without_newer_attributes(xml: str, compiled: Callable[[str], T]) -> tuple[T, list[str]]:
+def without_newer_attributes(
+    xml: str, assets: Mapping[str, bytes], compiled: Callable[[str, Mapping[str, bytes]], T]
+) -> tuple[T, list[str]]:
     """Compile an MJCF that a newer MuJoCo has written; return the result and which attributes were left out for that.
 
     An attribute is left out when this MuJoCo does not know it, or does not know its value, a keyword.
+
+    Args:
+        xml: The model.
+        assets: Its files by name; among them documents, `.xml`, that it attaches.
+        compiled: Compiles a model with its files.
 
     Raises:
         ValueError: It cannot be compiled, for any other reason.
     """
     left_out: list[str] = []
-    untried: list[tuple[str, str]] = []
+    untried: list[tuple[str, list[str]]] = []
     complaint: tuple[str, ...] = ()
+    names = [name for name in assets if name.lower().endswith(".xml")]
+    texts = [xml, *(assets[name].decode("utf-8", "surrogateescape") for name in names)]
     while True:
         try:
-            return compiled(xml), left_out
+            attached = {
+                name: text.encode("utf-8", "surrogateescape") for name, text in zip(names, texts[1:], strict=True)
+            }
+            return compiled(texts[0], {**assets, **attached}), left_out
         except ValueError as error:
             found = _UNKNOWN.search(str(error))
             if found is None:
@@ -313,29 +325,29 @@ def without_newer_attributes(xml: str, compiled: Callable[[str], T]) -> tuple[T,
             if untried and found.groups() == complaint:
                 left_out.pop()  # another attribute has the value that was meant
             else:
-                untried = _without_one_attribute(xml, *found.groups())
+                untried = _without_one_attribute(texts, *found.groups())
                 complaint = found.groups()
             if not untried:
                 raise
-            name, xml = untried.pop()
+            name, texts = untried.pop()
             left_out.append(name)
 
 
 _UNKNOWN = re.compile(r"(unrecognized attribute|invalid keyword): '([^'\"]+)'\s+Element '([\w:-]+)'")
 
 
-def _without_one_attribute(xml: str, problem: str, word: str, element: str) -> list[tuple[str, str]]:
-    """Return what may be the attribute that MuJoCo complains of, and the MJCF without it, for each that may be it."""
+def _without_one_attribute(texts: list[str], problem: str, word: str, element: str) -> list[tuple[str, list[str]]]:
+    """Return what may be the attribute that MuJoCo complains of, and the texts without it, for each that may be it."""
     attributes = [word]
     if problem == "invalid keyword":
-        tags = " ".join(re.findall(rf"<{element}\b[^<>]*", xml))
+        tags = " ".join(tag for text in texts for tag in re.findall(rf"<{element}\b[^<>]*", text))
         attributes = sorted(set(re.findall(rf'\s([\w:-]+)="{re.escape(word)}"', tags)))
     value = re.escape(word) if problem == "invalid keyword" else '[^"]*'
-    shorter = [
-        (f"{element}.{attribute}", re.sub(rf'(<{element}\b[^<>]*?)\s{re.escape(attribute)}="{value}"', r"\1", xml))
-        for attribute in attributes
-    ]
-    return [(name, text) for name, text in shorter if text != xml]
+    shorter: list[tuple[str, list[str]]] = []
+    for attribute in attributes:
+        there = re.compile(rf'(<{element}\b[^<>]*?)\s{re.escape(attribute)}="{value}"')
+        shorter.append((f"{element}.{attribute}", [there.sub(r"\1", text) for text in texts]))
+    return [(name, changed) for name, changed in shorter if changed != texts]
 
 
 def mujoco_version() -> str:

@@ -79,6 +79,31 @@ def test_on_trio_it_says_so_at_once(run: Callable[[Any], object], use: Callable[
     run(main)
 
 
+def test_anyios_asyncio_backend_is_a_loop_like_any_other(scripted: Any) -> None:
+    level = {"op": "current_level_ok", "level_path": "/Game/Levels/lab"}
+    scripted.on("current_level", None)
+
+    async def main() -> None:
+        async with URLabClient("tcp://127.0.0.1", step_port=scripted.port, local_model=False) as client:
+            await client.discover()
+            with anyio.move_on_after(0.05) as gave_up:
+                await client.scene.current_level(timeout=None)
+            assert gave_up.cancelled_caught
+            scripted.on("current_level", level)
+            scripted.release(level)
+            found: list[str] = []
+
+            async def ask() -> None:
+                found.append(await client.scene.current_level())
+
+            async with anyio.create_task_group() as tasks:
+                for _ in range(3):
+                    tasks.start_soon(ask)
+            assert found == ["/Game/Levels/lab"] * 3
+
+    anyio.run(main, backend="asyncio")
+
+
 def test_without_any_loop_it_says_so() -> None:
     client = URLabClient("tcp://127.0.0.1", step_port=1)
     with pytest.raises(URLabError, match="but no event loop runs here"):

@@ -7,15 +7,17 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 from waiting import DEADLINE_S, eventually, pass_time, until
 
 import urlab_client
 from urlab_client import ClientClosed, OutcomeUnknown, ServerUnreachable
-from urlab_client.aio import URLabClient
+from urlab_client.aio import URLabClient, launch
 from urlab_client.aio.launch import serve_arguments, start_seconds, with_model_options
 
 
@@ -130,6 +132,46 @@ async def test_a_killed_server_is_noticed() -> None:
             await client.step()
         await client.discover()
         assert (await client.step()).step == 1
+
+
+class LateNews:
+    """A process whose end is told when a test says so."""
+
+    def __init__(self, process: asyncio.subprocess.Process) -> None:
+        self.told = asyncio.Event()
+        self._process = process
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._process, name)
+
+    @property
+    def returncode(self) -> int | None:
+        return self._process.returncode if self.told.is_set() else None
+
+    async def wait(self) -> int:
+        await self.told.wait()
+        return await self._process.wait()
+
+
+async def test_a_call_that_waits_for_a_connection_to_a_killed_server_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    processes: list[LateNews] = []
+    start = launch._start
+
+    async def start_one(command: Sequence[str]) -> Any:
+        processes.append(LateNews(await start(command)))  # type: ignore[arg-type]
+        return processes[-1]
+
+    monkeypatch.setattr(launch, "_start", start_one)
+    async with URLabClient("sim://ball", step_mode="direct") as client:
+        await client.discover()
+        processes[0].kill()
+        await until(lambda: not client.connected)
+        step = asyncio.create_task(client.step(timeout=10 * DEADLINE_S))
+        await until(lambda: client._transport._inner._waiting)  # type: ignore[attr-defined]
+        processes[0].told.set()
+        async with asyncio.timeout(DEADLINE_S):
+            with pytest.raises(ServerUnreachable, match=r"ended with code -9.*discover\(\)"):
+                await step
 
 
 async def test_cancelling_the_first_call_leaves_no_server_behind(never_ready: None) -> None:

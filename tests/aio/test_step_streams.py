@@ -74,7 +74,8 @@ async def test_the_picture_of_a_step_is_taken_from_the_stream(
         await until(lambda step=step: beta.frame >= step)
         camera.send(TOPIC, picture(step - 1, 0.0, 9))
         camera.send(TOPIC, picture(step, 0.002 * step, 10 * step))
-        camera.send(TOPIC, picture(step + 1, 1.0, 9))
+        if step == 2:  # it would answer the second step, were it sent during the first
+            camera.send(TOPIC, picture(3, 1.0, 9))
         reply = await task
         assert reply.cameras is not None
         assert list(reply.cameras) == ["arm a/wrist"]

@@ -745,7 +745,7 @@ class TestEvents:
     async def test_listeners_hear_what_happens_from_then_on(self) -> None:
         bus = EventBus()
         bus.publish(ServerConnected(endpoint="tcp://early"))
-        first, second = bus.stream(10), bus.stream(10)
+        first, second = bus.stream((), 10), bus.stream((), 10)
         bus.publish(ServerConnected(endpoint="tcp://lab"))
         bus.publish(PlayStarted(articulations=["g1"]))
         heard = [await first.receive(), await first.receive()]
@@ -756,7 +756,7 @@ class TestEvents:
 
     async def test_a_waiting_listener_is_woken(self) -> None:
         bus = EventBus()
-        listener = asyncio.create_task(anext(bus.stream(10)))
+        listener = asyncio.create_task(anext(bus.stream((), 10)))
         await asyncio.sleep(0)
         bus.publish(ServerReconnected(endpoint="tcp://lab", down_s=1.5))
         assert await listener == ServerReconnected(
@@ -765,7 +765,7 @@ class TestEvents:
 
     async def test_the_oldest_give_way_visibly(self) -> None:
         bus = EventBus()
-        events = bus.stream(3)
+        events = bus.stream((), 3)
         for number in range(10):
             bus.publish(ServerLost(endpoint=f"tcp://{number}"))
         event = await events.receive()
@@ -774,22 +774,34 @@ class TestEvents:
 
     async def test_closing_the_client_ends_them(self) -> None:
         bus = EventBus()
-        events = bus.stream(3)
+        events = bus.stream((), 3)
         bus.publish(ServerLost(endpoint="tcp://lab"))
         bus.close()
         assert isinstance(await anext(events), ServerLost)
         with pytest.raises(ClientClosed):
             await anext(events)
         with pytest.raises(ClientClosed):
-            bus.stream(3)
+            bus.stream((), 3)
+
+    async def test_only_the_kinds_asked_for_are_heard(self) -> None:
+        bus = EventBus()
+        events = bus.stream(("lost", PlayStarted), 10)
+        for event in (ServerConnected(endpoint="tcp://lab"), ServerLost(endpoint="tcp://lab"), PlayStarted()):
+            bus.publish(event)
+        heard = [await events.receive(), await events.receive()]
+        assert [(type(event), event.seq, event.dropped) for event in heard] == [(ServerLost, 1, 0), (PlayStarted, 2, 0)]
+        with pytest.raises(ValueError, match=r"'play_start' is not a kind of event\. Did you mean 'play_started'"):
+            bus.stream(["play_start"], 10)
+        with pytest.raises(TypeError, match=r"\('lost',\)"):
+            bus.stream("lost", 10)
 
     async def test_nobody_is_kept(self) -> None:
         bus = EventBus()
-        events = bus.stream(3)
+        events = bus.stream((), 3)
         with pytest.raises(URLabTimeoutError, match="nothing happened within 0 ms"):
             await events.receive(timeout=0)
         await events.aclose()
-        dropped = bus.stream(3)
+        dropped = bus.stream((), 3)
         del dropped
         gc.collect()
         assert not bus._handlers

@@ -149,7 +149,7 @@ def test_the_registry_is_listed(
             (tmp_path / f"{name}_1.json").write_text(json.dumps(content))
         (tmp_path / "broken_1.json").write_text("{")
         (tmp_path / "far_1.json").write_text(json.dumps(entry | {"host": "elsewhere.example", "instance_id": "far"}))
-        assert main(["ping", "--all", "--json", "--timeout", "2"]) == 0
+        assert main(["ping", "--all", "--json", "--timeout", "1"]) == 0
         listed = json.loads(capsys.readouterr().out)
         assert {(row["instance_id"], row["answers"]) for row in listed} == {
             ("bench", True),
@@ -157,7 +157,7 @@ def test_the_registry_is_listed(
             ("far", None),
         }
         assert len(listed) == 6
-        assert main(["ping", "--all", "--timeout", "2"]) == 0
+        assert main(["ping", "--all", "--timeout", "1"]) == 0
         text = capsys.readouterr().out
         assert f"bench  tcp://127.0.0.1:{server.step_port}" in text
         assert "does not answer" in text

@@ -52,6 +52,10 @@ async def test_who_answers(connect: Any, serve: Any, bot: str) -> None:
         assert len(client.global_cameras) == 0
         assert client.transport_stats.received >= 3
         assert repr(getattr(client, "twin", client)).endswith("connected>")
+        sim = repr(getattr(client, "twin", client).sim)
+        assert sim.startswith("<SimNamespace tcp://127.0.0.1:")
+        assert ": start, " in sim
+        assert repr(await client.explain()).startswith("<Diagnosis ")
 
 
 async def test_clocks(connect: Any, serve: Any, bot: str) -> None:

@@ -28,7 +28,13 @@ LONG = {
     "docs/console.md",
     "docs/environments.md",
     "docs/howto/cameras.md",
+    "docs/howto/rl.md",
+    "docs/install.md",
+    "docs/policies.md",
+    "docs/recording.md",
     "docs/simulated-server.md",
+    "docs/tasks.md",
+    "docs/tutorials/policy.md",
 }
 """Pages whose code takes several seconds."""
 

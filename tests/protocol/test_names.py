@@ -118,6 +118,13 @@ class TestIsADict:
         assert {**arts} == dict(arts) == plain
         assert repr(arts) == repr(plain)
 
+    def test_ipython_completes_keys_and_the_aliases_that_mean_one_of_them(self) -> None:
+        arts = two_robots_and_an_arm()
+        completions = arts._ipython_key_completions_()
+        assert completions[: len(arts)] == list(arts)
+        assert len(completions) > len(arts)
+        assert all(name in arts for name in completions)
+
     def test_it_cannot_be_changed_behind_the_clients_back(self) -> None:
         arts = two_robots_and_an_arm()
         with pytest.raises(TypeError, match="read-only"):

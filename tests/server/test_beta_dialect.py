@@ -258,24 +258,31 @@ def test_numbers_of_a_new_play_session_begin_anew(bench: Bench) -> None:
 
 
 MESHED = """
-<mujoco model="crab"><asset><mesh name="claw" file="claw.obj"/></asset>
+<mujoco model="crab"><option timestep="0.001" iterations="7"/><asset><mesh name="claw" file="claw.obj"/></asset>
   <worldbody><body><joint name="hip"/><geom type="mesh" mesh="claw"/></body></worldbody>
   <actuator><motor joint="hip"/></actuator></mujoco>
 """
 
 
 def test_a_scene_can_be_built_from_what_comes_with_it(tmp_path: Path) -> None:
-    """Beta statement 86."""
+    """Beta statement 86. A document for each robot, and the options of all merged, as 4.5 and 9.5 say."""
     (tmp_path / "claw.obj").write_text("v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n")
     (tmp_path / "crab.xml").write_text(MESHED)
     crab = tmp_path / "crab.xml"
     with SimulatedServer(crab, "arm", crab, play=True, dialect="beta") as server, Wire(server) as wire:
         reply = wire.hello(include_assets=True)
+        options = wire.ask("set_sim_options", options={})["options"]
+    assert (options["timestep"], options["iterations"], options["integrator"]) == (0.001, 7, "implicitfast")
     scene, assets = reply["mjcf_compiled"], reply["vfs_assets"]
     texts = [scene, *(content.decode() for name, content in assets.items() if name.endswith(".xml"))]
+    for info in reply["articulations"]:
+        prefix = f"{info['actor_name']}_"
+        assert f'<model name="{prefix}" file="{prefix}model.xml"' in scene
+        assert f'<attach model="{prefix}" prefix="{prefix}"' in scene
     files = {file for text in texts for file in re.findall(r'file="([^"]+)"', text)}
     assert files
     assert files <= assets.keys()
     built = mujoco.MjModel.from_xml_string(scene, assets)
     sent = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": reply["mjb"]})
     assert (built.nq, built.nv, built.nu) == (sent.nq, sent.nv, sent.nu)
+    assert (built.opt.timestep, built.opt.integrator) == (sent.opt.timestep, sent.opt.integrator)

@@ -165,7 +165,7 @@ def test_ignored_options_are_named_in_one_warning(
 def test_the_first_models_options_can_be_honoured(scene_of: SceneOf) -> None:
     ant = mjcf(BALL_BODY, head='<option timestep="0.01" integrator="Euler"/>')
 
-    scene = scene_of(("bot", BOT), ("ant", ant), honour_mjcf_options=True)
+    scene = scene_of(("bot", BOT), ("ant", ant), options="first")
 
     assert scene.model.opt.timestep == 0.005
     assert scene.model.opt.gravity[2] == -1
@@ -418,7 +418,7 @@ def test_the_exported_scene_loads_with_its_assets(workspace: Workspace) -> None:
     workspace.world.spawn_actor(workspace.blueprint("bot", BOT))
     scene = compile_scene(workspace.world.freeze())
 
-    text, assets = scene.mjcf(), scene.assets()
+    text, assets = scene.export()
     again = mujoco.MjModel.from_xml_string(text, assets=assets)
 
     assert len(assets) == 4
@@ -625,7 +625,7 @@ def test_a_model_that_needs_its_own_integrator_says_how_to_get_it(scene_of: Scen
     with pytest.raises(CompileFailed, match="--mjcf-options"):
         scene_of(("cloth", cloth))
 
-    assert compile_scene(workspace.world.freeze(), honour_mjcf_options=True).model.nflex == 1
+    assert compile_scene(workspace.world.freeze(), options="first").model.nflex == 1
 
 
 def test_what_a_scene_warns_of_is_logged(two_bots: CompiledScene, caplog: pytest.LogCaptureFixture) -> None:

@@ -11,7 +11,7 @@ import pytest
 from raw_shm import RawShm
 from wire import Wire
 
-from urlab_client.server import SimulatedServer
+from urlab_client.server import Limits, SimulatedServer
 from urlab_client.server.assets.uploads import IDLE_S, MAX_OPEN
 
 MESH = b"v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
@@ -41,7 +41,8 @@ def chunk(upload: str, data: bytes, name: str = "", **fields: Any) -> dict[str, 
 
 @pytest.fixture
 def server(tmp_path: Path) -> Iterator[SimulatedServer]:
-    with SimulatedServer(dialect="beta", saved_dir=tmp_path / "saved") as server:
+    limits = Limits(model_cpu_s=1, model_memory_bytes=256 * 2**20)
+    with SimulatedServer(dialect="beta", saved_dir=tmp_path / "saved", limits=limits) as server:
         yield server
 
 
@@ -191,8 +192,6 @@ def test_a_model_that_runs_is_described(wire: Wire) -> None:
 
 
 def test_the_cache_gives_way(tmp_path: Path) -> None:
-    from urlab_client.server import Limits
-
     with (
         SimulatedServer(dialect="beta", saved_dir=tmp_path, limits=Limits(upload_cache_bytes=len(XML))) as server,
         Wire(server) as wire,

@@ -5,143 +5,39 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-import subprocess
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from console_page import PATIENCE_S, PHONE, RUNNING, SLIDER, SOLID, Page, command, link_in, opened, serve
 from PIL import Image
-from selenium import webdriver
 from selenium.common.exceptions import TimeoutException
-from selenium.webdriver.chrome.options import Options
-from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.keys import Keys
-from selenium.webdriver.remote.webelement import WebElement
 from selenium.webdriver.support.ui import WebDriverWait
 
 pytestmark = pytest.mark.browser
-
-FLAGS = (
-    "--headless", "--no-sandbox", "--disable-quic", "--no-first-run", "--window-size=1300,900",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync",
-)  # fmt: skip
-FLAT = ("--disable-gpu", "--disable-3d-apis")
-SOLID = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")  # WebGL without a graphics card
-PATIENCE_S = 40
-RUNNING = "document.querySelector('#play').textContent.includes('Pause')"
-SLIDER = "[data-robot=arm] [data-actuator=elbow]"
 
 TOO_WIDE = """[...document.querySelectorAll('main *, header *')]
   .filter((one) => !one.closest('.frame, .entries, .actors') && one.getBoundingClientRect().right > innerWidth + 1)
   .map((one) => one.outerHTML.slice(0, 80))"""
 
 
-@contextlib.contextmanager
-def command(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """Run `urlab` and yield it with the line that it prints first."""
-    with subprocess.Popen([sys.executable, "-m", "urlab_client", *arguments], stdout=subprocess.PIPE, text=True) as one:
-        try:
-            assert one.stdout is not None
-            yield one, one.stdout.readline()
-        finally:
-            one.kill()
-
-
-def serve(*ports: str) -> contextlib.AbstractContextManager[tuple[subprocess.Popen[str], str]]:
-    return command(
-        "serve", "arm", "quadruped", "--controller", "quadruped=pd,kp=40,kv=1.5", "--play", "--unpaused", "--json",
-        "--camera-size", "64x48", *ports,
-    )  # fmt: skip
-
-
-class Page:
-    """One browser, and what is seen in it."""
-
-    def __init__(self, driver: webdriver.Chrome) -> None:
-        self.driver = driver
-
-    def look(self, script: str) -> Any:
-        return self.driver.execute_script(f"return {script}")
-
-    def until(self, script: str) -> None:
-        WebDriverWait(self.driver, PATIENCE_S, 0.05).until(lambda _: self.look(script), f"never: {script}")
-
-    def click(self, selector: str) -> None:
-        self.until(f"document.querySelector('{selector}')?.disabled === false")
-        self.look(f"document.querySelector('{selector}').click()")
-
-    def find(self, selector: str) -> WebElement:
-        return self.driver.find_element("css selector", selector)
-
-    def ask(self, path: str, body: object = None) -> Any:
-        """Ask the console as the page does."""
-        return self.driver.execute_async_script(
-            "const [path, body, done] = arguments; import('/static/link.js').then(({ask}) => "
-            "ask(body === null ? 'GET' : 'POST', path, body ?? undefined)).then(done)",
-            path, body,
-        )  # fmt: skip
-
-    def asked(self, path: str, wanted: Callable[[Any], object], body: object = None) -> None:
-        """Ask until the answer is as wanted."""
-        WebDriverWait(self.driver, PATIENCE_S, 0.05).until(lambda _: wanted(self.ask(path, body)), f"never: {path}")
-
-    def unfold(self, robot: str, title: str) -> None:
-        self.driver.execute_script(
-            "[...document.querySelectorAll(`[data-robot=${arguments[0]}] details`)]"
-            ".find(one => one.firstChild.textContent === arguments[1]).open = true",
-            robot, title,
-        )  # fmt: skip
-
-    def slide(self, value: float) -> None:
-        self.driver.execute_script(
-            "const slider = document.querySelector(arguments[0]); slider.value = arguments[1];"
-            "slider.dispatchEvent(new Event('input', {bubbles: true}))",
-            SLIDER, value,
-        )  # fmt: skip
-
-    def invitation(self) -> str:
-        """Return a link for one more browser."""
-        return str(
-            self.driver.execute_async_script(
-                "const done = arguments[0]; fetch('api/invitations', {method: 'POST'})"
-                ".then(a => a.json()).then(a => done(new URL(a.path, location.href).href))"
-            )
-        )
-
-    def elbow_is(self, value: float) -> str:
-        shown = "document.querySelector('[data-robot=arm] [data-value=elbow]').textContent"
-        return f"Math.abs(parseFloat({shown}.replace('\u2212', '-')) - {value}) < 0.03"
-
-
-@contextlib.contextmanager
-def opened(folder: Path, link: str, flags: tuple[str, ...] = FLAT) -> Iterator[Page]:
-    options = Options()
-    options.binary_location = "/usr/bin/chromium"
-    for flag in (*FLAGS, *flags, f"--user-data-dir={folder}"):
-        options.add_argument(flag)
-    driver = webdriver.Chrome(options, Service("/usr/bin/chromedriver"))
-    try:
-        driver.get(link)
-        yield Page(driver)
-    finally:
-        driver.quit()
-
-
 @pytest.fixture(scope="module")
-def console() -> Iterator[tuple[dict[str, Any], str, contextlib.ExitStack]]:
+def console(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[tuple[dict[str, Any], str, contextlib.ExitStack]]:
     """A server, the link to a console before it, and what holds the server."""
     with contextlib.ExitStack() as stack:
         _, line = stack.enter_context(serve(*(f"--{n}-port=0" for n in ("step", "state", "ctrl", "info", "camera"))))
         ready = json.loads(line)
         with command(
             "console", ready["address"], f"--step-port={ready['step_port']}", f"--state-port={ready['state_port']}",
-            "--port=0",
+            "--port=0", f"--recordings={tmp_path_factory.mktemp('recordings')}",
         ) as (_, said):  # fmt: skip
-            yield ready, next(word for word in said.split() if word.startswith("http://")), stack
+            yield ready, link_in(said), stack
 
 
 @pytest.fixture(scope="module")
@@ -265,12 +161,16 @@ def test_actors_are_spawned_moved_and_removed_and_nobody_loses_what_they_type(pa
     page.find("[data-actor=second] button[title^=Move]").click()
     page.asked("api/ops/list_actors", lambda _: where("second")[0] == 1.5, {})
     for actor in ("second", "third"):
-        page.find(f"[data-actor={actor}] button[title^=Remove]").click()
+        remove = page.find(f"[data-actor={actor}] button[title^=Remove]")
+        remove.click()
+        assert remove.text == "Remove?"
+        assert where(actor) is not None, "what cannot be taken back is asked for first"
+        remove.click()
         page.until(f"document.querySelector('[data-actor={actor}]') === null")
         assert where(actor) is None
 
 
-def test_a_recording_is_made_and_replayed_and_one_can_go_to_any_place_in_it(page: Page) -> None:
+def test_a_recording_is_made_offered_for_download_and_replayed_in_seconds(page: Page) -> None:
     page.until(RUNNING)
     page.slide(0.0)
     page.until(page.elbow_is(0.0))
@@ -278,29 +178,43 @@ def test_a_recording_is_made_and_replayed_and_one_can_go_to_any_place_in_it(page
     page.until("document.querySelector('#record').textContent.includes('Stop')")
     page.slide(0.9)
     page.until(page.elbow_is(0.9))
-    page.ask("api/ops/configure_controller", {"articulation": "quadruped", "params": {"kp": {"RR_hip": 41}}})
-    assert page.ask("api/status")["recording"], "tuning a controller is not a reason to think that it ended"
+    page.asked("api/status", lambda status: status["recording"]["pictures"] >= 4)
     page.click("#record")
-    page.until("document.querySelector('#toasts').innerText.includes('frames')")
-    page.click("#replay")
-    page.until("document.querySelector('#replay').textContent.includes('Stop')")
-    page.until("document.querySelector('#mode').value === 'direct' && +document.querySelector('#timeline').value > 5")
-    page.click("#stop")
-    page.until(f"!({RUNNING})")
-    seek = (
-        "const t = document.querySelector('#timeline'); t.value = Math.round(arguments[0] * t.max);"
-        "t.dispatchEvent(new Event('input', {bubbles: true})); return +t.value"
+    page.until("document.querySelectorAll('[data-recording]').length === 1")
+    page.driver.execute_script("document.querySelector('[data-recording] .menu').open = true")
+    page.until("document.querySelector('[data-recording] .kinds').innerText.includes('MP4, arm/overview')")
+    kinds = page.look(
+        "[...document.querySelectorAll('[data-recording] .kind')].map(one => one.textContent.split(',')[0])"
+    )
+    assert {"MCAP", "CSV", "MP4"} <= set(kinds)
+    for at in (0, 1):
+        size = "fetch(arguments[0]).then(one => one.blob()).then(one => arguments[1](one.size))"
+        link = page.look(f"document.querySelectorAll('[data-recording] .kind')[{at}].href")
+        assert page.driver.execute_async_script(size, link) > 1000
+    page.click("[data-recording] .replay")
+    page.until("!document.querySelector('#replay').hidden && +document.querySelector('#timeline').value > 0.1")
+    page.until("document.querySelector('#time').textContent !== '0.00 s'")
+    seconds = page.look("+document.querySelector('#timeline').max")
+    page.click("#stop")  # whatever moves, physics as well
+    page.until("document.querySelector('#replay-play').textContent === '▶'")
+    go = (
+        "const t = document.querySelector('#timeline'); t.value = arguments[0] * t.max;"
+        "t.dispatchEvent(new Event('input', {bubbles: true}))"
     )
     for share, elbow in ((1.0, 0.9), (0.0, 0.0), (1.0, 0.9)):
-        frame = page.driver.execute_script(seek, share)
-        page.asked("api/status", lambda status, frame=frame: status["replay"][0] == frame)
+        page.driver.execute_script(go, share)
         page.until(page.elbow_is(elbow))
-    page.click("#replay")
-    page.until("document.querySelector('#mode').value === 'live'")
-    page.driver.execute_script(
-        "document.querySelector('#play').textContent.includes('Play') && document.querySelector('#play').click()"
-    )
+        page.until(f"Math.abs(parseFloat(document.querySelector('#time').textContent) - {share * seconds}) < 0.1")
+    page.find("body").send_keys(" ")
+    page.until("document.querySelector('#replay-play').textContent === '❚❚'")
+    page.click("#replay-end")
+    page.until("document.querySelector('#replay').hidden")
+    page.click("#play")
     page.until(RUNNING)
+    remove = page.find("[data-recording] button[aria-label^=Delete]")
+    remove.click()
+    remove.click()
+    page.until("document.querySelectorAll('[data-recording]').length === 0")
 
 
 def test_keys_work_and_not_while_somebody_types(page: Page) -> None:
@@ -325,22 +239,17 @@ def test_keys_work_and_not_while_somebody_types(page: Page) -> None:
 
 
 def test_it_fits_a_phone(page: Page) -> None:
-    command = "Emulation.setDeviceMetricsOverride"
-    page.driver.execute_cdp_cmd(command, {"width": 360, "height": 740, "deviceScaleFactor": 2, "mobile": True})
-    try:
-        page.until("innerWidth === 360")
+    with page.phone():
         page.unfold("quadruped", "Gains")
         page.unfold("quadruped", "Joints")
         for place in (0, 1):
             page.driver.execute_script(f"window.scrollTo(0, {place} * document.body.scrollHeight)")
             wide = page.look(TOO_WIDE)
             assert wide == []
-            assert page.look("document.documentElement.scrollWidth") == 360
+            assert page.look("document.documentElement.scrollWidth") == PHONE["width"]
             stop = page.look("document.querySelector('#stop').getBoundingClientRect().toJSON()")
-            assert 0 <= stop["top"] <= stop["bottom"] <= 740
+            assert 0 <= stop["top"] <= stop["bottom"] <= PHONE["height"]
             assert stop["height"] >= 44
-    finally:
-        page.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
 def test_a_second_viewer_drives_only_when_the_first_lets_go(page: Page, tmp_path: Path) -> None:
@@ -399,17 +308,3 @@ def test_a_killed_server_shows_as_such_and_comes_back(
     page.until(RUNNING)
     page.slide(0.4)
     page.until(page.elbow_is(0.4))
-
-
-def test_a_console_that_ends_shows_as_such(
-    console: tuple[dict[str, Any], str, contextlib.ExitStack], tmp_path: Path
-) -> None:
-    ready = console[0]
-    ports = [f"--{n}-port={ready[f'{n}_port']}" for n in ("step", "state")]
-    with contextlib.ExitStack() as stack:
-        process, said = stack.enter_context(command("console", ready["address"], *ports, "--port=0"))
-        link = next(word for word in said.split() if word.startswith("http://"))
-        page = stack.enter_context(opened(tmp_path, link))
-        page.until(f"document.querySelector('{SLIDER}') !== null")
-        process.kill()
-        page.until("document.querySelector('#banner').innerText.includes('console itself')")

@@ -5,13 +5,13 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import operator
 import os
 from collections.abc import Callable, Collection, Mapping
 from types import TracebackType
 from typing import NoReturn, Self, TypeVar
 
 from urlab_client.aio.address import transport_to
+from urlab_client.aio.arguments import integer
 from urlab_client.aio.client_state import ClientState
 from urlab_client.aio.control import Control
 from urlab_client.aio.deadline import DEFAULT, Timeout
@@ -30,6 +30,7 @@ from urlab_client.aio.namespaces.sim import SimNamespace
 from urlab_client.aio.namespaces.viewport import ViewportNamespace
 from urlab_client.aio.session import Session
 from urlab_client.aio.session_level import SESSION_LEVEL, SessionLevel
+from urlab_client.aio.state.capturing import Capturing
 from urlab_client.aio.state.connection_monitor import ConnectionMonitor
 from urlab_client.aio.state.discovery import Discovery
 from urlab_client.aio.state.recovery import resync
@@ -42,13 +43,13 @@ from urlab_client.aio.transport.curve import client_keys, is_local
 from urlab_client.aio.transport.server_regions import SharedMemoryRegions
 from urlab_client.aio.transport.shm import ShmTransport
 from urlab_client.protocol.base import Reply, Request
-from urlab_client.protocol.client_types import ClientConfig, Diagnosis, Resync
+from urlab_client.protocol.client_types import CallRecord, ClientConfig, Diagnosis, Resync
 from urlab_client.protocol.enums import CameraTiming, ObservationLevel, StepMode, Transport
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.protocol.messages.session import Hello, MetaOk, OpInfo, Reset, ResetOk, Step, StepOk
 from urlab_client.protocol.messages.session import Meta as MetaRequest
-from urlab_client.protocol.messages.streams import ClientEvent, RowSample, StateSnapshot, StreamPolicy
+from urlab_client.protocol.messages.streams import CameraSample, ClientEvent, RowSample, StateSnapshot, StreamPolicy
 from urlab_client.protocol.topics import TopicKind
 
 __all__ = ["URLabClient"]
@@ -92,8 +93,12 @@ class URLabClient(ClientState):
             server and network those that nobody looks at; `frames()` is received all the same.
         claim_control: Take control of a robot with the first write to it, where robots have one owner. False is for
             those who look on, and for those who say `articulation.claim()`.
+        observe: Called with a `CallRecord` when a request is over, whatever became of it: op, bytes, time in the queue,
+            round trip, outcome. It runs on the client's event loop, so it must be quick and must not call the client;
+            what it raises is logged and changes nothing.
 
     Raises:
+        TypeError: `observe` is not a plain function.
         KeyFileError: A key file cannot be used.
         ValueError: The address or an option is malformed.
     """
@@ -119,6 +124,7 @@ class URLabClient(ClientState):
         trust_server: bool = False,
         live_pictures: bool = True,
         claim_control: bool = True,
+        observe: Callable[[CallRecord], object] | None = None,
     ) -> None:
         config = ClientConfig(
             address=address,
@@ -150,7 +156,9 @@ class URLabClient(ClientState):
         memory = SharedMemoryRegions(shm_dir) if Transport(transport) is Transport.SHM else None
         plain = transport_to(address, step_port, keys, shm=memory is not None)
         self._transport = plain if memory is None else ShmTransport(plain, memory)
-        session = Session(self._transport, default_timeout=rcv_timeout_ms / 1000, json=encoding == "json")
+        session = Session(
+            self._transport, default_timeout=rcv_timeout_ms / 1000, json=encoding == "json", observe=observe
+        )
         session.control = Control(session, wanted=claim_control)
         self._publishers = Publishers(
             lambda: self._transport.endpoint,
@@ -170,6 +178,7 @@ class URLabClient(ClientState):
         state = SimState(
             session, self._publishers, self._motion, wanted_mode=StepMode(step_mode), live_pictures=live_pictures
         )
+        self._publishers.capture = Capturing(state, rcv_timeout_ms / 1000).take
         super().__init__(config, session, state)
         self._discovery = Discovery(
             state,
@@ -294,7 +303,7 @@ class URLabClient(ClientState):
             ValueError: A set-point is NaN or infinite, or in puppet mode something in `data`; nothing was sent.
             NoSession: `discover()` was not called, or was broken off; nothing was sent.
         """
-        n_steps = operator.index(n_steps)  # a hot op: its request is not checked again before it is sent
+        n_steps = integer("step: n_steps", n_steps)  # a hot op: its request is not checked again before it is sent
         level = None if observations is SESSION_LEVEL else ObservationLevel(observations)
         turn = self._session.turn(Step, timeout=timeout)
         if not turn.begin_at_once():  # which `async with` would take three coroutines for
@@ -386,10 +395,43 @@ class URLabClient(ClientState):
         """
         return await self._motion.wait_until(predicate, timeout)
 
+    async def capture(
+        self, cameras: Collection[str] | None = None, *, timeout: Timeout = DEFAULT
+    ) -> dict[str, CameraSample]:
+        """Take pictures of several cameras now, in any step mode, without a step; see `URLabCameraView.capture`.
+
+        In `direct` and `puppet` mode, and while paused, all of them show the same moment.
+
+        Args:
+            cameras: Names, as `camera()` takes them; None for all there are.
+            timeout: Seconds to wait for all of them together; None waits without limit.
+
+        Returns:
+            The pictures by the names given.
+
+        Raises:
+            KeyError: There is no such camera, or there are several; nothing was sent.
+            TypeError: `cameras` is a name by itself.
+            PictureTimeout: Some came not in time; `.cameras` names them.
+            NoActiveManager: No play session runs.
+            ModeLocked: The project pins a mode in which pictures come with steps only.
+        """
+        objects = self._state.objects
+        if isinstance(cameras, str):
+            raise TypeError(f"capture takes several names; one: client.camera({cameras!r}).capture()")
+        if cameras is None:
+            names = {shown: name for name, shown in objects.shown_cameras(objects.camera_names()).items()}
+        else:
+            names = {name: name for name in cameras}
+        views = [self.camera(name) for name in names.values()]
+        samples = await self._publishers.capture(views, timeout) if views else []
+        return dict(zip(names, samples, strict=True))
+
     def state_stream(
         self,
         policy: str | StreamPolicy = "latest",
         *,
+        max_rate: float | None = None,
         buffer: int = BUFFER_ITEMS,
         buffer_bytes: int = BUFFER_BYTES,
         timeout: Timeout = DEFAULT,
@@ -403,17 +445,20 @@ class URLabClient(ClientState):
 
         Args:
             policy: `latest`, or `all` within the buffer.
+            max_rate: With `latest`, snapshots per second at most, each the newest by then. The rate does not drift: an
+                item that is taken late does not delay those after it. None for as many as come.
             buffer: Snapshots that may wait, with `all`.
             buffer_bytes: Bytes that may wait, with `all`.
             timeout: Seconds that iterating waits for each snapshot; by default the client's for the first one and then
                 without limit; None waits.
 
         Raises:
-            ValueError: Unknown policy, or an empty buffer.
+            ValueError: Unknown policy, an empty buffer, or a rate that is not above 0 or not for this policy.
         """
         return Stream(
             self._publishers.state(policy),
             policy=policy,
+            max_rate=max_rate,
             buffer=buffer,
             buffer_bytes=buffer_bytes,
             timeout=timeout,
@@ -475,16 +520,22 @@ class URLabClient(ClientState):
             default_timeout=self._publishers.default_timeout,
         )
 
-    def events(self, *, buffer: int = BUFFER_ITEMS) -> Stream[ClientEvent]:
+    def events(
+        self, *, kinds: Collection[str | type[ClientEvent]] = (), buffer: int = BUFFER_ITEMS
+    ) -> Stream[ClientEvent]:
         """Stream what happens to the connection, the session and play, from this call on.
 
         Args:
+            kinds: Which events, by class or by name: `connected`, `lost`, `reconnected`, `silent`, `answers`,
+                `session_opened`, `session_lost`, `play_started`, `play_ended`. Empty for all.
             buffer: Events that wait for a reader; the oldest give way, which shows in the next one's `dropped`.
 
         Raises:
             ClientClosed: The client was closed.
+            ValueError: There is no event of such a kind.
+            TypeError: `kinds` is a name by itself.
         """
-        return self._publishers.events.stream(buffer)
+        return self._publishers.events.stream(kinds, buffer)
 
     async def call(self, request: Request[R], *, timeout: Timeout = DEFAULT) -> R:
         """Send any request of `urlab_client.protocol.messages` and return its reply, without taking anything over.

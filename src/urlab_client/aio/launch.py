@@ -141,6 +141,7 @@ class LaunchedTransport:
             self._arguments.append(f"--shm-dir={_memory_directory()}")
         self._process: asyncio.subprocess.Process | _Watched | None = None
         self._drain: asyncio.Task[None] | None = None
+        self._watch: asyncio.Task[None] | None = None
         self._inner: ZmqTransport | None = None
         self._launching: asyncio.Task[ZmqTransport] | None = None
         self._state_port: int | None = None
@@ -174,12 +175,7 @@ class LaunchedTransport:
         process = self._process
         if self._inner is not None and process is not None and process.returncode is not None:
             if op.request is not Hello:
-                raise ServerUnreachable(
-                    f"{op.name}: the simulated server of {self._address} has ended with code {process.returncode}. "
-                    "Nothing was sent.",
-                    op=op.name,
-                    hint="discover() starts another one.",
-                )
+                raise self._ended(process, op)
             self._lost_at = self._inner.lost_at
             await self._bury()
         if self._inner is None:
@@ -209,6 +205,9 @@ class LaunchedTransport:
         inner, self._inner = self._inner, None
         process, self._process = self._process, None
         drain, self._drain = self._drain, None
+        watch, self._watch = self._watch, None
+        if watch is not None:
+            watch.cancel()
         if inner is not None:
             await inner.aclose()
         if process is None:
@@ -249,6 +248,19 @@ class LaunchedTransport:
             raise transport
         return transport
 
+    async def _tell_end(self, process: asyncio.subprocess.Process | _Watched, transport: ZmqTransport) -> None:
+        """Fail what waits, unsent, for a connection to a server that has ended: none will come."""
+        await process.wait()
+        transport.fail_waiting(self._ended(process))
+
+    def _ended(self, process: asyncio.subprocess.Process | _Watched, op: Op | None = None) -> ServerUnreachable:
+        return ServerUnreachable(
+            f"{f'{op.name}: ' if op else ''}the simulated server of {self._address} has ended with code "
+            f"{process.returncode}. Nothing was sent.",
+            op=op.name if op else None,
+            hint="discover() starts another one.",
+        )
+
     def _was_closed(self) -> ClientClosed:
         return ClientClosed(f"The client of {self._address} was closed.", hint="Make a new client.")
 
@@ -268,6 +280,7 @@ class LaunchedTransport:
         transport.stats = self.stats
         transport.on_event = self.on_event
         transport.lost_at = self._lost_at
+        self._watch = asyncio.create_task(self._tell_end(process, transport), name="urlab-server-end")
         self._state_port = ready.state_port
         self.scene_warnings = ready.scene_warnings
         for warning in ready.scene_warnings:

@@ -5,9 +5,12 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Coroutine
+from collections.abc import AsyncGenerator, Callable, Coroutine
+from contextlib import asynccontextmanager
+from contextvars import ContextVar
 from typing import Any, TypeVar
 
+from urlab_client.aio.call_records import CallRecords, Observe
 from urlab_client.aio.control import Control
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.event_loop import running_loop
@@ -15,7 +18,7 @@ from urlab_client.aio.jobs import OnProgress, finish
 from urlab_client.aio.mutex import Mutex
 from urlab_client.aio.transport.base import RequestTransport
 from urlab_client.aio.turn import Limits, Turn, at_once
-from urlab_client.protocol.base import ControlRequest, Needs, Op, Reply, Request
+from urlab_client.protocol.base import ControlRequest, Effect, Needs, Op, Reply, Request
 from urlab_client.protocol.codec import (
     check_finite,
     check_request,
@@ -44,6 +47,8 @@ log = logging.getLogger("urlab_client.session")
 
 R = TypeVar("R", bound=Reply)
 _HELLO = op_of(Hello)
+_COMPOSING: ContextVar[Session | None] = ContextVar("_COMPOSING", default=None)
+"""Whose scene the running task changes by several ops."""
 _UNLISTED = frozenset({"hello", "meta"})  # every server has them, none lists them
 
 
@@ -66,9 +71,17 @@ class Session:
         line: Held while a request is under way, from encoding it to its reply.
         turns: Held by the `Turn` under way.
         editing: Held while the editor has a job.
+        scene: Held by whoever changes the scene, for one op or for several that belong together.
     """
 
-    def __init__(self, transport: RequestTransport, *, default_timeout: float | None, json: bool = False) -> None:
+    def __init__(
+        self,
+        transport: RequestTransport,
+        *,
+        default_timeout: float | None,
+        json: bool = False,
+        observe: Observe | None = None,
+    ) -> None:
         self.session_id = ""
         self.greeted = False
         self.features = Features()
@@ -76,12 +89,15 @@ class Session:
         self.on_refusal: Callable[[URLabRPCError], None] | None = None
         self.confirmed = False
         self._transport = transport
+        self._call_records = None if observe is None else CallRecords(observe, transport)
+        self._way = self._call_records or transport
         self._default_timeout = default_timeout
         self._json = json
         self.control = Control(self)
         self.line = Mutex()
         self.turns = Mutex()
         self.editing = Mutex()
+        self.scene = Mutex()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._queued = 0
         self._aside: asyncio.Task[Reply] | None = None
@@ -112,8 +128,35 @@ class Session:
             TypeError, ValueError: The request is malformed; nothing was sent.
         """
         op = op_of(request)
+        if on_progress is not None and not callable(on_progress):
+            raise TypeError(f"{op.name}: on_progress takes a function, got {on_progress!r:.80}.")
         self.check_offered(op)
         limits = self.limits(op, timeout, self.bound_loop().time())
+        if op.ns != "scene" or op.effect is Effect.READ or _COMPOSING.get() is self:
+            return await self._call(request, op, limits, on_progress)
+        await self.acquire(self.scene, op, limits[0])
+        try:
+            return await self._call(request, op, limits, on_progress)
+        finally:
+            self.scene.release()
+
+    @asynccontextmanager
+    async def composing(self, request: type[Request[Any]], timeout: Timeout) -> AsyncGenerator[None]:
+        """Let no other task change the scene while this one does by several ops, the first of which is `request`.
+
+        Raises:
+            URLabTimeoutError: Others changed it until the deadline of that op; nothing was sent.
+        """
+        op = op_of(request)
+        await self.acquire(self.scene, op, self.limits(op, timeout, self.bound_loop().time())[0])
+        outer = _COMPOSING.set(self)
+        try:
+            yield
+        finally:
+            _COMPOSING.reset(outer)
+            self.scene.release()
+
+    async def _call(self, request: Request[R], op: Op, limits: Limits, on_progress: OnProgress | None) -> R:
         if op.needs is not Needs.EDITOR:
             return await self._on_line(request, op, limits)
         # One job at a time: the next op of the editor would wait for it anyway, and block the server meanwhile.
@@ -236,11 +279,14 @@ class Session:
         """Send a request and return its answer; for whoever holds the line."""
         if self.features.claims and isinstance(request, ControlRequest):
             return self.control.send(request, self._ask, limits)
+        if self._call_records is not None:
+            return self._call_records.record(op, self._answer(request, op, limits))
         return self._answer(request, op, limits)
 
     async def _ask(self, request: Request[R], limits: Limits) -> R:
         op = op_of(request)
-        return at_once(op, await self._answer(request, op, limits))
+        answer = self._answer(request, op, limits)
+        return at_once(op, await (answer if self._call_records is None else self._call_records.record(op, answer)))
 
     async def _answer(self, request: Request[R], op: Op, limits: Limits, *, again: bool = False) -> R | OpStarted:
         # One coroutine, though it does several things: each one between a step and its socket costs every step.
@@ -255,7 +301,7 @@ class Session:
         try:
             try:
                 deadline, connect_by = limits
-                answer = await self._transport.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
+                answer = await self._way.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
             except ConnectionLost as lost:
                 answer = await self._ask_again(frame, op, lost, limits)
             finally:
@@ -337,20 +383,24 @@ class Session:
             log.debug("%s: asking again, because the connection was lost", op.name)
             try:
                 deadline, connect_by = limits
-                return await self._transport.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
+                return await self._way.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
             except ConnectionLost as again:
                 lost = again
             except ServerUnreachable as unreachable:
                 raise lost from unreachable
 
     async def acquire(self, lock: Mutex, op: Op, deadline: float | None) -> None:
-        """Wait for `line`, `turns` or `editing`.
+        """Wait for `line`, `turns`, `editing` or `scene`.
 
         Raises:
             URLabTimeoutError: Another call held it until the deadline; nothing was sent.
         """
         if lock.acquire_nowait():
             return
+        waiting = self._wait_for(lock, op, deadline)
+        await (waiting if self._call_records is None else self._call_records.queued(op, waiting))
+
+    async def _wait_for(self, lock: Mutex, op: Op, deadline: float | None) -> None:
         if self._aside is not None:
             self._aside.cancel()
         self._queued += 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from typing import Any
 
+from urlab_client.aio.arguments import integer
 from urlab_client.protocol.messages.streams import StreamPolicy
 
 __all__ = ["BufferedMessage", "StreamBuffer"]
@@ -55,6 +56,7 @@ class StreamBuffer:
         max_bytes: Bytes of content to keep at most; a larger message is never kept.
 
     Attributes:
+        policy: As given.
         received: Messages pushed.
         received_bytes: Bytes of their content.
         dropped: Messages that will never be popped.
@@ -63,9 +65,10 @@ class StreamBuffer:
     """
 
     def __init__(self, policy: StreamPolicy, max_items: int, max_bytes: int) -> None:
+        max_items, max_bytes = integer("buffer", max_items), integer("buffer_bytes", max_bytes)
         if max_items < 1 or max_bytes < 1:
             raise ValueError(f"a buffer holds at least one item and one byte, not {max_items} and {max_bytes}")
-        self._policy = policy
+        self.policy = policy
         self._max_items = max_items
         self._max_bytes = max_bytes
         self._waiting: OrderedDict[bytes | int, BufferedMessage] = OrderedDict()
@@ -88,7 +91,7 @@ class StreamBuffer:
         entry = BufferedMessage(topic, payload, size, wall_ns, self.received)
         entry.dropped, self._carried = self._carried, 0
         entry.gap, self._carried_gap = self._carried_gap, None
-        policy = self._policy
+        policy = self.policy
         key = topic if policy is StreamPolicy.LATEST_PER_KEY else self.received if policy is StreamPolicy.ALL else 0
         old = self._waiting.get(key)
         if old is not None:

@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from types import TracebackType
-from typing import Generic, Protocol, Self, TypeVar
+from typing import Generic, Protocol, Self, SupportsFloat, TypeVar
 
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.event_loop import running_loop
@@ -86,6 +86,7 @@ class _StreamHandler(MessageHandler, Generic[T]):
         tolerant: bool,
         timeout: Timeout,
         default_timeout: float | None,
+        max_rate: float | None,
     ) -> None:
         self.closed = False
         self._source = source
@@ -93,6 +94,8 @@ class _StreamHandler(MessageHandler, Generic[T]):
         self._tolerant = tolerant
         self._timeout = timeout
         self._default_timeout = default_timeout
+        self._period = 0.0 if max_rate is None else 1.0 / max_rate
+        self._due = -math.inf  # when the next item may be handed out, by the monotonic clock
         self._lock = threading.Lock()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._attached = False
@@ -119,8 +122,8 @@ class _StreamHandler(MessageHandler, Generic[T]):
         self._warn(problem)
 
     def on_drained(self) -> None:
-        if self._waiter is not None and not self._waiter.done():
-            self._waiter.set_result(None)
+        if self._early_by() <= 0.0:
+            self._wake()
 
     def on_gap(self, why: str) -> None:
         with self._lock:
@@ -129,7 +132,7 @@ class _StreamHandler(MessageHandler, Generic[T]):
 
     def on_end(self, error: Callable[[], URLabError]) -> None:
         self._end = error
-        self.on_drained()
+        self._wake()
 
     # What the reader calls
 
@@ -198,7 +201,7 @@ class _StreamHandler(MessageHandler, Generic[T]):
         self._source.detach(self)
         with self._lock:
             self._buffer.clear()
-        self.on_drained()
+        self._wake()
 
     def abandon(self) -> None:
         """Stop receiving, from whichever thread collects garbage."""
@@ -209,6 +212,21 @@ class _StreamHandler(MessageHandler, Generic[T]):
         else:
             with contextlib.suppress(RuntimeError):  # the loop is closed, and with it everything that received
                 self._loop.call_soon_threadsafe(self._source.detach, self)
+
+    def __repr__(self) -> str:
+        stats = self.stats()
+        state = "closed" if self.closed else "ended" if self._end is not None else "open" if self._attached else "idle"
+        counts = f"{stats.delivered} delivered, {stats.dropped} dropped, {stats.waiting} waiting"
+        rate = f" at most {1.0 / self._period:g} per s" if self._period else ""
+        return f"<Stream {self._source.name} {self._buffer.policy}{rate}, {state}: {counts}>"
+
+    def _early_by(self) -> float:
+        """Return how many seconds are left until the next item may be handed out."""
+        return self._due - time.monotonic() if self._period and self._end is None else 0.0
+
+    def _wake(self) -> None:
+        if self._waiter is not None and not self._waiter.done():
+            self._waiter.set_result(None)
 
     def _refuse_second_reader(self) -> None:
         if self._reading:
@@ -222,9 +240,10 @@ class _StreamHandler(MessageHandler, Generic[T]):
         while True:
             if self.closed:
                 raise StopAsyncIteration
+            early = self._early_by() > 0.0
             with self._lock:
                 lost = self._buffer.take_overflow()
-                entry = None if lost and not self._tolerant else self._buffer.pop()
+                entry = None if early or (lost and not self._tolerant) else self._buffer.pop()
                 waiting = len(self._buffer)
             if lost and not self._tolerant:
                 raise StreamOverflow(
@@ -243,6 +262,10 @@ class _StreamHandler(MessageHandler, Generic[T]):
                     self._buffer.skip(entry)
                     continue
                 self._delivered += 1
+            if self._period:
+                # From when it was due, not from when it was taken: else each late awakening would lower the rate.
+                now = time.monotonic()
+                self._due = (self._due if now - self._due < self._period else now) + self._period
             # Messages may have been lost in front of it since `latest` looked at it.
             item.dropped, item.gap = entry.dropped, entry.gap
             return item
@@ -273,9 +296,12 @@ class _StreamHandler(MessageHandler, Generic[T]):
         seconds = self._default_timeout if timeout is DEFAULT else timeout
         self._expired = False
         timer = None if seconds is None else loop.call_later(seconds, self._expire)
+        pace: asyncio.TimerHandle | None = None
         try:
             while True:
                 self._waiter = loop.create_future()
+                if (early := self._early_by()) > 0.0:
+                    pace = loop.call_later(early, self._wake)
                 await self._waiter
                 item = self._take()
                 if item is not None:
@@ -291,12 +317,13 @@ class _StreamHandler(MessageHandler, Generic[T]):
                     raise URLabTimeoutError(f"{self._source.name}: {problem}", hint=advice)
         finally:
             self._waiter = None
-            if timer is not None:
-                timer.cancel()
+            for pending in (timer, pace):
+                if pending is not None:
+                    pending.cancel()
 
     def _expire(self) -> None:
         self._expired = True
-        self.on_drained()
+        self._wake()
 
     def _warn(self, problem: str) -> None:
         if not self._warned:
@@ -334,6 +361,7 @@ class Stream(Generic[T]):
         buffer_bytes: int = BUFFER_BYTES,
         timeout: Timeout = DEFAULT,
         default_timeout: float | None = None,
+        max_rate: float | None = None,
         eager: bool = False,
         tolerant: bool = False,
     ) -> None:
@@ -347,15 +375,20 @@ class Stream(Generic[T]):
             timeout: Seconds that iterating waits for an item; by default `default_timeout` for the first item and
                 without limit for those after it.
             default_timeout: Seconds that `receive` waits by default; None waits.
+            max_rate: Items per second at most, for policy `latest`; None for all.
             eager: Receive from now on. The source must allow it from any thread.
             tolerant: Let an overflow show in the next item's `dropped` only.
 
         Raises:
-            ValueError: Unknown policy, or a limit below 1.
+            ValueError: Unknown policy, a limit below 1, or a rate that is not above 0 or not for this policy.
         """
         kept = StreamBuffer(StreamPolicy(policy), buffer, buffer_bytes)
+        if max_rate is not None and kept.policy is not StreamPolicy.LATEST:
+            raise ValueError(f"max_rate is for policy 'latest', which leaves out items; {kept.policy!r} keeps them")
+        if max_rate is not None and not (isinstance(max_rate, SupportsFloat) and 0 < float(max_rate) < math.inf):
+            raise ValueError(f"max_rate must be a number above 0, got {max_rate!r:.80}")
         self._handler = _StreamHandler(
-            source, kept, tolerant=tolerant, timeout=timeout, default_timeout=default_timeout
+            source, kept, tolerant=tolerant, timeout=timeout, default_timeout=default_timeout, max_rate=max_rate
         )
         if eager:
             self._handler.attach()
@@ -424,6 +457,9 @@ class Stream(Generic[T]):
         self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self._handler.close()
+
+    def __repr__(self) -> str:
+        return repr(self._handler)
 
     def __aiter__(self) -> Self:
         return self

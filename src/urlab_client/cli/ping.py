@@ -7,6 +7,7 @@ import json
 import socket
 import statistics
 import time
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -33,13 +34,15 @@ from urlab_client.protocol.errors import (
     URLabTimeoutError,
     URLabVersionMismatch,
 )
-from urlab_client.protocol.instances import decode, registry_directory
+from urlab_client.protocol.instances import RegisteredInstance, decode, registry_directory
 from urlab_client.protocol.messages.runtime import SetMode
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabArticulation, URLabClient
 
 __all__ = ["add_parser", "run"]
+
+REGISTRY_CLIENTS = 16
 
 
 class PingArguments(ServerArguments):
@@ -173,37 +176,39 @@ class RegisteredServer(Struct):
 
 
 async def _registered(arguments: PingArguments) -> list[RegisteredServer]:
+    at_once = asyncio.Semaphore(REGISTRY_CLIENTS)  # entries of servers that are gone would add up their timeouts
+
+    async def server(instance: RegisteredInstance, written: float) -> RegisteredServer:
+        local = instance.host in ("", socket.gethostname())
+        address = f"tcp://{'127.0.0.1' if local else instance.host}"
+        async with at_once:
+            answers = await _answers(address, instance.step_port, arguments.timeout) if local else None
+        return RegisteredServer(
+            instance_id=instance.instance_id,
+            address=f"{address}:{instance.step_port}",
+            pid=instance.pid,
+            seen_s_ago=round(max(0.0, time.time() - written), 1),
+            busy=instance.busy,
+            answers=answers,
+        )
+
+    entries: list[tuple[RegisteredInstance, float]] = []
+    for path in sorted(registry_directory().glob("*.json")):
+        with suppress(OSError, ValueError):  # gone meanwhile, or not a server's
+            entries.append((decode(path.read_bytes()), path.stat().st_mtime))
+    return await asyncio.gather(*(server(instance, written) for instance, written in entries))
+
+
+async def _answers(address: str, step_port: int, timeout: float) -> bool:
     from urlab_client.aio import URLabClient  # noqa: PLC0415
 
-    found: list[RegisteredServer] = []
-    here = socket.gethostname()
-    for path in sorted(registry_directory().glob("*.json")):
+    timeout_ms = max(1, round(timeout * 1000))
+    async with URLabClient(address, step_port=step_port, rcv_timeout_ms=timeout_ms, local_model=False) as client:
         try:
-            instance, written = decode(path.read_bytes()), path.stat().st_mtime
-        except (OSError, ValueError):  # gone meanwhile, or not a server's
-            continue
-        address = f"tcp://{'127.0.0.1' if instance.host in ('', here) else instance.host}"
-        answers: bool | None = None
-        if instance.host in ("", here):
-            timeout_ms = max(1, round(arguments.timeout * 1000))
-            client = URLabClient(address, step_port=instance.step_port, rcv_timeout_ms=timeout_ms, local_model=False)
-            async with client:
-                try:
-                    await client.meta(timeout=arguments.timeout)
-                    answers = True
-                except (URLabConnectionError, URLabTimeoutError):
-                    answers = False
-        found.append(
-            RegisteredServer(
-                instance_id=instance.instance_id,
-                address=f"{address}:{instance.step_port}",
-                pid=instance.pid,
-                seen_s_ago=round(max(0.0, time.time() - written), 1),
-                busy=instance.busy,
-                answers=answers,
-            )
-        )
-    return found
+            await client.meta(timeout=timeout)
+        except (URLabConnectionError, URLabTimeoutError):
+            return False
+    return True
 
 
 def _list(servers: list[RegisteredServer]) -> str:

@@ -214,7 +214,7 @@ def add_parser(commands: Commands) -> None:
         "--mjcf-options",
         action=argparse.BooleanOptionalAction,
         default=False,
-        help="honour the <option> of the first model; without it the plugin's defaults apply, with a warning",
+        help="honour the <option> of the first model; else the alpha ignores all, the beta merges them",
     )
     physics.add_argument(
         "--randomise",

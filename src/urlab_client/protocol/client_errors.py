@@ -12,6 +12,7 @@ __all__ = [
     "ForkedError",
     "NotSettled",
     "OutcomeUnknown",
+    "PictureTimeout",
     "ProtocolError",
     "ServerUnreachable",
     "StreamOverflow",
@@ -56,6 +57,16 @@ class URLabError(Exception):
     def __str__(self) -> str:
         text = str(self.args[0]) if self.args else ""
         return f"{_sentence(text)} {self.hint}" if self.hint else text
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the error as data that JSON can hold: `error` (the class), `message`, `op`, `code` and `hint`."""
+        return {
+            "error": type(self).__name__,
+            "message": str(self),
+            "op": self.op,
+            "code": self.code,
+            "hint": self.hint,
+        }
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _rebuild, (type(self), self.args, dict(self.__dict__))
@@ -117,6 +128,20 @@ class NotSettled(URLabTimeoutError):
     def __init__(self, message: str, *, remaining: dict[str, float], hint: str | None = None) -> None:
         super().__init__(message, hint=hint)
         self.remaining = remaining
+
+
+class PictureTimeout(URLabTimeoutError):
+    """Cameras delivered no picture in time.
+
+    Attributes:
+        cameras: Which ones.
+    """
+
+    cameras: list[str]
+
+    def __init__(self, message: str, *, cameras: list[str], hint: str | None = None) -> None:
+        super().__init__(message, hint=hint)
+        self.cameras = cameras
 
 
 class ProtocolError(URLabError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from enum import StrEnum
 from typing import Any
 
@@ -11,8 +12,11 @@ from msgspec.structs import asdict
 from urlab_client.protocol.enums import StepMode, Transport
 from urlab_client.protocol.features import Features
 from urlab_client.protocol.messages.session import InstanceInfo
+from urlab_client.protocol.serializable import Serializable
 
 __all__ = [
+    "CallOutcome",
+    "CallRecord",
     "ClientConfig",
     "Diagnosis",
     "Finding",
@@ -30,7 +34,7 @@ class Verdict(StrEnum):
     PROBLEM = "problem"
 
 
-class Finding(Struct, frozen=True):
+class Finding(Serializable, Struct, frozen=True):
     """One thing that `client.explain()` looked at.
 
     Attributes:
@@ -44,7 +48,7 @@ class Finding(Struct, frozen=True):
     text: str
 
 
-class Diagnosis(Struct, frozen=True):
+class Diagnosis(Serializable, Struct, frozen=True):
     """What `client.explain()` found, from the sockets inwards; `print()` shows it line by line.
 
     Attributes:
@@ -58,11 +62,17 @@ class Diagnosis(Struct, frozen=True):
         """Whether nothing keeps the robots from moving."""
         return all(finding.verdict is not Verdict.PROBLEM for finding in self.findings)
 
+    def __repr__(self) -> str:
+        counts = Counter(finding.verdict for finding in self.findings)
+        said = ", ".join(f"{counts[verdict]} {verdict}" for verdict in reversed(Verdict) if counts[verdict])
+        problems = [f"{one.subject}: {one.text}" for one in self.findings if one.verdict is Verdict.PROBLEM]
+        return f"<Diagnosis {said or 'empty'}{'; ' if problems else ''}{' '.join(problems)}>"
+
     def __str__(self) -> str:
         return "\n".join(f"{finding.verdict:<8}{finding.subject}: {finding.text}" for finding in self.findings)
 
 
-class Resync(Struct, frozen=True, kw_only=True):
+class Resync(Serializable, Struct, frozen=True, kw_only=True):
     """What `client.resync()` found out.
 
     Attributes:
@@ -91,7 +101,51 @@ class Resync(Struct, frozen=True, kw_only=True):
     settled: bool = True
 
 
-class ClientConfig(Struct, frozen=True, kw_only=True):
+class CallOutcome(StrEnum):
+    """What became of a request."""
+
+    OK = "ok"
+    REFUSED = "refused"
+    """The server answered with an error."""
+    TIMEOUT = "timeout"
+    """No reply in time, or no turn: the bytes sent tell which."""
+    LOST = "lost"
+    """No connection, or it broke."""
+    CANCELLED = "cancelled"
+    FAILED = "failed"
+    """The request was malformed, or the reply."""
+
+
+class CallRecord(Serializable, Struct, frozen=True, kw_only=True):
+    """One request of a client, as `observe=` is told of it when it is over.
+
+    What follows from one call of a method may be several: `discover()` sends `hello` and `meta`, an editor's job is
+    asked after with `op_status`.
+
+    Attributes:
+        op: Its op.
+        endpoint: The server's address.
+        started_ns: This machine's UTC clock when the request came up, nanoseconds.
+        queued_s: Seconds that it waited for other requests of this client.
+        round_trip_s: Seconds from sending to the reply, with the wait for a connection; 0 if it never got so far.
+        sent_bytes: Size of the request; with each repetition after a lost connection. 0 if it never got so far.
+        received_bytes: Size of the reply; 0 without one.
+        outcome: What became of it.
+        error: The server's code for what it refused, else the name of the exception; empty if all went well.
+    """
+
+    op: str
+    endpoint: str
+    started_ns: int
+    queued_s: float
+    round_trip_s: float
+    sent_bytes: int
+    received_bytes: int
+    outcome: CallOutcome
+    error: str = ""
+
+
+class ClientConfig(Serializable, Struct, frozen=True, kw_only=True):
     """The arguments a client was made with; see `URLabClient` for their meaning."""
 
     address: str = "tcp://localhost"
@@ -118,7 +172,7 @@ class ClientConfig(Struct, frozen=True, kw_only=True):
         return asdict(self)
 
 
-class ServerInfo(Struct, frozen=True, kw_only=True):
+class ServerInfo(Serializable, Struct, frozen=True, kw_only=True):
     """What a server is and can do; see `client.server`.
 
     Attributes:

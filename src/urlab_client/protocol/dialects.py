@@ -89,6 +89,7 @@ class Dialect:
         jobs: Ops that take long answer `op_started`.
         claims: Writes to a robot are refused unless the writer owns it.
         cameras_on: Cameras stream from the start of play.
+        cameras_repeat: Cameras stream the same state over and over, else each state once.
         camera_headers: Streamed pictures begin with number, time and size.
         camera_forms: Pictures carry `frame_id` and `sim_time` in replies, live steps bring them, and steps can wait.
         draws_for_steps: Steps draw the pictures that they bring; else they bring what was drawn before them.
@@ -103,7 +104,8 @@ class Dialect:
         auto_mode: `auto` is a step mode beside live, else another name of it.
         controls_float32: Set-points are rounded to single precision.
         options_float32: Options are kept in single precision and keywords in lower case.
-        options_merged: The `<option>` of an imported robot reaches the scene.
+        options_merged: The `<option>` of every imported robot reaches the scene.
+        robots_attached: The XML of the handshake attaches a document for each robot, else it is one flat model.
         instance: The handshake says which of several servers this is, and its own shared-memory regions.
         first_camera_port: Default port of the first camera.
         shapes: What replies look like, by their `op`, where that is not how `messages` declares them.
@@ -115,6 +117,7 @@ class Dialect:
     jobs: bool
     claims: bool
     cameras_on: bool
+    cameras_repeat: bool
     camera_headers: bool
     camera_forms: bool
     draws_for_steps: bool
@@ -130,6 +133,7 @@ class Dialect:
     controls_float32: bool
     options_float32: bool
     options_merged: bool
+    robots_attached: bool
     instance: bool
     first_camera_port: int
     shapes: Callable[[], Mapping[str, Callable[[Any], Struct]]] = field(default=_no_shapes)
@@ -168,6 +172,7 @@ ALPHA: Final = Dialect(
     jobs=False,
     claims=False,
     cameras_on=True,
+    cameras_repeat=True,
     camera_headers=False,
     camera_forms=False,
     draws_for_steps=True,
@@ -183,6 +188,7 @@ ALPHA: Final = Dialect(
     controls_float32=True,
     options_float32=True,
     options_merged=False,
+    robots_attached=False,
     instance=False,
     first_camera_port=5558,
 )
@@ -195,6 +201,7 @@ BETA: Final = Dialect(
     jobs=True,
     claims=True,
     cameras_on=False,
+    cameras_repeat=False,
     camera_headers=True,
     camera_forms=True,
     draws_for_steps=True,
@@ -210,6 +217,7 @@ BETA: Final = Dialect(
     controls_float32=False,
     options_float32=False,
     options_merged=True,
+    robots_attached=True,
     instance=True,
     first_camera_port=5561,
     shapes=_beta_shapes,

@@ -18,6 +18,7 @@ from urlab_client.protocol.client_errors import (
     ForkedError,
     NotSettled,
     OutcomeUnknown,
+    PictureTimeout,
     ProtocolError,
     ServerUnreachable,
     StreamOverflow,
@@ -80,6 +81,7 @@ __all__ = [
     "PathNotReadable",
     "PathNotWritable",
     "PayloadTooLarge",
+    "PictureTimeout",
     "ProtocolError",
     "RecordingAlreadyActive",
     "RecordingNotActive",
@@ -158,6 +160,12 @@ class URLabRPCError(URLabError):
         )
         self.message = message
         self.details = dict(details or {})
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the error as data that JSON can hold; besides what every error has, `details`."""
+        from urlab_client.protocol.serializable import plain  # noqa: PLC0415  # errors alone need no NumPy
+
+        return {**super().to_dict(), "details": plain(self.details, "list")}
 
 
 def rpc_error(

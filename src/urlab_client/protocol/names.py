@@ -160,6 +160,10 @@ class NameMap(dict[str, T]):
     def __reduce__(self) -> tuple[Any, ...]:
         return NameMap, (dict(self), self._aliases, self.kind)
 
+    def _ipython_key_completions_(self) -> list[str]:
+        """Return what completes `map["` in IPython and Jupyter: keys, then the aliases that mean one of them."""
+        return [*self, *(alias for alias, keys in self._aliases.items() if len(keys) == 1)]
+
     def _refuse(self, *args: Any, **kwargs: Any) -> NoReturn:
         raise TypeError(f"this map of {self.kind} names is read-only; dict(map) makes a copy to change")
 

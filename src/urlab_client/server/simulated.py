@@ -120,7 +120,7 @@ class SimulatedServer:
             camera_size: Width and height of cameras whose MJCF gives none, pixels; default 640 by 480.
             render_quality: `fast`, without shadows, reflections and smooth edges; `high`, with them; or `auto`: `fast`
                 where the processor draws, `high` on a graphics card.
-            mjcf_options: Honour the `<option>` of the first model; the plugin ignores it.
+            mjcf_options: Honour the `<option>` of the first model; else the alpha ignores all, the beta merges them.
             actor_names: Name articulations after their MJCF's model name (`robot`, `robot_1`) or as the plugin does
                 (`robot_C_0`, `robot_C_1`).
             faults: What is to go wrong with replies and published messages, for tests; may change while the server

@@ -86,10 +86,34 @@ class URLabCameraView(Facade, twin=aio.URLabCameraView):
         """Return what it is."""
         return self._aio.describe()
 
+    def capture(self, *, timeout: Timeout = DEFAULT) -> CameraSample:
+        """Take a picture now, in any step mode, without a step; it is then also `latest_frame`.
+
+        It shows the simulation after this call, and time does not pass for it: in `direct` and `puppet` mode the
+        server is brought into live mode for a moment, paused, which takes a few requests; a picture of every step is
+        quicker with `step(include_cameras=…)`. A camera that is switched off is switched on for as long. A server of
+        the alpha does not number its pictures: there the second one counts that arrives after the call.
+
+        Args:
+            timeout: Seconds to wait; None waits without limit. By default the client's, or 30 where that is less and
+                no picture of this camera has come before: the server may still be looking for OpenGL.
+
+        Returns:
+            The picture; `.png()` and `.jpeg()` encode it.
+
+        Raises:
+            PictureTimeout: None came in time: the camera is off in the editor, or the server cannot draw.
+            NoActiveManager: No play session runs.
+            ModeLocked: The project pins a mode in which pictures come with steps only.
+            URLabError: The camera is not in the scene any more.
+        """
+        return self._portal.call(self._aio.capture, timeout=timeout)
+
     def frames(
         self,
         policy: str | StreamPolicy = "latest",
         *,
+        max_rate: float | None = None,
         buffer: int = BUFFER_ITEMS,
         buffer_bytes: int = BUFFER_BYTES,
         timeout: Timeout = DEFAULT,
@@ -98,6 +122,7 @@ class URLabCameraView(Facade, twin=aio.URLabCameraView):
 
         Args:
             policy: `latest`, or `all` within the buffer.
+            max_rate: With `latest`, pictures per second at most, each the newest by then; None for as many as come.
             buffer: Pictures that may wait, with `all`.
             buffer_bytes: Bytes that may wait, with `all`.
             timeout: Seconds that iterating waits for each picture; by default the client's for the first one, or 30
@@ -105,10 +130,11 @@ class URLabCameraView(Facade, twin=aio.URLabCameraView):
                 then without limit; None waits.
 
         Raises:
-            ValueError: Unknown policy, or an empty buffer.
+            ValueError: Unknown policy, an empty buffer, or a rate that is not above 0 or not for this policy.
         """
         return self._wrap(
-            Stream[CameraSample], self._aio.frames(policy, buffer=buffer, buffer_bytes=buffer_bytes, timeout=timeout)
+            Stream[CameraSample],
+            self._aio.frames(policy, max_rate=max_rate, buffer=buffer, buffer_bytes=buffer_bytes, timeout=timeout),
         )
 
     def shared_frame(self) -> SharedFrame | None:

@@ -14,10 +14,10 @@ from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.session_level import SESSION_LEVEL, SessionLevel
 from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS
 from urlab_client.protocol.base import Reply, Request
-from urlab_client.protocol.client_types import Diagnosis, Resync
+from urlab_client.protocol.client_types import CallRecord, Diagnosis, Resync
 from urlab_client.protocol.enums import CameraTiming, ObservationLevel, StepMode, Transport
 from urlab_client.protocol.messages.session import OpInfo, ResetOk, StepOk
-from urlab_client.protocol.messages.streams import ClientEvent, RowSample, StateSnapshot, StreamPolicy
+from urlab_client.protocol.messages.streams import CameraSample, ClientEvent, RowSample, StateSnapshot, StreamPolicy
 from urlab_client.protocol.topics import TopicKind
 from urlab_client.sync._facade import FacadeRoot
 from urlab_client.sync.client_state import ClientState
@@ -68,8 +68,12 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
             server and network those that nobody looks at; `frames()` is received all the same.
         claim_control: Take control of a robot with the first write to it, where robots have one owner. False is for
             those who look on, and for those who say `articulation.claim()`.
+        observe: Called with a `CallRecord` when a request is over, whatever became of it: op, bytes, time in the queue,
+            round trip, outcome. It runs on the client's event loop, so it must be quick and must not call the client;
+            what it raises is logged and changes nothing.
 
     Raises:
+        TypeError: `observe` is not a plain function.
         KeyFileError: A key file cannot be used.
         ValueError: The address or an option is malformed.
     """
@@ -98,6 +102,7 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
         trust_server: bool = False,
         live_pictures: bool = True,
         claim_control: bool = True,
+        observe: Callable[[CallRecord], object] | None = None,
     ) -> None:
         super().__init__(
             aio.URLabClient(
@@ -119,6 +124,7 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
                 trust_server=trust_server,
                 live_pictures=live_pictures,
                 claim_control=claim_control,
+                observe=observe,
             )
         )
 
@@ -304,10 +310,32 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
         """
         return self._portal.call(self._aio.wait_until, predicate, timeout=timeout)
 
+    def capture(self, cameras: Collection[str] | None = None, *, timeout: Timeout = DEFAULT) -> dict[str, CameraSample]:
+        """Take pictures of several cameras now, in any step mode, without a step; see `URLabCameraView.capture`.
+
+        In `direct` and `puppet` mode, and while paused, all of them show the same moment.
+
+        Args:
+            cameras: Names, as `camera()` takes them; None for all there are.
+            timeout: Seconds to wait for all of them together; None waits without limit.
+
+        Returns:
+            The pictures by the names given.
+
+        Raises:
+            KeyError: There is no such camera, or there are several; nothing was sent.
+            TypeError: `cameras` is a name by itself.
+            PictureTimeout: Some came not in time; `.cameras` names them.
+            NoActiveManager: No play session runs.
+            ModeLocked: The project pins a mode in which pictures come with steps only.
+        """
+        return self._portal.call(self._aio.capture, cameras, timeout=timeout)
+
     def state_stream(
         self,
         policy: str | StreamPolicy = "latest",
         *,
+        max_rate: float | None = None,
         buffer: int = BUFFER_ITEMS,
         buffer_bytes: int = BUFFER_BYTES,
         timeout: Timeout = DEFAULT,
@@ -321,17 +349,21 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
 
         Args:
             policy: `latest`, or `all` within the buffer.
+            max_rate: With `latest`, snapshots per second at most, each the newest by then. The rate does not drift: an
+                item that is taken late does not delay those after it. None for as many as come.
             buffer: Snapshots that may wait, with `all`.
             buffer_bytes: Bytes that may wait, with `all`.
             timeout: Seconds that iterating waits for each snapshot; by default the client's for the first one and then
                 without limit; None waits.
 
         Raises:
-            ValueError: Unknown policy, or an empty buffer.
+            ValueError: Unknown policy, an empty buffer, or a rate that is not above 0 or not for this policy.
         """
         return self._wrap(
             Stream[StateSnapshot],
-            self._aio.state_stream(policy, buffer=buffer, buffer_bytes=buffer_bytes, timeout=timeout),
+            self._aio.state_stream(
+                policy, max_rate=max_rate, buffer=buffer, buffer_bytes=buffer_bytes, timeout=timeout
+            ),
         )
 
     def row_stream(
@@ -381,16 +413,22 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
             ),
         )
 
-    def events(self, *, buffer: int = BUFFER_ITEMS) -> Stream[ClientEvent]:
+    def events(
+        self, *, kinds: Collection[str | type[ClientEvent]] = (), buffer: int = BUFFER_ITEMS
+    ) -> Stream[ClientEvent]:
         """Stream what happens to the connection, the session and play, from this call on.
 
         Args:
+            kinds: Which events, by class or by name: `connected`, `lost`, `reconnected`, `silent`, `answers`,
+                `session_opened`, `session_lost`, `play_started`, `play_ended`. Empty for all.
             buffer: Events that wait for a reader; the oldest give way, which shows in the next one's `dropped`.
 
         Raises:
             ClientClosed: The client was closed.
+            ValueError: There is no event of such a kind.
+            TypeError: `kinds` is a name by itself.
         """
-        return self._wrap(Stream[ClientEvent], self._aio.events(buffer=buffer))
+        return self._wrap(Stream[ClientEvent], self._aio.events(kinds=kinds, buffer=buffer))
 
     def call(self, request: Request[R], *, timeout: Timeout = DEFAULT) -> R:
         """Send any request of `urlab_client.protocol.messages` and return its reply, without taking anything over.

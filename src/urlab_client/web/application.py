@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import secrets
 import time
 from collections.abc import AsyncGenerator, Awaitable, Callable
@@ -32,6 +33,7 @@ from urlab_client.web.access import Access, Guarded
 from urlab_client.web.console_session import Audience, ConsoleSession
 from urlab_client.web.driving_lease import DrivingLease, NotDriving, Viewer
 from urlab_client.web.ops import encode, openapi, parse, served
+from urlab_client.web.recording_routes import RecordingRoutes
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabClient
@@ -47,7 +49,13 @@ _VIEWER = "x-urlab-viewer"
 _Handler: TypeAlias = Callable[[Request], Awaitable[Response]]
 
 
-def app(client: URLabClient, *, access: Access | None = None, lease_seconds: float = 20.0) -> Starlette:
+def app(
+    client: URLabClient,
+    *,
+    access: Access | None = None,
+    lease_seconds: float = 20.0,
+    recordings: str | os.PathLike[str] = "recordings",
+) -> Starlette:
     """Make the application. It opens the client's session while its lifespan runs, and closes nothing at its end.
 
     To mount it in another application, enter `site.router.lifespan_context(site)` in that one's lifespan.
@@ -57,9 +65,10 @@ def app(client: URLabClient, *, access: Access | None = None, lease_seconds: flo
             other part of a program may.
         access: Who may come in; default: whoever brings a token of `site.state.access.invite()`, on this machine.
         lease_seconds: How long a viewer keeps the controls without using them.
+        recordings: Folder of the recordings that viewers make, download and replay; made with the first one.
     """
     access = access or Access()
-    site = _Site(ConsoleSession(client, DrivingLease(lease_seconds)), access)
+    site = _Site(ConsoleSession(client, DrivingLease(lease_seconds), Path(recordings)), access)
 
     @contextlib.asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncGenerator[None]:
@@ -78,10 +87,6 @@ class _RunRequest(Struct):
 
 class _StepRequest(Struct):
     n_steps: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] = 1
-
-
-class _SeekRequest(Struct):
-    frame: int
 
 
 class _LoginRequest(Struct):
@@ -103,6 +108,7 @@ class _Site:
         self.console = console
         self._access = access
         self._viewers: dict[str, Viewer] = {}
+        self._recordings = RecordingRoutes(console, self._viewer)
 
     def routes(self) -> list[Route | WebSocketRoute | Mount]:
         def route(path: str, handler: _Handler, *methods: str) -> Route:
@@ -119,7 +125,7 @@ class _Site:
             route("/api/ctrl", self._ctrl, "POST"),
             route("/api/run", self._run, "POST"),
             route("/api/step", self._step, "POST"),
-            route("/api/replay", self._seek, "POST"),
+            *(route(path, handler, *methods) for path, handler, methods in self._recordings.routes()),
             route("/api/lease", self._lease, "POST", "DELETE"),
             route("/api/connection", self._connection, "POST"),
             route("/api/invitations", self._invite, "POST"),
@@ -190,11 +196,6 @@ class _Site:
         steps = msgspec.json.decode(await _body(request) or b"{}", type=_StepRequest)
         return _json(encode(await self.console.controls.step(self._viewer(request), steps.n_steps)))
 
-    async def _seek(self, request: Request) -> Response:
-        wanted = msgspec.json.decode(await _body(request), type=_SeekRequest).frame
-        frame, total = await self.console.controls.seek(self._viewer(request), wanted)
-        return _json(encode({"frame": frame, "total": total}))
-
     async def _lease(self, request: Request) -> Response:
         viewer = self._viewer(request)
         if request.method == "POST":
@@ -243,7 +244,7 @@ class _Site:
             await socket.send_json({"type": "you", "viewer": viewer.key, "name": viewer.name})
             async with anyio.create_task_group() as tasks:
                 tasks.start_soon(self._send, socket, one, flow)
-                with contextlib.suppress(WebSocketDisconnect):
+                with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # gone, maybe while it is answered
                     await self._listen(socket, one, flow)
                 tasks.cancel_scope.cancel()
         finally:
@@ -434,7 +435,7 @@ def _answering(handler: _Handler) -> _Handler:
     async def answer(request: Request) -> Response:
         try:
             return await handler(request)
-        except (NotDriving, URLabError, ValueError, TypeError, KeyError, RecursionError) as error:
+        except (NotDriving, URLabError, OSError, ValueError, TypeError, KeyError, RecursionError) as error:
             status, said = _explain(error)
             return _json(encode({"error": said}), status)
 
@@ -459,6 +460,8 @@ def _explain(error: Exception) -> tuple[int, dict[str, Any]]:
             status, code = 503, "unreachable"
         case URLabError():
             status, code = 502, "failed"
+        case OSError():
+            status, code = 500, "io_failed"
         case _:
             status, code = 400, "bad_request"
     return status, {"code": code, "message": str(text), "hint": hint}

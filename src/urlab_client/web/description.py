@@ -78,7 +78,7 @@ class WorldDescription(Struct):
     urlab_version: str = ""
     mujoco_version: str = ""
     playing: bool = False
-    no_view: str = ""
+    no_view: str = "The console has not reached the server yet."
     timestep: float | None = None
     articulations: list[ArticulationView] = field(default_factory=list[ArticulationView])
     cameras: list[CameraDescription] = field(default_factory=list[CameraDescription])

@@ -115,8 +115,12 @@ class MujocoViewer:
     def missing(self) -> str:
         """Why there is no view; empty when there is one."""
         if files() is None:
-            return "this MuJoCo comes without its web viewer, which is in mujoco-studio, for MuJoCo 4.0 and later"
-        return "" if self._client.model is not None else "there is no compiled model: no play session runs"
+            return "This MuJoCo has no web viewer. MuJoCo 4.0 and later have one."
+        if self._client.model is not None:
+            return ""
+        if not self._client.manager_present:
+            return "Waiting for a play session: begin play to see the robots."
+        return "There is no compiled model here, without which the 3-D view has nothing to draw."
 
     async def shown(self) -> Shown | None:
         """Return the client's model, made ready for browsers, or None without one."""

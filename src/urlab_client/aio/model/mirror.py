@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import math
 import threading
+from collections.abc import Mapping
 from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -107,11 +108,11 @@ def _from_binary(mjb: bytes) -> mujoco.MjModel:
     return mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": mjb})
 
 
-def _compiled(xml: str, assets: dict[str, bytes], *, trusted: bool) -> mujoco.MjModel:
+def _compiled(xml: str, assets: Mapping[str, bytes], *, trusted: bool) -> mujoco.MjModel:
     import mujoco  # noqa: PLC0415
 
     if trusted:
-        return mujoco.MjModel.from_xml_string(xml, assets)
+        return mujoco.MjModel.from_xml_string(xml, dict(assets))
     from urlab_client.aio.model.compilation import compile_confined  # noqa: PLC0415 - it is run as a program, too
 
     try:
@@ -187,9 +188,10 @@ class Mirror:
             if binary and hello.mjb is not None:
                 model = _from_binary(hello.mjb)
             elif hello.mjcf_compiled is not None:
-                assets = hello.vfs_assets or {}
                 model, left_out = without_newer_attributes(
-                    hello.mjcf_compiled, lambda xml: _compiled(xml, assets, trusted=trusted)
+                    hello.mjcf_compiled,
+                    hello.vfs_assets or {},
+                    lambda xml, assets: _compiled(xml, assets, trusted=trusted),
                 )
                 if left_out:
                     log.warning(

@@ -20,6 +20,7 @@ from urlab_client.protocol.base import (
     Vec3,
     doc,
 )
+from urlab_client.protocol.serializable import Serializable
 from urlab_client.protocol.types import Contact, KeyframeInfo, MocapPose, SimOptions
 
 __all__ = [
@@ -103,7 +104,7 @@ class SetControlSource(ControlRequest[SetControlSourceOk], tag="set_control_sour
     """Choose whose set-points drive the actuators: those of this protocol or those of the editor's panel."""
 
     source: Annotated[str, doc("`zmq` or `ui`.")]
-    articulation: Annotated[str | None, doc("Articulation key; None for all.")] = None
+    articulation: Annotated[str | None, doc("Articulation key, actor id or engine's object name; None for all.")] = None
 
 
 class SetTwistOk(Reply, tag="set_twist_ok", kw_only=True):
@@ -117,7 +118,7 @@ class SetTwistOk(Reply, tag="set_twist_ok", kw_only=True):
 class SetTwist(ControlRequest[SetTwistOk], tag="set_twist", kw_only=True, omit_defaults=True):
     """Store a commanded base velocity for policies to read; it does not drive the simulation."""
 
-    articulation: Annotated[str, doc("Articulation key.")]
+    articulation: Annotated[str, doc("Articulation key, actor id or engine's object name.")]
     linear: Annotated[Vec3, doc("(vx, vy, ignored), m/s, base frame.")] = (0.0, 0.0, 0.0)
     angular: Annotated[Vec3, doc("(ignored, ignored, yaw rate), rad/s, base frame.")] = (0.0, 0.0, 0.0)
 
@@ -155,7 +156,7 @@ class SetMocapPoseOk(MocapReply, tag="set_mocap_pose_ok", kw_only=True):
 class SetMocapPose(ControlRequest[SetMocapPoseOk], tag="set_mocap_pose", kw_only=True, omit_defaults=True):
     """Place a mocap body; body poses follow at the next step or `forward()`."""
 
-    body: Annotated[str, doc("Compiled body name, prefix included.")]
+    body: Annotated[str, doc("Compiled name, or with the articulation's key, actor id or nothing in front.")]
     pos: Annotated[Vec3 | None, doc("Position, metres, world frame; None keeps it.")] = None
     quat: Annotated[QuatWXYZ | None, doc("Unit quaternion (w, x, y, z), world frame; None keeps it.")] = None
 
@@ -167,7 +168,7 @@ class ReadMocapPoseOk(MocapReply, tag="read_mocap_pose_ok", kw_only=True):
 class ReadMocapPose(Request[ReadMocapPoseOk], tag="read_mocap_pose", kw_only=True):
     """Read the pose of a mocap body."""
 
-    body: Annotated[str, doc("Compiled body name, prefix included.")]
+    body: Annotated[str, doc("Compiled name, or with the articulation's key, actor id or nothing in front.")]
 
 
 class GetContactsOk(Reply, tag="get_contacts_ok", kw_only=True):
@@ -178,7 +179,7 @@ class GetContactsOk(Reply, tag="get_contacts_ok", kw_only=True):
     contacts: Annotated[list[Contact], doc("In the order of `mjData.contact`.")]
 
 
-class ContactFilter(Struct, kw_only=True, omit_defaults=True):
+class ContactFilter(Serializable, Struct, kw_only=True, omit_defaults=True):
     """Exact compiled names, combined with AND and compared by position in the contact."""
 
     body1: Annotated[str | None, doc("Body of the first geom.")] = None
@@ -269,9 +270,6 @@ OPS: Final = (
         ns="runtime",
         needs=Needs.MANAGER,
         errors=("not_ready", "missing_field"),
-        generated=True,
-        returns="paused",
-        positional=1,
     ),
     Op(
         request=ConfigureController,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import mujoco
@@ -11,42 +11,62 @@ from urlab_client._mujoco import merge_assets
 from urlab_client.protocol.rotation import wxyz
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.assets.blueprint import Blueprint
-from urlab_client.server.compile.mjcf_options import copy_options, ignored_options
+from urlab_client.server.compile.mjcf_options import OptionPolicy, adopt_options, copy_options, ignored_options
 from urlab_client.server.compile.static_meshes import add_light, add_static_mesh
 
-__all__ = ["compose"]
+__all__ = ["aims_at_world", "attachable", "compose", "empty_scene", "populate"]
 
 
 def compose(
     actors: Sequence[Actor],
     articulations: Sequence[tuple[Actor, Blueprint]],
     warnings: list[str],
-    *,
-    honour_mjcf_options: bool,
+    options: OptionPolicy,
 ) -> tuple[mujoco.MjSpec, list[tuple[str, str | None]]]:
-    """Return the spec of the whole scene, and the body and free joint of each converted mesh."""
+    """Return the spec of the whole scene, and the body and free joint of each converted mesh.
+
+    Raises:
+        CompileFailed: The options of its models cannot be merged.
+    """
+    spec = empty_scene()
+    spec.copy_during_attach = True
+    adopt_options(spec, articulations, options)
+    warnings.extend(ignored_options(spec, articulations, options))
+    children = {blueprint.folder: attachable(blueprint, spec) for _, blueprint in articulations}
+
+    def attach(actor: Actor, blueprint: Blueprint) -> None:
+        frame = spec.worldbody.add_frame(pos=actor.location, quat=wxyz(actor.rotation))
+        spec.attach(children[blueprint.folder], frame=frame, prefix=actor.prefix)
+
+    bodies = populate(spec, actors, attach)
+    _restore_world_references(spec, {f"{actor.prefix}world" for actor, _ in articulations})
+    merge_assets(spec, children)
+    return spec, bodies
+
+
+def empty_scene() -> mujoco.MjSpec:
+    """Return the spec of a scene without anything in it."""
     spec = mujoco.MjSpec()
     spec.modelname = "urlab"
     spec.compiler.degree = False
-    spec.copy_during_attach = True
-    if honour_mjcf_options and articulations:
-        copy_options(articulations[0][1].spec.option, spec.option)
-    warnings.extend(ignored_options(spec, articulations, honoured=honour_mjcf_options))
-    children = {blueprint.folder: _attachable(blueprint, spec) for _, blueprint in articulations}
+    return spec
+
+
+def populate(
+    spec: mujoco.MjSpec, actors: Sequence[Actor], place: Callable[[Actor, Blueprint], None]
+) -> list[tuple[str, str | None]]:
+    """Add actors to a scene, articulations by `place`; return the body and free joint of each converted mesh."""
     bodies: list[tuple[str, str | None]] = []
     for actor in actors:
         if actor.blueprint is not None:
-            frame = spec.worldbody.add_frame(pos=actor.location, quat=wxyz(actor.rotation))
-            spec.attach(children[actor.blueprint.folder], frame=frame, prefix=actor.prefix)
+            place(actor, actor.blueprint)
         elif actor.light is not None:
             add_light(spec, actor)
         elif actor.mesh is not None:
             converted = add_static_mesh(spec, actor, actor.mesh)
             if converted is not None:
                 bodies.append(converted)
-    _restore_world_references(spec, {f"{actor.prefix}world" for actor, _ in articulations})
-    merge_assets(spec, children)
-    return spec, bodies
+    return bodies
 
 
 def _restore_world_references(spec: mujoco.MjSpec, prefixed: set[str]) -> None:
@@ -56,7 +76,12 @@ def _restore_world_references(spec: mujoco.MjSpec, prefixed: set[str]) -> None:
             element.targetbody = "world"
 
 
-def _attachable(blueprint: Blueprint, parent: mujoco.MjSpec) -> mujoco.MjSpec:
+def aims_at_world(spec: mujoco.MjSpec) -> bool:
+    """Return whether lights or cameras aim at the world's origin, whose name attaching would change."""
+    return any(element.targetbody == "world" for element in (*spec.lights, *spec.cameras))
+
+
+def attachable(blueprint: Blueprint, parent: mujoco.MjSpec) -> mujoco.MjSpec:
     """Return a copy of the blueprint's spec that agrees with `parent` in whatever attaching would drop.
 
     Where they disagree MuJoCo keeps the parent's value as we want, but prints a warning for each attachment.

@@ -1,18 +1,33 @@
-"""The options of the models in a scene: which apply, and which have no effect."""
+"""The options of the models in a scene: which apply, and which have no effect.
+
+How options are merged is how MuJoCo's attachment merges them where it is told to, which releases before 3.11 cannot.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import cache
-from typing import Any
+from typing import Any, Final, Literal, TypeAlias
 
 import mujoco
 import numpy as np
 
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.assets.blueprint import Blueprint
+from urlab_client.server.compile.failure import CompileFailed
 
-__all__ = ["copy_options", "ignored_options"]
+__all__ = ["OptionPolicy", "adopt_options", "copy_options", "ignored_options"]
+
+OptionPolicy: TypeAlias = Literal["ignored", "first", "merged"]
+"""Which `<option>` reaches the scene: that of no model, of the first articulation, or what all of them come to."""
+
+_SMALLEST: Final = frozenset({"timestep", "tolerance", "ls_tolerance"}) | {
+    f"{kind}_tolerance" for kind in ("noslip", "ccd", "sleep")
+}
+_LARGEST: Final = frozenset({"iterations", "sdf_initpoints"}) | {
+    f"{kind}_iterations" for kind in ("ls", "noslip", "ccd", "sdf")
+}
+_UNITED: Final = frozenset({"disableflags", "enableflags", "disableactuator"})
 
 
 @cache
@@ -23,41 +38,88 @@ def _option_names() -> tuple[str, ...]:
 def copy_options(source: Any, target: Any) -> None:
     """Make the options of a spec those of another."""
     for name in _option_names():
-        value = getattr(source, name)
-        if isinstance(value, np.ndarray):
-            getattr(target, name)[:] = value
-        else:
-            setattr(target, name, value)
+        _write(target, name, getattr(source, name))
+
+
+def _write(option: Any, name: str, value: Any) -> None:
+    if isinstance(value, np.ndarray):
+        getattr(option, name)[:] = value
+    else:
+        setattr(option, name, value)
+
+
+def adopt_options(spec: mujoco.MjSpec, articulations: Iterable[tuple[Actor, Blueprint]], policy: OptionPolicy) -> None:
+    """Give a scene's spec the options that its articulations bring along.
+
+    Raises:
+        CompileFailed: Two of them want different values of what cannot be merged, as gravity or the integrator.
+    """
+    blueprints = list({blueprint.folder: blueprint for _, blueprint in articulations}.values())
+    if policy == "first" and blueprints:
+        copy_options(blueprints[0].spec.option, spec.option)
+    if policy != "merged":
+        return
+    wanted: dict[str, tuple[str, Any]] = {}
+    for blueprint in blueprints:
+        for name in _authored(blueprint):
+            value = getattr(blueprint.spec.option, name)
+            first, before = wanted.get(name, (blueprint.stem, value))
+            wanted[name] = first, _merged(name, (first, before), (blueprint.stem, value))
+    for name, (_, value) in wanted.items():
+        _write(spec.option, name, value)
+
+
+def _authored(blueprint: Blueprint) -> list[str]:
+    own, default = blueprint.spec.option, mujoco.MjSpec().option
+    return [name for name in _option_names() if not np.array_equal(getattr(own, name), getattr(default, name))]
+
+
+def _merged(name: str, one: tuple[str, Any], other: tuple[str, Any]) -> Any:
+    (first, before), (second, value) = one, other
+    if name in _SMALLEST:
+        return min(before, value)
+    if name in _LARGEST:
+        return max(before, value)
+    if name in _UNITED:
+        return before | value
+    if not np.array_equal(before, value):
+        raise CompileFailed(
+            f"options of the models conflict: {first} has {_option_text(name, before)}, "
+            f"{second} has {_option_text(name, value)}. Give both the same, or start the server with "
+            "--mjcf-options, which takes those of the first model"
+        )
+    return before
 
 
 def ignored_options(
-    spec: mujoco.MjSpec, articulations: Iterable[tuple[Actor, Blueprint]], *, honoured: bool
+    spec: mujoco.MjSpec, articulations: Iterable[tuple[Actor, Blueprint]], policy: OptionPolicy
 ) -> list[str]:
     """Return one warning that names the options of the models that will have no effect, or none."""
-    default = mujoco.MjSpec().option
     applied = mujoco.MjSpec()
     copy_options(spec.option, applied.option)
-    if not honoured:
+    if policy == "ignored":
         applied.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     ignored: list[str] = []
     for blueprint in {blueprint.folder: blueprint for _, blueprint in articulations}.values():
         own = blueprint.spec.option
         names = [
             name
-            for name in _option_names()
-            if not np.array_equal(getattr(own, name), getattr(default, name))
-            and not np.array_equal(getattr(own, name), getattr(applied.option, name))
+            for name in _authored(blueprint)
+            if not np.array_equal(getattr(own, name), getattr(applied.option, name))
+            and not (policy == "merged" and name in _UNITED)
         ]
         if names:
             ignored.append(f"{blueprint.stem}: {', '.join(_option_text(name, getattr(own, name)) for name in names)}")
     if not ignored:
         return []
-    reason = (
-        "the first articulation's options apply"
-        if honoured
-        else "the plugin's defaults apply; --mjcf-options (sim://MODEL?mjcf-options) takes the first model's"
-    )
-    return [f"options of the models have no effect ({'; '.join(ignored)}): {reason}"]
+    return [f"options of the models have no effect ({'; '.join(ignored)}): {_REASONS[policy]}"]
+
+
+_REASONS: Final[dict[OptionPolicy, str]] = {
+    "ignored": "the plugin's defaults apply; --mjcf-options (sim://MODEL?mjcf-options) takes the first model's",
+    "first": "the first articulation's options apply",
+    "merged": "of several models' options the smallest timestep and tolerances and the most iterations apply",
+}
 
 
 def _option_text(name: str, value: Any) -> str:
@@ -72,7 +134,7 @@ def _option_text(name: str, value: Any) -> str:
         return f"{name} {_constant(enumerations[name](value))}"
     if name in flags:
         names = [_constant(bit).lower() for bit in flags[name].__members__.values() if int(bit) & int(value)]
-        return f"{name.removesuffix('flags')}d {' '.join(names)}"
+        return f"{name.removesuffix('flags')}d {' '.join(filter(None, names))}"  # the number of flags has no name
     if isinstance(value, np.ndarray):
         return f"{name} ({' '.join(f'{number:g}' for number in value.tolist())})"
     return f"{name} {value:g}"

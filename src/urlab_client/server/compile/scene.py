@@ -25,6 +25,8 @@ from urlab_client.server.assets.option_ranges import options_problem
 from urlab_client.server.compile.composition import compose
 from urlab_client.server.compile.duplicates import coinciding_planes, draw_once, floor_warning
 from urlab_client.server.compile.failure import CompileFailed
+from urlab_client.server.compile.mjcf_options import OptionPolicy
+from urlab_client.server.compile.scene_document import attached_scene
 from urlab_client.server.compile.scene_index import ArticulationIndex, EntityIndex, index_articulation, index_entity
 from urlab_client.server.compile.static_meshes import unique_name
 from urlab_client.server.limits import Limits
@@ -45,6 +47,7 @@ class CompiledScene:
         data: Its data, reset and with derived quantities computed.
         spec: The compiled `mujoco.MjSpec`; options of `model.opt` that changed since are not in it.
         articulations: In spawn order.
+        actors: What it was compiled from, in spawn order.
         entities: In spawn order.
         warnings: What the user should know about the scene.
     """
@@ -53,6 +56,7 @@ class CompiledScene:
     data: mujoco.MjData
     spec: mujoco.MjSpec
     articulations: tuple[ArticulationIndex, ...]
+    actors: tuple[Actor, ...] = ()
     entities: tuple[EntityIndex, ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -60,16 +64,22 @@ class CompiledScene:
         """Return the live model in MuJoCo's binary format. The caller holds whatever guards the model."""
         return saved_model(self.model)
 
-    def mjcf(self) -> str:
-        """Return the scene as MJCF. Its `file` attributes are bare names, the keys of `assets`."""
-        return self._export[0]
+    def export(self, *, attached: bool = False) -> tuple[str, dict[str, bytes]]:
+        """Return the scene as MJCF, and the content of every file it names; `file` attributes are bare names.
 
-    def assets(self) -> dict[str, bytes]:
-        """Return the content of every file the MJCF names."""
-        return dict(self._export[1])
+        Args:
+            attached: Whether each robot has a document of its own among the files, which the scene attaches.
+        """
+        xml, files = self._attached if attached else self._flat
+        return xml, dict(files)
 
     @cached_property
-    def _export(self) -> tuple[str, dict[str, bytes]]:
+    def _attached(self) -> tuple[str, dict[str, bytes]]:
+        with mujoco_messages():
+            return attached_scene(self.spec, self.actors) or self._flat
+
+    @cached_property
+    def _flat(self) -> tuple[str, dict[str, bytes]]:
         with mujoco_messages():
             xml, files = export_model(self.spec)
         names: dict[str, str] = {}
@@ -93,22 +103,22 @@ def saved_model(model: mujoco.MjModel) -> bytes:
 def compile_scene(
     actors: Sequence[Actor],
     *,
-    honour_mjcf_options: bool = False,
+    options: OptionPolicy = "ignored",
     camera_size: tuple[int, int] | None = None,
     texts: Mapping[str, str] = MappingProxyType({}),
     limits: Limits = _DEFAULT_LIMITS,
 ) -> CompiledScene:
     """Compile the actors of a level into one model.
 
-    Each articulation's MJCF is attached at the actor's pose with its name as prefix. Its `<option>`, `<visual>` and
-    `<statistic>` have no effect, and of its `<size>` only the memory: the scene has MuJoCo's default options and the
-    implicitfast integrator, as in the plugin. Keyframes hold the owner's part; everything else is at its reference, and
-    a free joint's coordinates are not moved by the actor's pose. Cameras, lights and materials stay, but of floors that
-    coincide and of suns that shine alike one is drawn.
+    Each articulation's MJCF is attached at the actor's pose with its name as prefix. Its `<visual>` and `<statistic>`
+    have no effect, and of its `<size>` only the memory. Unless asked for, its `<option>` has none, either: the scene
+    has MuJoCo's default options and the implicitfast integrator, as in the plugin of June 2026. Keyframes hold the
+    owner's part; everything else is at its reference, and a free joint's coordinates are not moved by the actor's pose.
+    Cameras, lights and materials stay, but of floors that coincide and of suns that shine alike one is drawn.
 
     Args:
         actors: In spawn order.
-        honour_mjcf_options: Take the `<option>` of the first articulation instead, integrator included.
+        options: Which `<option>` the scene has, integrator included.
         camera_size: Width and height of cameras whose MJCF gives no resolution.
         texts: Custom texts of the model, by name.
         limits: Memory and sensors of the scene, and the ranges of its options; checked before it is simulated.
@@ -123,7 +133,7 @@ def compile_scene(
     articulations = [(actor, actor.blueprint) for actor in actors if actor.blueprint is not None]
     warnings: list[str] = []
     try:
-        spec, entities = compose(actors, articulations, warnings, honour_mjcf_options=honour_mjcf_options)
+        spec, entities = compose(actors, articulations, warnings, options)
         for name, content in texts.items():
             text = spec.add_text()
             text.name, text.data = name, content
@@ -134,7 +144,7 @@ def compile_scene(
             spec.memory = memory
             model = spec.compile()
         _refuse(_size_problem(model, limits))
-        if not honour_mjcf_options:
+        if options == "ignored":
             model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         with mujoco_messages() as messages:
             data = mujoco.MjData(model)
@@ -143,7 +153,7 @@ def compile_scene(
             mujoco.mj_forward(model, data)
     except (ValueError, mujoco.FatalError) as error:
         message = one_line(error)
-        if not honour_mjcf_options and "integrator" in message:
+        if options == "ignored" and "integrator" in message:
             message += " (scenes use implicitfast; start the server with --mjcf-options to take the model's own)"
         raise CompileFailed(message) from None
     warnings.extend(one_line(message) for message in messages)
@@ -155,7 +165,13 @@ def compile_scene(
     indices = tuple(index_articulation(model, actor, blueprint, camera_size) for actor, blueprint in articulations)
     _fit_offscreen_buffer(model, (camera.resolution for index in indices for camera in index.cameras))
     return CompiledScene(
-        model, data, spec, indices, tuple(index_entity(model, *names) for names in entities), tuple(warnings)
+        model,
+        data,
+        spec,
+        indices,
+        tuple(actors),
+        tuple(index_entity(model, *names) for names in entities),
+        tuple(warnings),
     )
 
 

@@ -1,7 +1,8 @@
 // The bar at the top: connection, age, time, play and stop, modes, who drives.
 
-import { $, choices, duration, h, text, toast } from "./dom.js";
+import { $, choices, confirmed, duration, h, text, toast } from "./dom.js";
 import { ask, clock, on, op } from "./link.js";
+import { toggleReplay } from "./replay.js";
 
 export const now = { status: null, state: null, socket: false };
 const ui = {};
@@ -12,6 +13,7 @@ const LINKS = {
   lost: "Server lost",
   silent: "No reply",
   taken_over: "Taken over",
+  gone: "No console",
 };
 
 export const run = (running) => ask("POST", "api/run", { running });
@@ -21,7 +23,14 @@ export const drive = () =>
   now.status?.mine ? ask("DELETE", "api/lease") : ask("POST", "api/lease");
 
 export function toggleRun() {
-  if (now.status) run(!now.status.running);
+  if (now.status?.replay) toggleReplay();
+  else if (now.status) run(!now.status.running);
+}
+
+/** Stop whatever moves: physics, and a replay. */
+export function stop() {
+  run(false);
+  if (now.status?.replay?.playing) toggleReplay();
 }
 
 async function restartPlay() {
@@ -49,7 +58,7 @@ export function makeBar() {
   ui.time = h("b", { id: "time" }, "–");
   ui.rate = h("b", {}, "–");
   ui.play = h("button", { class: "primary", id: "play", title: "Let physics run or stop it (space)", onclick: toggleRun }, "▶ Play");
-  ui.stop = h("button", { class: "danger", id: "stop", title: "Stop physics; everybody may (escape)", onclick: () => run(false) }, "■ Stop");
+  ui.stop = h("button", { class: "danger", id: "stop", title: "Stop physics; everybody may (escape)", onclick: stop }, "■ Stop");
   ui.steps = h("input", { id: "steps", type: "number", min: 1, max: 10000, value: 10, title: "Steps at a time", "aria-label": "Steps at a time" });
   ui.step = h("button", { id: "step", title: "Step, in mode direct (.)", onclick: () => step(+ui.steps.value || 1) }, "Step");
   ui.keyframe = h("select", { id: "keyframe", "aria-label": "Keyframe" }, h("option", { value: "" }, "start"));
@@ -64,7 +73,8 @@ export function makeBar() {
   ui.speedText = h("span", { class: "num" }, "100 %");
   ui.driver = h("span", { id: "driver", class: "pill" });
   ui.drive = h("button", { id: "drive", title: "Take the controls, or give them back (d)", onclick: drive }, "Take the controls");
-  ui.restart = h("button", { title: "Begin play, or begin again", onclick: restartPlay }, "Restart play");
+  ui.restart = confirmed({ id: "restart", title: "Begin play, or begin again" }, () => now.status?.playing ? "Restart play" : "Begin play",
+    () => now.status?.playing && "Lose this simulation?", restartPlay);
 
   $("bar").append(
     h("div", { class: "row" },
@@ -75,10 +85,11 @@ export function makeBar() {
         h("span", { title: "Simulation time" }, "time ", ui.time),
         h("span", { title: "Simulation time per real time" }, "pace ", ui.rate)),
       h("span", { class: "space" }),
-      ui.driver, ui.drive,
-      h("button", { class: "quiet", title: "A link for one more browser", onclick: invite }, "Invite"),
+      ui.driver,
+      h("span", { class: "acts" }, ui.drive,
+        h("button", { class: "quiet", title: "A link for one more browser", onclick: invite }, "Invite")),
       h("button", { class: "quiet", title: "Keys (?)", "aria-label": "Keys", onclick: () => $("help").showModal() }, "?")),
-    h("div", { class: "row controls" },
+    h("div", { class: "row controls acts" },
       ui.play, ui.stop,
       h("span", { class: "group" }, ui.step, ui.steps),
       h("span", { class: "group" }, ui.reset, ui.keyframe),
@@ -87,8 +98,8 @@ export function makeBar() {
       h("label", { class: "speed" }, "speed ", ui.speed, ui.speedText),
       ui.restart));
 
-  on("open", () => { now.socket = true; });
-  on("closed", () => { now.socket = false; banner(); });
+  on("open", () => { now.socket = true; now.since = null; });
+  on("closed", () => { now.socket = false; now.since = now.since ?? Date.now(); show(now.status); banner(); });
   on("status", (status) => { now.status = status; show(status); banner(); });
   on("state", (state) => { now.state = state; });
   on("world", async ({ world }) => {
@@ -99,22 +110,27 @@ export function makeBar() {
   setInterval(() => {
     if (now.state) {
       const age = Date.now() + clock.offset - now.state.made;
-      text(ui.age, duration(age));
-      ui.age.classList.toggle("old", age > 1000);
+      const replayed = now.status?.replay != null;
+      text(ui.age, replayed ? "replay" : duration(age));
+      ui.age.classList.toggle("old", !replayed && age > 1000);
       text(ui.time, `${now.state.time.toFixed(2)} s`);
     }
     if (!now.socket || now.status?.link.state !== "connected") banner();
   }, 200);
 }
 
+/** Show how things stand; without a console that is nothing that could be relied on, or touched. */
 function show(status) {
-  document.body.dataset.link = status.link.state;
+  const link = now.socket ? status?.link.state : "gone";
+  document.body.dataset.link = link ?? "connecting";
+  text(ui.link, LINKS[link] ?? LINKS.connecting);
+  for (const part of [document.querySelector("main"), ...document.querySelectorAll("#bar .acts")]) part.inert = !now.socket;
+  if (!status || !now.socket) return;
   document.body.classList.toggle("watching", !status.mine && status.driver !== null);
-  text(ui.link, LINKS[status.link.state]);
   text(ui.address, status.address);
   text(ui.rate, status.moving ? `${status.rate.toFixed(2)}×` : "stopped");
-  text(ui.play, status.running ? "❚❚ Pause" : "▶ Play");
-  ui.play.disabled = !status.playing;
+  text(ui.play, (status.replay ? status.replay.playing : status.running) ? "❚❚ Pause" : "▶ Play");
+  ui.play.disabled = !status.playing && !status.replay;
   ui.step.disabled = ui.steps.disabled = status.mode !== "direct";
   if (document.activeElement !== ui.mode) ui.mode.value = status.mode;
   if (document.activeElement !== ui.source) ui.source.value = status.source ?? "";
@@ -129,25 +145,28 @@ function show(status) {
   ui.driver.dataset.who = status.mine ? "me" : status.driver === null ? "free" : "other";
   text(ui.drive, status.mine ? "Release" : "Take the controls");
   ui.drive.disabled = !status.mine && status.driver !== null;
-  text(ui.restart, status.playing ? "Restart play" : "Begin play");
+  if (!ui.restart.classList.contains("danger")) text(ui.restart, status.playing ? "Restart play" : "Begin play");
 }
+
+/** A duration that does not flicker. */
+const whole = (ms) => duration(Math.max(1, Math.round(ms / 1000)) * 1000).replace(".0 s", " s");
 
 function banner() {
   const link = now.status?.link;
   const box = $("banner");
   let said = null;
   let button = null;
+  let title = "";
   if (!now.socket) {
-    said = "The console itself does not answer. Trying again.";
+    said = `The console does not answer for ${whole(Date.now() - (now.since ?? Date.now()))}. Retrying. If it was started again, open its new link.`;
   } else if (link && link.state !== "connected") {
-    const since = duration(Date.now() + clock.offset - link.since * 1000);
-    const shown = now.state ? " What you see is the last that came." : "";
+    const since = whole(Date.now() + clock.offset - link.since * 1000);
     if (link.state === "taken_over") {
-      said = `Another program has taken the server over, ${since} ago. You still see what it does.`;
+      said = `Another program took the session over ${since} ago.`;
       button = h("button", { onclick: () => ask("POST", "api/connection", {}) }, "Take it back");
-    } else {
-      said = `No connection to the server for ${since}: ${link.reason || "trying"}. Trying again.${shown}`;
-    }
+    } else if (link.state === "silent") said = `The server has not answered for ${since}. Waiting.`;
+    else said = now.state ? `Server not reachable for ${since}. Retrying.` : `Connecting to the server for ${since}.`;
+    title = link.reason;
   } else if (now.status && !now.status.playing) {
     said = "No play session runs.";
     button = h("button", { onclick: restartPlay }, "Begin play");
@@ -156,6 +175,6 @@ function banner() {
   box.hidden = said === null;
   if (said !== null && box.dataset.said !== said) {
     box.dataset.said = said;
-    box.replaceChildren(h("span", {}, said), ...(button ? [button] : []));
+    box.replaceChildren(h("span", { title }, said), ...(button ? [button] : []));
   } else if (said === null) delete box.dataset.said;
 }

@@ -42,6 +42,38 @@ export function duration(ms) {
   return `${Math.floor(ms / 60000)} min ${Math.round((ms % 60000) / 1000)} s`;
 }
 
+/**
+ * Make a button that does something which cannot be taken back: it asks first, in its own place, and the second press
+ * within a few seconds does it.
+ */
+export function confirmed(attributes, label, question, act) {
+  const ASKED_MS = 4000;
+  let timer = null;
+  const settle = () => {
+    clearTimeout(timer);
+    timer = null;
+    text(button, typeof label === "function" ? label() : label);
+    button.classList.remove("danger");
+  };
+  const button = h("button", {
+    ...attributes,
+    onclick: () => {
+      const asks = typeof question === "function" ? question() : question;
+      if (timer !== null || !asks) {
+        settle();
+        act();
+        return;
+      }
+      text(button, asks);
+      button.classList.add("danger");
+      timer = setTimeout(settle, ASKED_MS);
+    },
+    onblur: () => timer !== null && settle(),
+  });
+  settle();
+  return button;
+}
+
 export function toast(message, kind = "error") {
   const box = h("div", { class: `toast ${kind}` }, message);
   $("toasts").append(box);

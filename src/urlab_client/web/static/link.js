@@ -7,8 +7,11 @@ const listeners = new Map();
 
 export const me = { viewer: "", name: "" };
 export const clock = { offset: 0, best: Infinity };
+const PING_MS = 2000;
+const SILENT_MS = 6000;
 let socket = null;
 let pause = 250;
+let asked = null; // when the first ping was sent that nothing has come after
 
 /** Call `listener` with each message of that type; `open` and `closed` are the connection's own. */
 export function on(type, listener) {
@@ -27,6 +30,7 @@ export function socketAt(path) {
 }
 
 export function connect() {
+  asked = null;
   socket = socketAt("api/live");
   socket.onopen = () => {
     pause = 250;
@@ -35,6 +39,7 @@ export function connect() {
     tell("open");
   };
   socket.onmessage = (event) => {
+    asked = null;
     const message = JSON.parse(event.data);
     if (message.type === "state") {
       // The console sends the next state once this one was drawn: a slow browser sees fewer, not older ones.
@@ -51,21 +56,32 @@ export function connect() {
     }
     tell(message.type, message);
   };
-  socket.onclose = () => {
-    tell("closed");
-    setTimeout(connect, pause);
-    pause = Math.min(pause * 1.7, 4000);
-  };
+  socket.onclose = lost;
+}
+
+function lost() {
+  socket.onclose = socket.onmessage = null;
+  tell("closed");
+  setTimeout(connect, pause);
+  pause = Math.min(pause * 1.7, 4000);
 }
 
 export function send(message) {
   if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message));
 }
 
+/** Ask whether the console is still there: a process that stands still closes no socket. */
 function ping() {
+  if (socket?.readyState !== WebSocket.OPEN) return;
+  if (asked !== null && performance.now() - asked > SILENT_MS) {
+    socket.close();
+    lost();
+    return;
+  }
+  asked ??= performance.now();
   send({ type: "ping", at: Date.now() });
 }
-setInterval(ping, 5000);
+setInterval(ping, PING_MS);
 
 /** Ask over HTTP; a failure becomes a toast and null. */
 export async function ask(method, path, body, { quiet = false } = {}) {

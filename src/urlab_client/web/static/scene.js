@@ -1,6 +1,6 @@
 // The level: what stands in it, spawning, moving, removing; and what touches what.
 
-import { $, choices, h, number, text, toast } from "./dom.js";
+import { $, choices, confirmed, h, number, text, toast } from "./dom.js";
 import { on, op } from "./link.js";
 import { fold } from "./robots.js";
 
@@ -8,6 +8,12 @@ const actors = h("div", { class: "actors" });
 const blueprint = h("select", { "aria-label": "Blueprint", id: "blueprint" });
 const id = h("input", { placeholder: "id", "aria-label": "Actor id", id: "actor-id", size: 8 });
 const place = xyz([0, 0, 0]);
+const warning = h("div", { class: "line warning", id: "no-manager", hidden: true },
+  h("span", {}, "This level has no manager, without which play cannot begin."),
+  h("button", { id: "add-manager", onclick: async () => done(await op("ensure_manager")) }, "Add manager"));
+/** Actors that the plugin itself needs; nobody places or removes them. */
+const isManager = (actor) => /^A?Mj(Replay)?Manager$/.test(actor.class);
+const managesPlay = (actor) => /^A?MjManager$/.test(actor.class);
 
 function xyz(values) {
   return values.map((value, i) => h("input", { type: "number", step: 0.1, value: +value.toFixed(3), "aria-label": "xyz"[i] }));
@@ -29,7 +35,8 @@ async function refresh() {
   $("scene").classList.toggle("empty", !list);
   if (!list) return;
   const seen = new Set();
-  list.actors.forEach((actor, i) => {
+  warning.hidden = list.actors.some(managesPlay);
+  list.actors.filter((actor) => !isManager(actor)).forEach((actor, i) => {
     const key = JSON.stringify([actor.name, actor.actor_id]);
     seen.add(key);
     if (!rows.has(key)) rows.set(key, new Row(actor));
@@ -65,7 +72,7 @@ function actorRow(actor, where) {
       h("span", { class: "tag" }, actor.is_light ? "light" : actor.is_articulation ? "robot" : "mesh")),
     h("span", { class: "group" }, ...where,
       h("button", { class: "quiet", title: "Move there", onclick: async () => done(await op("set_actor_transform", { ...target, location: read(where) })) }, "move"),
-      h("button", { class: "quiet", title: "Remove from the level", onclick: async () => done(await op("destroy_actor", target)) }, "remove")));
+      confirmed({ class: "quiet", title: "Remove from the level" }, "remove", "Remove?", async () => done(await op("destroy_actor", target)))));
 }
 
 async function spawn() {
@@ -78,12 +85,12 @@ async function spawn() {
 }
 
 export function makeScene() {
-  $("scene").append(h("h2", {}, "Scene"), actors,
+  $("scene").append(h("h2", {}, "Scene"), warning, actors,
     h("div", { class: "line spawn" }, blueprint, id, h("span", { class: "group" }, ...place),
       h("button", { id: "spawn", onclick: spawn }, "Spawn")));
   on("world", refresh);
   on("log", ({ entries }) => {
-    if (entries.some((entry) => /^(spawn|destroy|set_actor|duplicate|load_level|create_level|import)/.test(entry.what))) refresh();
+    if (entries.some((entry) => /^(spawn|destroy|set_actor|duplicate|ensure_manager|load_level|create_level|import)/.test(entry.what))) refresh();
   });
 }
 

@@ -1,4 +1,5 @@
-// The 3-D view: MuJoCo's web viewer in a frame. It is loaded when it is opened, and let go when it is closed.
+// The 3-D view: MuJoCo's web viewer in a frame. It is loaded once there is a model and somebody looks, and let go when
+// it is closed. What covers it says what it waits for.
 
 import { $, h, text } from "./dom.js";
 import { on } from "./link.js";
@@ -7,33 +8,55 @@ const OPEN = "urlab-view";
 
 /** Why this browser cannot show it, or nothing. */
 function lacking() {
-  if (!window.crossOriginIsolated) return "browsers allow it on this machine and over https only";
-  if (!document.createElement("canvas").getContext("webgl2")) return "this browser has no WebGL 2";
+  if (!window.crossOriginIsolated) return "Browsers show the 3-D view on this machine and over https only.";
+  if (!document.createElement("canvas").getContext("webgl2")) return "This browser has no WebGL 2, which the 3-D view needs.";
   return "";
 }
 
 export function makeView() {
-  const box = h("details", { id: "view-box" }, h("summary", {}, "3-D view"));
-  const why = h("p", { class: "hint" });
-  const stage = h("div", { class: "stage" });
-  box.append(stage, why);
+  const cover = h("p", { class: "cover", role: "status" });
+  const stage = h("div", { class: "stage" }, cover);
+  const box = h("details", { id: "view-box" }, h("summary", {}, h("h2", {}, "3-D view")), stage,
+    h("p", { class: "hint" }, "Drag to turn, with the right button to move, scroll for the distance."));
   $("view").append(box);
-  let missing = "there is nothing to show yet";
+  const here = { socket: false, link: "connecting", missing: "", shown: false };
+  const unable = lacking();
 
-  const show = () => {
-    text(why, missing ? `Nothing to see: ${missing}.` : "Drag to turn, with the right button to move, scroll for the distance.");
-    stage.hidden = missing !== "";
-    if (box.open && !missing) {
-      if (!stage.firstChild) stage.append(h("iframe", { src: "viewer/", title: "3-D view" }));
-    } else stage.replaceChildren();
-  };
+  /** What stands in the way of a picture, or nothing. */
+  function waiting() {
+    if (unable) return unable;
+    if (!here.socket) return "Waiting for the console.";
+    if (here.link === "connecting") return "Waiting for the server.";
+    return here.missing;
+  }
+
+  function show() {
+    const why = waiting();
+    let frame = stage.querySelector("iframe");
+    // A frame that shows something stays while a connection is lost: what it shows is the last that came.
+    const wanted = box.open && !unable && (frame ? !here.missing : !why);
+    if (wanted && !frame) {
+      here.shown = false;
+      frame = h("iframe", { src: "viewer/", title: "3-D view" });
+      stage.prepend(frame);
+    } else if (!wanted) frame?.remove();
+    const said = wanted && here.shown ? "" : why || "Loading the model …";
+    cover.hidden = !said;
+    stage.classList.toggle("unable", unable !== "");
+    text(cover, said);
+  }
 
   const kept = localStorage.getItem(OPEN);
-  box.open = kept === null ? matchMedia("(min-width: 901px)").matches : kept === "yes";
+  box.open = kept === null ? true : kept === "yes";
   box.addEventListener("toggle", () => { localStorage.setItem(OPEN, box.open ? "yes" : "no"); show(); });
-  on("world", ({ world }) => {
-    missing = world.no_view || lacking();
+  window.addEventListener("message", ({ source, data }) => {
+    if (!source || source !== stage.querySelector("iframe")?.contentWindow) return;
+    here.shown = data.viewer === "shown";
     show();
   });
+  on("open", () => { here.socket = true; show(); });
+  on("closed", () => { here.socket = false; show(); });
+  on("status", (status) => { here.link = status.link.state; show(); });
+  on("world", ({ world }) => { here.missing = world.no_view; show(); });
   show();
 }

@@ -1,0 +1,140 @@
+"""A browser before `urlab console`, as a person has it."""
+
+from __future__ import annotations
+
+import contextlib
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from selenium import webdriver
+from selenium.webdriver.chrome.options import Options
+from selenium.webdriver.chrome.service import Service
+from selenium.webdriver.remote.webelement import WebElement
+from selenium.webdriver.support.ui import WebDriverWait
+
+__all__ = ["PATIENCE_S", "PHONE", "RUNNING", "SLIDER", "SOLID", "Page", "command", "link_in", "opened", "serve"]
+
+FLAGS = (
+    "--headless", "--no-sandbox", "--disable-quic", "--no-first-run", "--window-size=1300,900",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
+)  # fmt: skip
+FLAT = ("--disable-gpu", "--disable-3d-apis")
+SOLID = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")  # WebGL without a graphics card
+PATIENCE_S = 40
+RUNNING = "document.querySelector('#play').textContent.includes('Pause')"
+SLIDER = "[data-robot=arm] [data-actuator=elbow]"
+
+PHONE = {"width": 360, "height": 740, "deviceScaleFactor": 2, "mobile": True}
+
+
+@contextlib.contextmanager
+def command(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """Run `urlab` and yield it with the line that it prints first."""
+    with subprocess.Popen([sys.executable, "-m", "urlab_client", *arguments], stdout=subprocess.PIPE, text=True) as one:
+        try:
+            assert one.stdout is not None
+            yield one, one.stdout.readline()
+        finally:
+            one.kill()
+
+
+def serve(*ports: str) -> contextlib.AbstractContextManager[tuple[subprocess.Popen[str], str]]:
+    return command(
+        "serve", "arm", "quadruped", "--controller", "quadruped=pd,kp=40,kv=1.5", "--play", "--unpaused", "--json",
+        "--camera-size", "64x48", *ports,
+    )  # fmt: skip
+
+
+class Page:
+    """One browser, and what is seen in it."""
+
+    def __init__(self, driver: webdriver.Chrome) -> None:
+        self.driver = driver
+
+    def look(self, script: str) -> Any:
+        return self.driver.execute_script(f"return {script}")
+
+    def until(self, script: str) -> None:
+        WebDriverWait(self.driver, PATIENCE_S, 0.05).until(lambda _: self.look(script), f"never: {script}")
+
+    def click(self, selector: str) -> None:
+        self.until(f"document.querySelector('{selector}')?.disabled === false")
+        self.look(f"document.querySelector('{selector}').click()")
+
+    def find(self, selector: str) -> WebElement:
+        return self.driver.find_element("css selector", selector)
+
+    def ask(self, path: str, body: object = None) -> Any:
+        """Ask the console as the page does."""
+        return self.driver.execute_async_script(
+            "const [path, body, done] = arguments; import('/static/link.js').then(({ask}) => "
+            "ask(body === null ? 'GET' : 'POST', path, body ?? undefined)).then(done)",
+            path, body,
+        )  # fmt: skip
+
+    def asked(self, path: str, wanted: Callable[[Any], object], body: object = None) -> None:
+        """Ask until the answer is as wanted."""
+        WebDriverWait(self.driver, PATIENCE_S, 0.05).until(lambda _: wanted(self.ask(path, body)), f"never: {path}")
+
+    def unfold(self, robot: str, title: str) -> None:
+        self.driver.execute_script(
+            "[...document.querySelectorAll(`[data-robot=${arguments[0]}] details`)]"
+            ".find(one => one.firstChild.textContent === arguments[1]).open = true",
+            robot, title,
+        )  # fmt: skip
+
+    def slide(self, value: float) -> None:
+        self.driver.execute_script(
+            "const slider = document.querySelector(arguments[0]); slider.value = arguments[1];"
+            "slider.dispatchEvent(new Event('input', {bubbles: true}))",
+            SLIDER, value,
+        )  # fmt: skip
+
+    def invitation(self) -> str:
+        """Return a link for one more browser."""
+        return str(
+            self.driver.execute_async_script(
+                "const done = arguments[0]; fetch('api/invitations', {method: 'POST'})"
+                ".then(a => a.json()).then(a => done(new URL(a.path, location.href).href))"
+            )
+        )
+
+    def elbow_is(self, value: float) -> str:
+        shown = "document.querySelector('[data-robot=arm] [data-value=elbow]').textContent"
+        return f"Math.abs(parseFloat({shown}.replace('\u2212', '-')) - {value}) < 0.03"
+
+    def phone(self) -> contextlib.AbstractContextManager[None]:
+        """Be as small as a phone for a while."""
+
+        @contextlib.contextmanager
+        def held() -> Iterator[None]:
+            self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", PHONE)
+            try:
+                self.until(f"innerWidth === {PHONE['width']}")
+                yield
+            finally:
+                self.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+        return held()
+
+
+def link_in(line: str) -> str:
+    """Return the link that `urlab console` printed."""
+    return next(word for word in line.split() if word.startswith("http://"))
+
+
+@contextlib.contextmanager
+def opened(folder: Path, link: str, flags: tuple[str, ...] = FLAT) -> Iterator[Page]:
+    options = Options()
+    options.binary_location = "/usr/bin/chromium"
+    for flag in (*FLAGS, *flags, f"--user-data-dir={folder}"):
+        options.add_argument(flag)
+    driver = webdriver.Chrome(options, Service("/usr/bin/chromedriver"))
+    try:
+        driver.get(link)
+        yield Page(driver)
+    finally:
+        driver.quit()

@@ -1,0 +1,165 @@
+"""The console's page while things go wrong around it, in a real Chromium that draws the 3-D view."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import signal
+import subprocess
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from console_page import PATIENCE_S, PHONE, RUNNING, SLIDER, SOLID, Page, command, link_in, opened
+from PIL import Image
+from selenium.common.exceptions import TimeoutException
+from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.support.ui import WebDriverWait
+
+pytestmark = pytest.mark.browser
+
+COVER = "document.querySelector('#view .cover')"
+MODEL = "document.querySelector('.stage iframe')?.contentWindow.eval('currentModelCrc')"
+PRESS = "document.querySelector(arguments[0]).click()"
+UNFADED = """for (const [name, value] of [["transition", "none"], ["opacity", "1"], ["filter", "none"]])
+  document.querySelector("main").style.setProperty(name, value, "important")"""
+
+
+@pytest.fixture(scope="module")
+def console(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[subprocess.Popen[str], Page]]:
+    """The process of a console whose server has an arm but does not play, and its page."""
+    ports = [f"--{name}-port=0" for name in ("step", "state", "ctrl", "info", "camera")]
+    with contextlib.ExitStack() as stack:
+        _, line = stack.enter_context(command("serve", "arm", "--json", "--camera-size", "64x48", *ports))
+        ready = json.loads(line)
+        ours = [f"--step-port={ready['step_port']}", f"--state-port={ready['state_port']}", "--port=0"]
+        process, said = stack.enter_context(command("console", ready["address"], *ours))
+        flags = (*SOLID, "--window-size=1000,700")
+        yield process, stack.enter_context(opened(tmp_path_factory.mktemp("page"), link_in(said), flags))
+
+
+@pytest.fixture(scope="module")
+def page(console: tuple[subprocess.Popen[str], Page]) -> Page:
+    return console[1]
+
+
+def picture(page: Page) -> np.ndarray[Any, Any]:
+    """Return the 3-D view as it is seen; a screenshot may take longer than it is given where others work, too."""
+    wait = WebDriverWait(page.driver, PATIENCE_S, 0.2, ignored_exceptions=[TimeoutException])
+    (taken,) = wait.until(lambda _: [page.find(".stage").screenshot_as_png], "no picture")
+    return np.asarray(Image.open(io.BytesIO(taken)).convert("RGB"), dtype=np.float64)
+
+
+def shows_the_arm(page: Page) -> bool:
+    return bool(((picture(page) @ [-1.0, -0.5, 1.0]) > 60).mean() > 0.003)  # blue, as nothing else is
+
+
+def drawn(page: Page) -> None:
+    page.until(f"{COVER}?.hidden === true")
+    WebDriverWait(page.driver, PATIENCE_S, 0.2).until(lambda _: shows_the_arm(page), "the arm never appeared")
+
+
+def begin_play(page: Page) -> None:
+    page.until("document.querySelector('#restart')?.textContent === 'Begin play'")
+    page.driver.execute_script(PRESS, "#restart")
+    page.until(f"document.querySelector('{SLIDER}') !== null")
+
+
+def test_the_3d_view_says_what_it_waits_for_and_loads_when_there_is_a_model(page: Page) -> None:
+    page.until(f"{COVER}?.innerText.includes('begin play')")
+    begin_play(page)
+    drawn(page)
+
+
+def test_the_3d_view_shows_the_next_model(page: Page) -> None:
+    first = page.look(MODEL)
+    blueprint = page.look("document.querySelector('#blueprint').value")
+    assert page.ask("api/ops/spawn_actor", {"blueprint": blueprint, "actor_id": "second", "location": [0, 2, 0]})
+    page.driver.execute_script(PRESS, "#restart")
+    page.until("document.querySelector('#restart').textContent.includes('?')")
+    assert page.look(MODEL) == first, "it asks before it throws a simulation away"
+    page.driver.execute_script(PRESS, "#restart")
+    page.until("document.querySelectorAll('[data-robot]').length === 2")
+    page.until(f"({MODEL} ?? 0) > 0 && {MODEL} !== {first}")
+    drawn(page)
+
+
+def test_keys_are_the_consoles_after_a_click_into_the_3d_view(page: Page) -> None:
+    drawn(page)
+    page.driver.execute_script("window.scrollTo(0, 0)")
+
+    def press(key: str) -> None:
+        ActionChains(page.driver).move_to_element(page.find(".stage")).click().send_keys(key).perform()
+
+    page.until(f"!({RUNNING})")
+    press(" ")
+    page.until(RUNNING)
+    press("\ue00c")  # escape
+    page.until(f"!({RUNNING})")
+    who = page.look("document.querySelector('#driver').dataset.who")
+    press("d")
+    page.until(f"document.querySelector('#driver').dataset.who !== '{who}'")
+    page.ask("api/lease", {})
+
+
+def test_a_list_gives_the_keyboard_back(page: Page) -> None:
+    page.driver.execute_script(
+        "const mode = document.querySelector('#mode'); mode.focus();"
+        "mode.dispatchEvent(new Event('change', {bubbles: true}))"
+    )
+    assert page.look("document.activeElement === document.body")
+
+
+def test_nobody_removes_the_manager_and_a_level_without_one_offers_it(page: Page) -> None:
+    page.until("document.querySelector('[data-actor=second]') !== null")
+    shown = page.look("[...document.querySelectorAll('[data-actor]')].map(one => one.dataset.actor)")
+    actors = page.ask("api/ops/list_actors", {})["actors"]
+    manager = next(actor["name"] for actor in actors if "Manager" in actor["class"])
+    assert manager not in shown
+    assert page.look("document.querySelector('#no-manager').hidden")
+    page.ask("api/ops/destroy_actor", {"target": manager, "target_by": "actor_name"})
+    page.until("!document.querySelector('#no-manager').hidden")
+    page.driver.execute_script(PRESS, "#add-manager")
+    page.until("document.querySelector('#no-manager').hidden")
+    assert any("Manager" in actor["class"] for actor in page.ask("api/ops/list_actors", {})["actors"])
+
+
+def test_no_message_covers_stop_on_a_phone(page: Page) -> None:
+    with page.phone():
+        for op in ("one_that_is_not", "nor_this", "and_not_this"):
+            page.ask(f"api/ops/{op}", {})
+        page.until("document.querySelectorAll('.toast').length >= 3")
+        boxes = page.look("[...document.querySelectorAll('.toast')].map(one => one.getBoundingClientRect().toJSON())")
+        stop = page.look("document.querySelector('#stop').getBoundingClientRect().toJSON()")
+        for box in boxes:
+            apart = box["right"] <= stop["left"] or stop["right"] <= box["left"]
+            assert apart or box["bottom"] <= stop["top"] or stop["bottom"] <= box["top"], (box, stop)
+            assert 0 <= box["left"] < box["right"] <= PHONE["width"]
+
+
+def test_a_console_that_stands_still_or_ends_shows_as_such_and_only_once(
+    console: tuple[subprocess.Popen[str], Page],
+) -> None:
+    process, page = console
+    drawn(page)
+    gone = (
+        "document.querySelector('#link').textContent === 'No console' && document.body.dataset.link === 'gone' "
+        "&& ['#play', '#stop', '#reset', '#drive'].every(one => document.querySelector(one).closest('[inert]')) "
+        "&& document.querySelector('main').inert && document.body.classList.contains('stale')"
+    )
+    process.send_signal(signal.SIGSTOP)
+    try:
+        page.until(gone)
+    finally:
+        process.send_signal(signal.SIGCONT)
+    page.until("document.querySelector('#link').textContent === 'Connected' && !document.querySelector('main').inert")
+    drawn(page)
+    before = picture(page)
+    process.kill()
+    page.until(gone)
+    page.until("document.querySelector('#banner').innerText.includes('console does not answer for 3 s')")
+    # The viewer would now cover the picture with a message of its own, as if there were two things wrong.
+    page.driver.execute_script(UNFADED)
+    assert (np.abs(picture(page) - before).max(axis=2) > 30).mean() < 0.01
