@@ -34,6 +34,8 @@ from urlab_client.web.driving_lease import DrivingLease, NotDriving, Viewer
 from urlab_client.web.ops import encode, openapi, parse, served
 
 if TYPE_CHECKING:
+    from prometheus_client import CollectorRegistry
+
     from urlab_client.aio import URLabClient
 
 __all__ = ["app"]
@@ -47,7 +49,13 @@ _VIEWER = "x-urlab-viewer"
 _Handler: TypeAlias = Callable[[Request], Awaitable[Response]]
 
 
-def app(client: URLabClient, *, access: Access | None = None, lease_seconds: float = 20.0) -> Starlette:
+def app(
+    client: URLabClient,
+    *,
+    access: Access | None = None,
+    lease_seconds: float = 20.0,
+    metrics: CollectorRegistry | None = None,
+) -> Starlette:
     """Make the application. It opens the client's session while its lifespan runs, and closes nothing at its end.
 
     To mount it in another application, enter `site.router.lifespan_context(site)` in that one's lifespan.
@@ -57,6 +65,8 @@ def app(client: URLabClient, *, access: Access | None = None, lease_seconds: flo
             other part of a program may.
         access: Who may come in; default: whoever brings a token of `site.state.access.invite()`, on this machine.
         lease_seconds: How long a viewer keeps the controls without using them.
+        metrics: What `/metrics` shows to Prometheus, behind the same access; None leaves the path out. The client's
+            requests are in it if the client was made with `observe=PrometheusObserver(metrics)`.
     """
     access = access or Access()
     site = _Site(ConsoleSession(client, DrivingLease(lease_seconds)), access)
@@ -66,10 +76,23 @@ def app(client: URLabClient, *, access: Access | None = None, lease_seconds: flo
         async with site.console.open():
             yield
 
-    application = Starlette(routes=site.routes(), middleware=[Middleware(Guarded, access=access)], lifespan=lifespan)
+    routes = site.routes()
+    if metrics is not None:
+        routes.append(Route("/metrics", _metrics(metrics)))
+    application = Starlette(routes=routes, middleware=[Middleware(Guarded, access=access)], lifespan=lifespan)
     application.state.access = access
     application.state.console = site.console
     return application
+
+
+def _metrics(registry: CollectorRegistry) -> Callable[[Request], Response]:
+    from prometheus_client.exposition import choose_encoder  # noqa: PLC0415
+
+    def show(request: Request) -> Response:
+        encode_all, media_type = choose_encoder(request.headers.get("accept", ""))
+        return Response(encode_all(registry), headers={"content-type": media_type})
+
+    return show
 
 
 class _RunRequest(Struct):
