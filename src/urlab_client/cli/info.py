@@ -39,7 +39,12 @@ def add_parser(commands: Commands) -> None:
             ("urlab info run.mcap --json", "the same for programs"),
         ),
     )
-    parser.add_argument("recording", type=Path, metavar="FILE", help="the recording, a .mcap file")
+    parser.add_argument(
+        "recording",
+        type=Path,
+        metavar="FILE",
+        help="a .mcap file, or a .json file of the server",
+    )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=run)
 

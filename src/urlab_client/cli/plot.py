@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from urlab_client._extras import need
 from urlab_client.cli._arguments import Commands
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._files import check_ending
 from urlab_client.cli._output import progress_bar
-from urlab_client.integrations._extras import need
 from urlab_client.protocol.names import did_you_mean
 
 if TYPE_CHECKING:
@@ -46,7 +46,12 @@ def add_parser(commands: Commands) -> None:
             ("urlab plot run.mcap --field sensors --joints 'imu*'", "readings of some sensors"),
         ),
     )
-    parser.add_argument("recording", type=Path, metavar="FILE", help="the recording, a .mcap file")
+    parser.add_argument(
+        "recording",
+        type=Path,
+        metavar="FILE",
+        help="a .mcap file, or a .json file of the server",
+    )
     parser.add_argument(
         "--joints",
         nargs="+",

@@ -22,6 +22,7 @@ from urlab_client.protocol.enums import CameraMode, PIEState, StepMode
 from urlab_client.protocol.messages.session import ErrorReply, Hello, InstanceInfo, Step
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.assets.uploads import UPLOADS, Uploads
+from urlab_client.server.compile.failure import CompileFailed
 from urlab_client.server.compile.mjcf_options import OptionPolicy
 from urlab_client.server.compile.scene import CompiledScene, compile_scene
 from urlab_client.server.compile.scene_index import ArticulationIndex
@@ -43,7 +44,7 @@ from urlab_client.server.session import ServerSession
 from urlab_client.server.system.allocator import trim
 from urlab_client.server.system.health import Health
 
-__all__ = ["PhysicsConfig", "ServerCore", "unmatched_names"]
+__all__ = ["PhysicsConfig", "ServerCore"]
 
 logger = logging.getLogger("urlab_client.server")
 
@@ -156,8 +157,12 @@ class ServerCore:
             return running.cameras.frame_bytes(request.include_cameras)
         return 0
 
-    def begin_play(self) -> None:
-        """Start play with the level as it is now; `play.wait` says how it ends."""
+    def begin_play(self, *, names_fit: bool = False) -> None:
+        """Start play with the level as it is now; `play.wait` says how it ends.
+
+        Args:
+            names_fit: Whether it fails if a configured controller or camera mode is for something that is not there.
+        """
         actors = self.world.freeze()
         physics = self.physics
 
@@ -169,7 +174,7 @@ class ServerCore:
                 limits=self.limits,
             )
             self.compiled = _Compiled(actors, scene, copy.copy(scene.model.opt))
-            return self._run(scene, actors)
+            return self._run(scene, actors, names_fit=names_fit)
 
         self.play.begin(build)
         self.world.pie_running = True
@@ -201,11 +206,13 @@ class ServerCore:
         self.world.pie_running = True
         return self.play.wait(timeout) is PIEState.READY
 
-    def _run(self, scene: CompiledScene, actors: Sequence[Actor]) -> Running:
+    def _run(self, scene: CompiledScene, actors: Sequence[Actor], *, names_fit: bool = False) -> Running:
         physics = self.physics
         files = recordings(replay_folder(self.world.content.root))
         controllers = {index.key: config for index in scene.articulations if (config := physics.controller(index))}
-        for problem in unmatched_names(scene, physics):
+        for problem in _unmatched_names(scene, physics):
+            if names_fit:
+                raise CompileFailed(problem)
             logger.warning("%s", problem)
         engine = Engine(
             scene,
@@ -282,7 +289,7 @@ def _kind(actor: Actor) -> str:
     return actor.class_name if mesh is None else Path(mesh.file).stem or mesh.shape
 
 
-def unmatched_names(scene: CompiledScene, physics: PhysicsConfig) -> list[str]:
+def _unmatched_names(scene: CompiledScene, physics: PhysicsConfig) -> list[str]:
     """Return what is wrong with configured names that fit nothing in a scene: most likely they are misspelt."""
     actors = {name for index in scene.articulations for name in (index.actor_id, index.key) if name}
     cameras = {

@@ -22,7 +22,7 @@ from urlab_client.protocol.enums import PIEState, Transport
 from urlab_client.protocol.instances import registry_directory
 from urlab_client.protocol.messages.session import InstanceInfo
 from urlab_client.server.assets.content import ContentRoot
-from urlab_client.server.core import PhysicsConfig, ServerCore, unmatched_names
+from urlab_client.server.core import PhysicsConfig, ServerCore
 from urlab_client.server.editor.markers import Drawings
 from urlab_client.server.editor.viewport import Viewport
 from urlab_client.server.editor.world import EditorWorld
@@ -229,12 +229,10 @@ class OpenServer:
         except Refusal as refusal:
             raise ModelError(refusal.message) from None
         if config.play:
-            core.begin_play()
+            # Whoever starts play with the server means what is there; actors to come are for a later begin_pie.
+            core.begin_play(names_fit=True)
             if core.play.wait(_NO_LIMIT) is not PIEState.READY:
                 raise ModelError(f"play cannot start: {core.play.compile_error}")
-            # Whoever starts play with the server means what is there; actors to come are for a later begin_pie.
-            for problem in unmatched_names(core.play.running().scene, config.physics):
-                raise ModelError(problem)
         self._authored = self._mark(core)
         self._dispatcher.served = [served.serving for served in (self._endpoint, memory) if served is not None]
         self._watchdog = Watchdog(core, self._dispatcher, self.health)

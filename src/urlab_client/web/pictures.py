@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import io
 import time
 from collections.abc import AsyncGenerator
 from typing import TYPE_CHECKING, Any
@@ -12,17 +11,16 @@ from typing import TYPE_CHECKING, Any
 import anyio
 import anyio.to_thread
 import msgspec
-import numpy as np
-from PIL import Image
 
-from urlab_client.protocol.enums import CameraMode, StepMode
+from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import URLabError, URLabTimeoutError
 from urlab_client.protocol.messages.streams import CameraSample
+from urlab_client.protocol.picture_files import jpeg
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabCameraView, URLabClient
 
-__all__ = ["EncodedPicture", "Feed", "jpeg"]
+__all__ = ["EncodedPicture", "Feed"]
 
 _FASTEST_S = 1 / 30
 _LOOK_S = 0.5
@@ -129,30 +127,8 @@ class Feed:
 
     async def _publish(self, pixels: Any, received_ns: int, sim_time: float | None) -> None:
         mode = str(self.view.mode)
-        encoded = await anyio.to_thread.run_sync(jpeg, pixels, mode, abandon_on_cancel=True)
+        encoded = await anyio.to_thread.run_sync(jpeg, pixels, mode, _QUALITY, abandon_on_cancel=True)
         self._seq += 1
         async with self._changed:
             self.newest = EncodedPicture(self._seq, received_ns, sim_time, mode, encoded)
             self._changed.notify_all()
-
-
-def jpeg(pixels: Any, mode: str) -> bytes:
-    """Encode a camera's pixels; depth becomes grey, near is bright."""
-    if mode == CameraMode.DEPTH:
-        image = Image.fromarray(_grey(np.asarray(pixels)))
-    elif mode == CameraMode.REAL:
-        image = Image.fromarray(np.ascontiguousarray(pixels[..., :3]))
-    else:
-        image = Image.fromarray(np.ascontiguousarray(pixels[..., 2::-1]))
-    buffer = io.BytesIO()
-    image.save(buffer, "JPEG", quality=_QUALITY)
-    return buffer.getvalue()
-
-
-def _grey(depth: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    seen = depth[np.isfinite(depth)]
-    if not seen.size:
-        return np.zeros(depth.shape, np.uint8)
-    near, far = np.percentile(seen, [1, 95])
-    share = np.clip((far - np.nan_to_num(depth, posinf=far, neginf=near)) / max(far - near, 1e-6), 0, 1)
-    return (share * 255).astype(np.uint8)

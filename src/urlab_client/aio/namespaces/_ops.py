@@ -29,7 +29,6 @@ from urlab_client.protocol.messages.runtime import (
     ReadMocapPose,
     SetControlSource,
     SetMocapPose,
-    SetPaused,
     SetSimSpeed,
     SetTwist,
 )
@@ -60,19 +59,6 @@ __all__ = ["DebugOps", "FarmOps", "OutlinerOps", "ReplayOps", "RuntimeOps", "Sce
 class RuntimeOps(Namespace):
     """Generated part of `client.runtime`."""
 
-    async def set_paused(self, paused: bool, *, timeout: Timeout = DEFAULT) -> bool:
-        """Pause or resume physics and return the state in force.
-
-        Args:
-            paused: True to pause.
-            timeout: Seconds to wait; None waits without limit.
-
-        Raises:
-            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            MissingField: A required field is absent, empty or malformed.
-        """
-        return (await self._call(SetPaused(paused=paused), timeout)).paused
-
     async def set_sim_speed(self, percent: float, *, timeout: Timeout = DEFAULT) -> float:
         """Set the pacing of live mode and return the value in force.
 
@@ -93,7 +79,7 @@ class RuntimeOps(Namespace):
 
         Args:
             source: `zmq` or `ui`.
-            articulation: Articulation key; None for all.
+            articulation: Articulation key, actor id or engine's object name; None for all.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
@@ -116,7 +102,7 @@ class RuntimeOps(Namespace):
         """Store a commanded base velocity for policies to read; it does not drive the simulation.
 
         Args:
-            articulation: Articulation key.
+            articulation: Articulation key, actor id or engine's object name.
             linear: (vx, vy, ignored), m/s, base frame.
             angular: (ignored, ignored, yaw rate), rad/s, base frame.
             timeout: Seconds to wait; None waits without limit.
@@ -139,7 +125,7 @@ class RuntimeOps(Namespace):
         """Place a mocap body; body poses follow at the next step or `forward()`.
 
         Args:
-            body: Compiled body name, prefix included.
+            body: Compiled name, or with the articulation's key, actor id or nothing in front.
             pos: Position, metres, world frame; None keeps it.
             quat: Unit quaternion (w, x, y, z), world frame; None keeps it.
             timeout: Seconds to wait; None waits without limit.
@@ -159,7 +145,7 @@ class RuntimeOps(Namespace):
         """Read the pose of a mocap body.
 
         Args:
-            body: Compiled body name, prefix included.
+            body: Compiled name, or with the articulation's key, actor id or nothing in front.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:

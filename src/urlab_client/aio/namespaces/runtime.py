@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import msgspec
 import numpy as np
 
+from urlab_client.aio.arguments import mapping
 from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.model.numbers import finite
+from urlab_client.aio.jobs import OnProgress
+from urlab_client.aio.model.numbers import finite, is_array
 from urlab_client.aio.namespaces._base import Vector, fill, target_by
 from urlab_client.aio.namespaces._ops import RuntimeOps
 from urlab_client.aio.session import Session
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_mode import ask_mode
-from urlab_client.protocol.base import Floats
+from urlab_client.aio.state.wire_names import as_written, for_the_server
+from urlab_client.protocol.base import Floats, Reply, Request
 from urlab_client.protocol.codec import building
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import UnknownOp
@@ -30,6 +33,7 @@ from urlab_client.protocol.messages.runtime import (
     ContactFilter,
     GetContacts,
     SetMode,
+    SetPaused,
     SetQpos,
     SetSimOptions,
     SetUserChannels,
@@ -39,6 +43,8 @@ from urlab_client.protocol.sim_options import check_sim_options, in_small_letter
 from urlab_client.protocol.types import ContactsResult, SimOptions
 
 __all__ = ["RuntimeNamespace"]
+
+R = TypeVar("R", bound=Reply)
 
 _NUMPY = (np.ndarray, np.generic)
 
@@ -50,13 +56,28 @@ class RuntimeNamespace(RuntimeOps):
         super().__init__(session)
         self._state = state
 
+    async def _call(self, request: Request[R], timeout: Timeout, on_progress: OnProgress | None = None) -> R:
+        sent = for_the_server(request, self._state.objects, self._state.mirror.model)
+        return as_written(await super()._call(sent, timeout, on_progress), request)
+
+    async def set_paused(self, paused: bool, *, timeout: Timeout = DEFAULT) -> bool:
+        """Pause or resume physics and return the state in force.
+
+        Args:
+            paused: True to pause.
+            timeout: Seconds to wait; None waits without limit.
+        """
+        state = self._state
+        state.paused = (await self._call(SetPaused(paused=paused), timeout)).paused
+        return state.paused
+
     async def set_qpos(self, target: str, qpos: Vector, *, by_name: bool = False, timeout: Timeout = DEFAULT) -> None:
         """Write joint positions of an articulation, run `mj_forward`, and mirror the result into `client.data`.
 
         Velocities and time stay.
 
         Args:
-            target: Actor id, or the articulation key with `by_name`.
+            target: Actor id, or the articulation key with `by_name`; any other of its names means it, too.
             qpos: All joint positions in joint order, or 7 values for a free base alone: xyz, quaternion (w, x, y, z).
             by_name: Look `target` up by the articulation key.
             timeout: Seconds to wait; None waits without limit.
@@ -69,11 +90,16 @@ class RuntimeNamespace(RuntimeOps):
         """
         async with self._session.turn(SetQpos, timeout=timeout) as turn:
             self._state.require_handshake("set_qpos")
+            known = self._state.objects.articulations if by_name else self._state.objects.articulations_by_id
+            if target not in [*known] and target in self._state.objects.articulations:
+                target, by_name = self._state.objects.articulations[target].prefix, True
             values = self._positions(target, qpos, by_name=by_name)
             reply = await turn.call(SetQpos(target=target, qpos=values, target_by=target_by(by_name)))
             self._state.mirror_qpos(reply.actor_name, reply.qpos)
 
     def _positions(self, target: str, qpos: Vector, *, by_name: bool) -> Floats:
+        if not is_array(qpos):
+            raise TypeError(f"set_qpos takes numbers, got {qpos!r:.80}.")
         values = tuple(qpos)
         arts = self._state.objects.articulations if by_name else self._state.objects.articulations_by_id
         joints = {j.qpos_local_offset: name for name, j in arts[target].joints.items()} if target in arts else {}
@@ -95,8 +121,10 @@ class RuntimeNamespace(RuntimeOps):
     ) -> ContactsResult:
         """Snapshot the active contacts.
 
-        Filters are exact compiled names, combined with AND. The server compares `body1` and `geom1` with the first
-        geom of a contact and `body2` and `geom2` with the second; a swapped pair does not match.
+        Filters are combined with AND. Each is a compiled name, or one with the articulation's key, actor id or nothing
+        in front; what was filtered by comes back as it was written, all other names as they were compiled. The server
+        compares `body1` and `geom1` with the first geom of a contact and `body2` and `geom2` with the second; a swapped
+        pair does not match.
 
         Args:
             body1: Body of the first geom.
@@ -105,6 +133,9 @@ class RuntimeNamespace(RuntimeOps):
             geom2: Second geom.
             max_contacts: Return at most so many.
             timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            KeyError: Several articulations have a body or geom of that name; nothing was sent.
         """
         names = ContactFilter(body1=body1, body2=body2, geom1=geom1, geom2=geom2)
         reply = await self._call(
@@ -167,10 +198,14 @@ class RuntimeNamespace(RuntimeOps):
             KeyError: Unknown articulation; nothing was sent.
             UnknownOp: The server has no such channels.
         """
+        given = mapping("set_user_channels: arts", arts or {}, "articulation keys to channels")
+        robots = {
+            key: dict(mapping(f"set_user_channels: {key!r}", channels, "channels to values"))
+            for key, channels in given.items()
+        }
         request = SetUserChannels(
-            arts={self._state.objects.articulations[key].prefix: dict(values) for key, values in (arts or {}).items()}
-            or None,
-            scene=None if scene is None else dict(scene),
+            arts={self._state.objects.articulations[key].prefix: channels for key, channels in robots.items()} or None,
+            scene=None if scene is None else dict(mapping("set_user_channels: scene", scene, "channels to values")),
         )
         return (await self._call(request, timeout)).rejected
 
@@ -196,7 +231,8 @@ class RuntimeNamespace(RuntimeOps):
             UnknownOp: A camera is to be switched off by a server whose cameras always stream; nothing was sent.
             GameThreadTimeout: The editor is busy; it may still do it later.
         """
-        wanted = {name: _transports(how) for name, how in cameras.items()}
+        given = mapping("set_camera_streaming", cameras, "cameras to whether, or where, they stream")
+        wanted = {name: _transports(name, how) for name, how in given.items()}
         topics = {name: self._camera_topic("set_camera_streaming", name) for name in wanted}
         switch = self._state.publishers.camera_switch
         if switch is None or not self._session.features.camera_switch:
@@ -224,7 +260,8 @@ class RuntimeNamespace(RuntimeOps):
             UnknownOp: The server has no such latency.
             GameThreadTimeout: The editor is busy; it may still do it later.
         """
-        wanted = {name: _latency(name, delay) for name, delay in cameras.items()}
+        given = mapping("set_camera_delay", cameras, "cameras to seconds")
+        wanted = {name: _latency(name, delay) for name, delay in given.items()}
         topics = {name: self._camera_topic("set_camera_delay", name) for name in wanted}
         request = SetCameraDelay(cameras={topics[name]: delay for name, delay in wanted.items()})
         told = (await self._call(request, timeout)).cameras if wanted else {}
@@ -279,9 +316,11 @@ class RuntimeNamespace(RuntimeOps):
             return reply
 
 
-def _transports(wanted: bool | CameraTransports) -> CameraTransports:
+def _transports(name: str, wanted: bool | CameraTransports) -> CameraTransports:
     if isinstance(wanted, bool):
         return CameraTransports(zmq=wanted, shm=wanted)
+    if not isinstance(wanted, CameraTransports):
+        raise TypeError(f"set_camera_streaming: camera {name!r} takes a bool or CameraTransports, got {wanted!r:.80}.")
     if wanted.zmq is None and wanted.shm is None:
         return CameraTransports(zmq=True, shm=True)
     return CameraTransports(zmq=bool(wanted.zmq), shm=bool(wanted.shm))

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, TypeVar
 import anyio
 
 from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.model.numbers import finite
 from urlab_client.aio.model.upload import flatten, upload
 from urlab_client.aio.namespaces._base import Vector, as_quat, as_vec3, target_by
 from urlab_client.aio.namespaces._ops import SceneOps
@@ -17,6 +18,7 @@ from urlab_client.protocol.base import Reply, Request
 from urlab_client.protocol.errors import CreateLevelFailed, ImportFailed, UnknownOp
 from urlab_client.protocol.messages.outliner import ListActors
 from urlab_client.protocol.messages.scene import (
+    CreateLevel,
     DestroyActor,
     DuplicateActor,
     ImportXml,
@@ -154,7 +156,7 @@ class SceneNamespace(SceneOps):
             actor_id=actor_id,
             location=as_vec3("location", location),
             rotation_euler=euler,
-            intensity=float(intensity),
+            intensity=finite("spawn_light: intensity", intensity),
             color=as_vec3("color", color),
         )
         reply = await self._call(request, timeout)
@@ -352,8 +354,9 @@ class SceneNamespace(SceneOps):
     ) -> dict[str, URLabSpawnHandle]:
         """Bring a level into a described state: load or create it, import each MJCF once, place each asset, save.
 
-        Safe to repeat: an actor whose id exists is moved, not spawned again. An MJCF that is on this machine only is
-        uploaded to servers that take models over the wire, one at most.
+        Safe to repeat: an actor whose id exists is moved, not spawned again. Other tasks' changes to the scene wait
+        until it is done. An MJCF that is on this machine only is uploaded to servers that take models over the wire,
+        one at most.
 
         Args:
             level_name: Short name or `/Game/` path.
@@ -368,32 +371,35 @@ class SceneNamespace(SceneOps):
             ValueError: Two assets share an actor id; nothing was done. Or two MJCF files would have to be uploaded.
             URLabRPCError: From the op that failed; what was placed before it stays.
         """
-        wanted = list(assets)
+        wanted = list(assets) if isinstance(assets, Iterable) else [assets]
+        if strange := [asset for asset in wanted if not isinstance(asset, URLabAsset)]:
+            raise TypeError(f"apply_scene takes URLabAsset objects, got {strange[0]!r:.80}.")
         ids = [asset.actor_id for asset in wanted]
         twice = sorted({i for i in ids if ids.count(i) > 1})
         if twice:
             raise ValueError(f"actor ids must differ, these are used twice: {', '.join(twice)}")
-        try:
-            await self.create_level(level_name, timeout=timeout)
-        except CreateLevelFailed:
-            await self.load_level(level_name, timeout=timeout)
-        await self.ensure_manager(timeout=timeout)
-        blueprints = await self._imported(list(dict.fromkeys(asset.xml for asset in wanted)), timeout)
-        handles = {
-            asset.actor_id: await self.spawn_actor(
-                blueprints[asset.xml],
-                asset.actor_id,
-                location=asset.location,
-                rotation_quat=asset.rotation_quat,
-                rotation_euler=asset.rotation_euler,
-                scale=asset.scale,
-                timeout=timeout,
-            )
-            for asset in wanted
-        }
-        if save:
-            await self.save_level(timeout=timeout)
-        return handles
+        async with self._session.composing(CreateLevel, timeout):
+            try:
+                await self.create_level(level_name, timeout=timeout)
+            except CreateLevelFailed:
+                await self.load_level(level_name, timeout=timeout)
+            await self.ensure_manager(timeout=timeout)
+            blueprints = await self._imported(list(dict.fromkeys(asset.xml for asset in wanted)), timeout)
+            handles = {
+                asset.actor_id: await self.spawn_actor(
+                    blueprints[asset.xml],
+                    asset.actor_id,
+                    location=asset.location,
+                    rotation_quat=asset.rotation_quat,
+                    rotation_euler=asset.rotation_euler,
+                    scale=asset.scale,
+                    timeout=timeout,
+                )
+                for asset in wanted
+            }
+            if save:
+                await self.save_level(timeout=timeout)
+            return handles
 
     async def _imported(self, files: list[str], timeout: Timeout) -> dict[str, URLabBlueprint]:
         """Import models from the server's disk, or else from this machine's where the server takes them so."""
@@ -416,7 +422,11 @@ class SceneNamespace(SceneOps):
 
 
 def _class_path(blueprint: URLabBlueprint | str) -> str:
-    return blueprint if isinstance(blueprint, str) else blueprint.class_path
+    if isinstance(blueprint, str):
+        return blueprint
+    if not isinstance(blueprint, URLabBlueprint):
+        raise TypeError(f"blueprint takes what import_xml() returns, or a class path, got {blueprint!r:.80}.")
+    return blueprint.class_path
 
 
 def _scene_actor(row: SnapshotRow) -> SceneActor:

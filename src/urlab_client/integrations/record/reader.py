@@ -33,10 +33,11 @@ from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.pixels import Pixels
 
-__all__ = ["Camera", "Column", "Run", "Summary", "Table", "Topic", "read_run"]
+__all__ = ["Camera", "Column", "Run", "Summary", "Table", "Topic", "describe_topic", "read_run"]
 
 _NS = 1e9
 _GAP_FACTOR = 3.0
+_UNKNOWN = "neither an MCAP file nor a recording of the server."
 _Number = float | Literal["NaN", "Infinity", "-Infinity"]
 
 
@@ -271,7 +272,7 @@ class Run:
             episodes=episode + 1,
             dropped_states=dropped[0],
             dropped_frames=dropped[1],
-            topics={name: _topic(name, schemas[name], times[name]) for name in sorted(times)},
+            topics={name: describe_topic(name, schemas[name], times[name]) for name in sorted(times)},
         )
 
     def table(self, progress: Callable[[int], None] | None = None) -> Table:
@@ -402,12 +403,16 @@ class Run:
                     record = next(records, None)
                 except InvalidMagic as error:
                     if not entries and not schemas and file.tell() <= 8:
-                        raise RecordingError(f"{self.path}: no MCAP file.") from error
+                        raise RecordingError(
+                            f"{self.path}: neither an MCAP file nor a recording of the server."
+                        ) from error
                     self.damage = "the end of the file is missing"
                     return
                 except (McapError, ZstdError, struct.error, ValueError, OverflowError) as error:
                     if file.tell() < 8:
-                        raise RecordingError(f"{self.path}: no MCAP file.") from error
+                        raise RecordingError(
+                            f"{self.path}: neither an MCAP file nor a recording of the server."
+                        ) from error
                     self.damage = f"{type(error).__name__}: {error}" if str(error) else "the end of the file is missing"
                     return
                 if record is None:
@@ -424,13 +429,18 @@ class Run:
 
 
 def read_run(path: str | os.PathLike[str]) -> Run:
-    """Open a recording, finished or not.
+    """Open a recording, finished or not: an MCAP file, or the JSON file of joint states that a server saves.
 
     Raises:
         OSError: The file cannot be read.
-        RecordingError: It is not an MCAP file.
+        RecordingError: It is neither.
     """
-    run = Run(Path(path))
+    from urlab_client.integrations.record.joint_states import JointStatesRun, is_joint_states  # noqa: PLC0415
+
+    file = Path(path)
+    if is_joint_states(file):
+        return JointStatesRun(file)
+    run = Run(file)
     for _ in run._records(None):  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
         break
     return run
@@ -447,7 +457,8 @@ def _drop_half_a_sample(rows: dict[int, tuple[float, float, int, int, int]], bui
                 builder.drop_last()
 
 
-def _topic(name: str, schema: str, times: list[int]) -> Topic:
+def describe_topic(name: str, schema: str, times: list[int]) -> Topic:
+    """Describe a topic by the times of its messages, nanoseconds."""
     distances = np.diff(np.sort(np.array(times, dtype=np.int64)))
     distances = distances[distances > 0]
     if not len(distances):

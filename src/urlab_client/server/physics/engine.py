@@ -219,7 +219,7 @@ class Engine:
     def step(self, request: Step, observe: Callable[[StepMode], T]) -> T:
         """Do what a `step` means in the active mode and return what `observe` makes of the state after it.
 
-        Live and auto: stage the positional `ctrl` and observe at once. Direct: stage, apply the wrenches and integrate
+        Live and auto: stage commands and observe at once. Direct: stage, apply the wrenches and integrate
         `n_steps` times without anything else coming between. Puppet: write the state and run `mj_forward`.
 
         Args:
@@ -250,10 +250,11 @@ class Engine:
                 raise Refusal("not_ready", self._fault)
             if mode is not StepMode.DIRECT:
                 commands = request.per_articulation or {}
-                self.articulations.stage_positional(commands)
                 if self.dialect.live_commands:
-                    self.articulations.stage_named(commands)
                     self._live_pushed += self.articulations.apply_wrenches(commands)
+                    commands = self.articulations.write_raw(commands)
+                    self.articulations.stage_named(commands)
+                self.articulations.stage_positional(commands)
                 self._kick()
                 return observe(mode)
             n_steps = max(1, request.n_steps)

@@ -55,6 +55,9 @@ _VISIBLE: Final = (
 )
 """The parts of a state that pictures depend on."""
 
+GIVEN_UP: Final = 8
+"""States that wait to be drawn though nobody waits for them any more; beyond, older frames have to do."""
+
 MAX_FAILED: Final = 3
 """After so many failures in a row drawing is given up until the next play session."""
 
@@ -81,6 +84,7 @@ class Shot:
         sync: Draw the state after the step, rather than hand over the latest frame.
         late: What delays the frame.
         least: Number of the first snapshot that is good enough.
+        older: Whether an older frame will do when the state is not drawn in time.
     """
 
     key: str
@@ -88,6 +92,7 @@ class Shot:
     sync: bool
     late: Latency | None = None
     least: float = 0.0
+    older: bool = False
 
 
 @dataclass(eq=False)
@@ -136,7 +141,8 @@ class Film:
         if frame is None or (frame.frame_id or 0) < shot.least:
             return None
         asked = any(shot.camera in job.cameras for job in self.jobs if job.past is None)
-        return None if shot.sync and asked and shot.camera.drawn_at < self.taken_at else frame
+        in_time = not asked or shot.camera.drawn_at >= self.taken_at
+        return frame if in_time or shot.older or not shot.sync else None
 
     def capture_time(self, shot: Shot) -> float:
         """Return when the camera saw what the frame for a shot shows, Unix seconds."""
@@ -204,9 +210,11 @@ class CameraRenderer:
         self._spare: list[mujoco.MjData] = []  # making one takes longer than copying a state
         self._queue: queue.SimpleQueue[Exposure | Painting | None] = queue.SimpleQueue()
         self._pending: set[Exposure | Painting] = set()
+        self._given_up: list[Exposure] = []
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
         self._drawing = False
+        self._ready = threading.Event()
         self._broken = False
         self._closed = False
 
@@ -224,7 +232,7 @@ class CameraRenderer:
         """
         if isinstance(include_cameras, bool):
             cameras = self._bare if include_cameras else {}
-            return [Shot(key, camera, sync=fresh, late=_late(camera)) for key, camera in cameras.items()]
+            return [Shot(key, camera, sync=fresh, late=_late(camera), older=fresh) for key, camera in cameras.items()]
         shots: list[Shot] = []
         for key, kind in include_cameras.items():
             camera = self._by_name.get(key) or self._bare.get(key)
@@ -234,7 +242,8 @@ class CameraRenderer:
                 # A picture from some snapshot on is asked for: that of now is one, if there is any.
                 least = 0.0 if isinstance(kind, str) or not self._stamped else kind.get("frame_id", 0.0)
                 later = self._stamped and not isinstance(kind, str)
-                shots.append(Shot(key, camera, sync=fresh or later or now, late=late, least=least))
+                older = fresh and not later
+                shots.append(Shot(key, camera, sync=fresh or later or now, late=late, least=least, older=older))
         return shots
 
     def stream_shots(self, keys: Iterable[str]) -> list[Shot]:
@@ -300,7 +309,8 @@ class CameraRenderer:
         Returns:
             What to hand to `frames`.
         """
-        now, draw = self._now(), draw and not self._broken
+        self._given_up = [job for job in self._given_up if not job.done.is_set()]
+        now, draw = self._now(), draw and not self._broken and len(self._given_up) < GIVEN_UP
         jobs: list[Exposure] = []
         past: dict[Latency, Past] = {}
         cameras: list[_Camera] = []
@@ -316,7 +326,9 @@ class CameraRenderer:
             jobs.append(Exposure(cameras, self._copy_state(), now.wall, frame_id if self._stamped else None))
         return Film(now.wall, time.time(), jobs, past)
 
-    def frames(self, shots: Sequence[Shot], film: Film) -> dict[str, CameraFrame] | None:
+    def frames(
+        self, shots: Sequence[Shot], film: Film, wait_s: float = FRAMES_DEADLINE_S
+    ) -> dict[str, CameraFrame] | None:
         """Draw what has to be drawn and return the frames by the request's keys; None without any.
 
         Without OpenGL, or when drawing fails or takes too long, cameras are left out; the log says why.
@@ -324,11 +336,17 @@ class CameraRenderer:
         Args:
             shots: What is asked for.
             film: What `capture` returned.
+            wait_s: Seconds that drawing may take before frames are left out, or older ones taken; what was begun
+                is drawn all the same. They begin when OpenGL has been found, which no request can hurry.
         """
-        deadline = time.monotonic() + FRAMES_DEADLINE_S
         drawing = [job for job in film.jobs if self._submit(job)]
+        if drawing:
+            self._ready.wait(FRAMES_DEADLINE_S)
+        deadline = time.monotonic() + wait_s
         if not all(job.done.wait(max(0.0, deadline - time.monotonic())) for job in drawing):
-            logger.warning("no camera images within %g s; continuing without them", FRAMES_DEADLINE_S)
+            self._given_up.extend(drawing)
+            if wait_s >= FRAMES_DEADLINE_S:
+                logger.warning("no camera images within %g s; continuing without them", wait_s)
         return {shot.key: frame for shot in shots if (frame := film.frame(shot)) is not None} or None
 
     def capture_viewport(self, picture: ViewportPicture) -> Painting:
@@ -369,6 +387,7 @@ class CameraRenderer:
         """
         with self._lock:
             self._closed = True
+            self._ready.set()
             self._release()
             thread = self._thread
             drawing = self._drawing
@@ -422,6 +441,7 @@ class CameraRenderer:
             if self._drawing and self._model is not None:
                 with Stage(self._model, backend, self._tints, self._quality) as stage:
                     atexit.register(self.close)  # after the driver's own hook, so before it at the end
+                    self._ready.set()
                     self._draw(stage)
         except Exception:
             logger.exception("camera images are left out from now on: drawing failed")
@@ -430,6 +450,7 @@ class CameraRenderer:
         finally:
             with self._lock:
                 self._broken = True
+                self._ready.set()
                 self._release()
 
     def _draw(self, stage: Stage) -> None:
