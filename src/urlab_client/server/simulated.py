@@ -30,6 +30,7 @@ from urlab_client.server.physics.channels import channel_problem
 from urlab_client.server.physics.controllers import ControllerConfig
 from urlab_client.server.render.drawing import RenderQuality
 from urlab_client.server.render.opengl import find_backend
+from urlab_client.server.rpc.served_request import ServedRequest
 from urlab_client.server.snapshot import LARGEST_PIXELS
 from urlab_client.server.transport.curve_authentication import CurveServer, is_loopback
 from urlab_client.server.transport.endpoint import connect_host, tcp
@@ -299,6 +300,22 @@ class SimulatedServer:
             RuntimeError: The server is closed.
         """
         self._running.health.add_callback(callback)
+
+    def add_request_callback(self, callback: Callable[[ServedRequest], None]) -> None:
+        """Call `callback` with each request that was answered, on the thread that answers, until the server is closed.
+
+        It must be quick: the next request waits for it. What it raises is logged and changes nothing.
+
+        Raises:
+            RuntimeError: The server is closed.
+        """
+        self._running.request_callbacks.append(callback)
+
+    @property
+    def sim_time(self) -> float | None:
+        """Simulation time of the play session, seconds; None without one."""
+        opened = self._opened
+        return None if opened is None else opened.sim_time
 
     @property
     def can_render(self) -> bool:
