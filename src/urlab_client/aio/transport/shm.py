@@ -442,10 +442,11 @@ class ShmTransport:
         self._look()
         if pending.future.done():
             return
+        waited_ms = 1000 * (pending.deadline - pending.at)
         executed = "" if pending.op.effect is Effect.READ else " The request was sent and may still be executed."
         pending.future.set_exception(
             URLabTimeoutError(
-                f"{pending.op.name}: no reply in shared memory within {1000 * (pending.deadline - pending.at):.0f} ms.{executed}",
+                f"{pending.op.name}: no reply in shared memory within {waited_ms:.0f} ms.{executed}",
                 op=pending.op.name,
                 hint="The server is busy or blocked; allow more time with timeout=…",
             )
