@@ -14,6 +14,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
+from contextvars import Context
 from typing import Any
 
 __all__ = ["CallerLoop"]
@@ -28,6 +29,8 @@ _READABLE = getattr(select, "EPOLLIN", None)
 _NEEDED = (
     "_asyncgen_finalizer_hook",
     "_asyncgen_firstiter_hook",
+    "_closed",
+    "_debug",
     "_process_events",
     "_ready",
     "_run_once",
@@ -43,6 +46,8 @@ class CallerLoop(asyncio.SelectorEventLoop):
 
     _asyncgen_finalizer_hook: Any
     _asyncgen_firstiter_hook: Any
+    _closed: bool
+    _debug: bool
     _process_events: Any
     _ready: deque[Any]
     _run_once: Any
@@ -52,10 +57,19 @@ class CallerLoop(asyncio.SelectorEventLoop):
     _thread_id: int | None
 
     def __init__(self) -> None:
+        self._as_known = False  # while asyncio's own loop is being made
         super().__init__()
         self._as_known = all(hasattr(self, name) for name in _NEEDED)
         nothing: Mapping[int, Any] = {}
         self._poll, self._keys = _parts(self._selector) if self._as_known else (None, nothing)
+
+    def call_soon(self, callback: Callable[..., object], *args: Any, context: Context | None = None) -> asyncio.Handle:
+        """See `asyncio.AbstractEventLoop.call_soon`."""
+        if not self._as_known or self._closed or self._debug:  # there is more to be done, or to be refused
+            return super().call_soon(callback, *args, context=context)
+        handle = asyncio.Handle(callback, args, self, context)
+        self._ready.append(handle)
+        return handle
 
     def run_until_stopped(self) -> None:
         """Do what `run_forever` does. For whoever stops it soon."""
