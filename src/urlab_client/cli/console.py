@@ -6,6 +6,7 @@ import asyncio
 import socket
 import webbrowser
 from contextlib import suppress
+from pathlib import Path
 
 from urlab_client._installation import install_command
 from urlab_client.cli._arguments import (
@@ -33,6 +34,7 @@ class ConsoleArguments(ServerArguments):
     port: int
     allow_host: list[str]
     open: bool
+    recordings: Path
 
 
 def add_parser(commands: Commands) -> None:
@@ -69,6 +71,13 @@ def add_parser(commands: Commands) -> None:
         help="host name under which browsers reach the page, besides this machine's own; repeatable",
     )
     parser.add_argument("--open", action="store_true", help="open the page in the browser")
+    parser.add_argument(
+        "--recordings",
+        type=Path,
+        default=Path("recordings"),
+        metavar="FOLDER",
+        help="where recordings are kept, made with the first one (default: %(default)s)",
+    )
     parser.set_defaults(run=run)
 
 
@@ -80,6 +89,7 @@ def run(arguments: ConsoleArguments) -> int:
         OSError: The port is in use.
     """
     try:
+        import prometheus_client  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]
         import uvicorn  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]
 
         from urlab_client.web import Access  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]
@@ -95,20 +105,22 @@ def run(arguments: ConsoleArguments) -> int:
 
 async def _serve(arguments: ConsoleArguments) -> None:
     import uvicorn  # noqa: PLC0415
+    from prometheus_client import REGISTRY  # noqa: PLC0415
 
     from urlab_client.aio import URLabClient  # noqa: PLC0415
+    from urlab_client.integrations.telemetry import PrometheusObserver  # noqa: PLC0415
     from urlab_client.web import Access, app  # noqa: PLC0415
     from urlab_client.web.access import LOOPBACK  # noqa: PLC0415
 
     access = Access(hosts=[*LOOPBACK, *(name.lower() for name in arguments.allow_host)])
     # Each camera is streamed while somebody watches it.
-    client = make_client(URLabClient, arguments.address, arguments, live_pictures=False)
+    client = make_client(URLabClient, arguments.address, arguments, live_pictures=False, observe=PrometheusObserver())
     async with client:
         with _bound(arguments.host, arguments.port) as listener:
             name = arguments.allow_host[0] if arguments.allow_host else "127.0.0.1"
             link = f"http://{name}:{listener.getsockname()[1]}/?token={access.invite()}"
             config = uvicorn.Config(
-                app(client, access=access),
+                app(client, access=access, recordings=arguments.recordings, metrics=REGISTRY),
                 log_config=None,
                 access_log=False,
                 ws="websockets-sansio",
