@@ -78,6 +78,7 @@ class ServeArguments(argparse.Namespace):
     camera_size: tuple[int, int] | None
     render_quality: Literal["auto", "fast", "high"]
     mjcf_options: bool
+    randomise: str | None
     scene_mib: int | None
     actor_names: Literal["model", "plugin"]
     dialect: Literal["alpha", "beta"]
@@ -224,6 +225,11 @@ def add_parser(commands: Commands) -> None:
         action=argparse.BooleanOptionalAction,
         default=False,
         help="honour the <option> of the first model; else the alpha ignores all, the beta merges them",
+    )
+    physics.add_argument(
+        "--randomise",
+        metavar="FILE",
+        help="vary the model from reset to reset, by the seed of the reset, as a TOML file (or JSON text) declares",
     )
     cameras = parser.add_argument_group("cameras")
     cameras.add_argument(
@@ -387,6 +393,7 @@ def _server(arguments: ServeArguments, saved_dir: Path) -> SimulatedServer:
             camera_size=arguments.camera_size,
             render_quality=arguments.render_quality,
             mjcf_options=arguments.mjcf_options,
+            randomise=arguments.randomise,
             limits=Limits() if arguments.scene_mib is None else Limits(scene_bytes=arguments.scene_mib * 2**20),
             actor_names=arguments.actor_names,
             shm_dir=arguments.shm_dir,
@@ -396,6 +403,8 @@ def _server(arguments: ServeArguments, saved_dir: Path) -> SimulatedServer:
         )
     except ValueError as error:
         raise CommandError(str(error)) from None
+    except OSError as error:  # nothing else is read before the start
+        raise CommandError(f"--randomise: {error}") from None
 
 
 def _curve(arguments: ServeArguments) -> CurveServer | None:
