@@ -62,7 +62,7 @@ ALLOWED: dict[str, frozenset[str]] = {
         {"", "_extras", "_installation", "_mujoco", "aio", "enums", "keys", "protocol", "randomise", "server", "sync"}
     ),
     "cluster": frozenset({"_installation", "integrations", "protocol", "sync"}),
-    "web": frozenset({"_installation", "aio", "integrations", "protocol"}),
+    "web": frozenset({"_extras", "_installation", "aio", "integrations", "protocol"}),
     "cli": frozenset(
         {
             "",

@@ -32,6 +32,7 @@ from urlab_client.web import mujoco_viewer
 from urlab_client.web.access import Access, Guarded
 from urlab_client.web.console_session import Audience, ConsoleSession
 from urlab_client.web.driving_lease import DrivingLease, NotDriving, Viewer
+from urlab_client.web.metrics import showing
 from urlab_client.web.ops import encode, openapi, parse, served
 from urlab_client.web.recording_routes import RecordingRoutes
 
@@ -82,21 +83,11 @@ def app(
 
     routes = site.routes()
     if metrics is not None:
-        routes.append(Route("/metrics", _metrics(metrics)))
+        routes.append(Route("/metrics", showing(metrics)))
     application = Starlette(routes=routes, middleware=[Middleware(Guarded, access=access)], lifespan=lifespan)
     application.state.access = access
     application.state.console = site.console
     return application
-
-
-def _metrics(registry: CollectorRegistry) -> Callable[[Request], Response]:
-    from prometheus_client.exposition import choose_encoder  # noqa: PLC0415
-
-    def show(request: Request) -> Response:
-        encode_all, media_type = choose_encoder(request.headers.get("accept", ""))
-        return Response(encode_all(registry), headers={"content-type": media_type})
-
-    return show
 
 
 class _RunRequest(Struct):
