@@ -42,8 +42,10 @@ ALLOWED: dict[str, frozenset[str]] = {
             "_windows",
             "keys",
             "protocol",
+            "randomise",
         }
     ),
+    "randomise": frozenset({"protocol"}),
     "enums": frozenset({"protocol"}),
     "_children": frozenset(),
     "_confined": frozenset(),
@@ -57,10 +59,10 @@ ALLOWED: dict[str, frozenset[str]] = {
     "_windows": frozenset(),
     "": frozenset({"_installation", "sync", "enums", "protocol"}),
     "integrations": frozenset(
-        {"", "_extras", "_installation", "_mujoco", "aio", "enums", "keys", "protocol", "server", "sync"}
+        {"", "_extras", "_installation", "_mujoco", "aio", "enums", "keys", "protocol", "randomise", "server", "sync"}
     ),
     "cluster": frozenset({"_installation", "integrations", "protocol", "sync"}),
-    "web": frozenset({"_installation", "aio", "integrations", "protocol"}),
+    "web": frozenset({"_extras", "_installation", "aio", "integrations", "protocol"}),
     "cli": frozenset(
         {
             "",
@@ -73,6 +75,7 @@ ALLOWED: dict[str, frozenset[str]] = {
             "integrations",
             "keys",
             "protocol",
+            "randomise",
             "server",
             "sync",
             "web",

@@ -89,6 +89,7 @@ def run(arguments: ConsoleArguments) -> int:
         OSError: The port is in use.
     """
     try:
+        import prometheus_client  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]
         import uvicorn  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]
 
         from urlab_client.web import Access  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]
@@ -104,20 +105,22 @@ def run(arguments: ConsoleArguments) -> int:
 
 async def _serve(arguments: ConsoleArguments) -> None:
     import uvicorn  # noqa: PLC0415
+    from prometheus_client import REGISTRY  # noqa: PLC0415
 
     from urlab_client.aio import URLabClient  # noqa: PLC0415
+    from urlab_client.integrations.telemetry import PrometheusObserver  # noqa: PLC0415
     from urlab_client.web import Access, app  # noqa: PLC0415
     from urlab_client.web.access import LOOPBACK  # noqa: PLC0415
 
     access = Access(hosts=[*LOOPBACK, *(name.lower() for name in arguments.allow_host)])
     # Each camera is streamed while somebody watches it.
-    client = make_client(URLabClient, arguments.address, arguments, live_pictures=False)
+    client = make_client(URLabClient, arguments.address, arguments, live_pictures=False, observe=PrometheusObserver())
     async with client:
         with _bound(arguments.host, arguments.port) as listener:
             name = arguments.allow_host[0] if arguments.allow_host else "127.0.0.1"
             link = f"http://{name}:{listener.getsockname()[1]}/?token={access.invite()}"
             config = uvicorn.Config(
-                app(client, access=access, recordings=arguments.recordings),
+                app(client, access=access, recordings=arguments.recordings, metrics=REGISTRY),
                 log_config=None,
                 access_log=False,
                 ws="websockets-sansio",

@@ -20,6 +20,7 @@ from urlab_client.protocol.codec import encode_reply
 from urlab_client.protocol.dialects import ALPHA, Dialect
 from urlab_client.protocol.enums import CameraMode, PIEState, StepMode
 from urlab_client.protocol.messages.session import ErrorReply, Hello, InstanceInfo, Step
+from urlab_client.randomise.declaration import MODEL_TEXT, Randomisation
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.assets.uploads import UPLOADS, Uploads
 from urlab_client.server.compile.failure import CompileFailed
@@ -63,6 +64,7 @@ class PhysicsConfig:
         mjcf_options: Honour the `<option>` of the first model.
         render_quality: How well cameras and the viewport are drawn.
         user_channels: First value of the user channels that the level declares, by `ROBOT/CHANNEL` or `scene/CHANNEL`.
+        randomise: What varies from reset to reset.
     """
 
     step_mode: StepMode = StepMode.AUTO
@@ -73,6 +75,7 @@ class PhysicsConfig:
     mjcf_options: bool = False
     render_quality: RenderQuality = "auto"
     user_channels: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    randomise: Randomisation | None = None
 
     def controller(self, index: ArticulationIndex) -> ControllerConfig | None:
         """Return the controller an articulation is to get: configured here, or else by the level or its MJCF."""
@@ -171,6 +174,7 @@ class ServerCore:
                 actors,
                 options=self._options,
                 camera_size=physics.camera_size,
+                texts={} if physics.randomise is None else {MODEL_TEXT: physics.randomise.to_json()},
                 limits=self.limits,
             )
             self.compiled = _Compiled(actors, scene, copy.copy(scene.model.opt))
@@ -214,14 +218,19 @@ class ServerCore:
             if names_fit:
                 raise CompileFailed(problem)
             logger.warning("%s", problem)
-        engine = Engine(
-            scene,
-            pinned_mode=physics.step_mode,
-            paused=not physics.unpaused,
-            controllers=controllers,
-            health=self.health,
-            dialect=self.dialect,
-        )
+        try:
+            engine = Engine(
+                scene,
+                pinned_mode=physics.step_mode,
+                paused=not physics.unpaused,
+                controllers=controllers,
+                health=self.health,
+                dialect=self.dialect,
+                randomise=physics.randomise,
+            )
+        except ValueError as error:
+            raise CompileFailed(f"what is to vary: {error}") from None
+        varied = () if engine.variation is None else engine.variation.visible_fields
         channels = UserChannels(physics.user_channels)
         modes = {
             (index.key, camera.name): physics.camera_mode(index, camera.name)
@@ -232,7 +241,7 @@ class ServerCore:
             scene,
             engine.start(),
             Observer(scene, engine.articulations.controls, channels),
-            self._camera_renderer(scene, actors, modes, engine.articulations.names),
+            self._camera_renderer(scene, actors, modes, engine.articulations.names, varied),
             files,
             self.limits,
             channels,
@@ -260,10 +269,18 @@ class ServerCore:
         actors: Sequence[Actor],
         modes: Mapping[tuple[str, str], CameraMode],
         names: Mapping[str, str],
+        varied: Sequence[str] = (),
     ) -> CameraRenderer:
         classes = {actor.name: _kind(actor) for actor in actors}
         return CameraRenderer(
-            scene, modes, classes, self.physics.render_quality, self.health, names=names, dialect=self.dialect
+            scene,
+            modes,
+            classes,
+            self.physics.render_quality,
+            self.health,
+            names=names,
+            varied=varied,
+            dialect=self.dialect,
         )
 
     def stop_play(self) -> None:

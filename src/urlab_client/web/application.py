@@ -32,10 +32,13 @@ from urlab_client.web import mujoco_viewer
 from urlab_client.web.access import Access, Guarded
 from urlab_client.web.console_session import Audience, ConsoleSession
 from urlab_client.web.driving_lease import DrivingLease, NotDriving, Viewer
+from urlab_client.web.metrics import showing
 from urlab_client.web.ops import encode, openapi, parse, served
 from urlab_client.web.recording_routes import RecordingRoutes
 
 if TYPE_CHECKING:
+    from prometheus_client import CollectorRegistry
+
     from urlab_client.aio import URLabClient
 
 __all__ = ["app"]
@@ -54,6 +57,7 @@ def app(
     *,
     access: Access | None = None,
     lease_seconds: float = 20.0,
+    metrics: CollectorRegistry | None = None,
     recordings: str | os.PathLike[str] = "recordings",
 ) -> Starlette:
     """Make the application. It opens the client's session while its lifespan runs, and closes nothing at its end.
@@ -65,6 +69,8 @@ def app(
             other part of a program may.
         access: Who may come in; default: whoever brings a token of `site.state.access.invite()`, on this machine.
         lease_seconds: How long a viewer keeps the controls without using them.
+        metrics: What `/metrics` shows to Prometheus, behind the same access; None leaves the path out. The client's
+            requests are in it if the client was made with `observe=PrometheusObserver(metrics)`.
         recordings: Folder of the recordings that viewers make, download and replay; made with the first one.
     """
     access = access or Access()
@@ -75,7 +81,10 @@ def app(
         async with site.console.open():
             yield
 
-    application = Starlette(routes=site.routes(), middleware=[Middleware(Guarded, access=access)], lifespan=lifespan)
+    routes = site.routes()
+    if metrics is not None:
+        routes.append(Route("/metrics", showing(metrics)))
+    application = Starlette(routes=routes, middleware=[Middleware(Guarded, access=access)], lifespan=lifespan)
     application.state.access = access
     application.state.console = site.console
     return application

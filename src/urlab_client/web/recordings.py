@@ -269,7 +269,7 @@ def _described(file: Path) -> dict[str, Any]:
 
 
 def _convert(file: Path, target: Path, kind: str, camera: str) -> None:
-    from urlab_client.integrations._extras import MissingExtra  # noqa: PLC0415
+    from urlab_client._extras import MissingExtra  # noqa: PLC0415
     from urlab_client.integrations.record import export  # noqa: PLC0415
 
     run = open_run(file)

@@ -23,6 +23,7 @@ from urlab_client.integrations._feed.messages import (
     ArticulationMessage,
     CompressedImage,
     EntityMessage,
+    EpisodeMessage,
     GapMessage,
     RawImage,
     schema_name,
@@ -68,6 +69,7 @@ class _Entity(msgspec.Struct):
 
 _state = msgspec.json.Decoder(_State).decode
 _entity = msgspec.json.Decoder(_Entity).decode
+_episode = msgspec.json.Decoder(EpisodeMessage).decode
 _gap = msgspec.json.Decoder(GapMessage).decode
 _compressed = msgspec.json.Decoder(CompressedImage).decode
 _raw = msgspec.json.Decoder(RawImage).decode
@@ -110,6 +112,7 @@ class Summary:
         dropped_states: States that could not be written fast enough.
         dropped_frames: Likewise pictures.
         topics: By name.
+        varied: What the server varied, by episode.
     """
 
     path: Path
@@ -122,6 +125,7 @@ class Summary:
     dropped_states: int
     dropped_frames: int
     topics: dict[str, Topic]
+    varied: tuple[EpisodeMessage, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,6 +248,7 @@ class Run:
         schemas: dict[str, str] = {}
         about: dict[str, str] = {}
         walls: list[int] = []
+        varied: list[EpisodeMessage] = []
         dropped = [0, 0]
         episode = -1
         complete = False
@@ -255,6 +260,8 @@ class Run:
                 if entry.schema == schema_name(GapMessage):
                     gap = _gap(record.data)
                     dropped = [dropped[0] + gap.states, dropped[1] + gap.frames]
+                elif entry.schema == schema_name(EpisodeMessage):
+                    varied.append(_episode(record.data))
                 elif entry.schema == schema_name(ArticulationMessage):
                     episode = _state(record.data).episode
             elif isinstance(record, Metadata) and record.name == "urlab":
@@ -273,6 +280,7 @@ class Run:
             dropped_states=dropped[0],
             dropped_frames=dropped[1],
             topics={name: describe_topic(name, schemas[name], times[name]) for name in sorted(times)},
+            varied=tuple(varied),
         )
 
     def table(self, progress: Callable[[int], None] | None = None) -> Table:

@@ -86,7 +86,7 @@ def handshake(server: ServerCore, session_id: str, *, include_assets: bool = Fal
         return reply
     scene, engine = running.scene, running.engine
     with engine.lock.look():
-        reply.mjb = scene.mjb()
+        reply.mjb = running.mjb()
         reply.articulations = [
             _articulation(server, name, control) for name, control in engine.articulations.controls.items()
         ]

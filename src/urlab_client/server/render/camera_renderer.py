@@ -16,7 +16,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Final
+from typing import Any, Final
 
 import mujoco
 import numpy as np
@@ -41,6 +41,8 @@ __all__ = ["CameraRenderer", "Exposure", "Film", "Painting", "Shot"]
 logger = logging.getLogger("urlab_client.server")
 
 Bytes = NDArray[np.uint8]
+Look = Mapping[str, NDArray[Any]]
+"""Fields of a model that pictures depend on, by name."""
 
 LATEST_S: Final = 1.0 / 30.0
 """Age up to which a frame is the latest."""
@@ -105,6 +107,7 @@ class Exposure:
         taken_at: When it was the state, monotonic seconds.
         frame_id: Number of its snapshot; None in dialects whose pictures do not tell.
         past: What gets the frame instead of the one camera, which saw this some time ago.
+        look: What the model looks like, where that varies.
         done: Set when the cameras have their frames, or never will.
     """
 
@@ -113,6 +116,7 @@ class Exposure:
     taken_at: float
     frame_id: int | None = None
     past: Past | None = None
+    look: Look | None = None
     done: threading.Event = field(default_factory=threading.Event)
 
 
@@ -157,12 +161,14 @@ class Painting:
     Attributes:
         picture: What it shows.
         data: The state.
+        look: What the model looks like, where that varies.
         pixels: Red, green, blue and alpha from the top, shape (height, width, 4); None until it is drawn.
         done: Set when it is drawn, or never will be.
     """
 
     picture: ViewportPicture
     data: mujoco.MjData
+    look: Look | None = None
     pixels: Bytes | None = None
     done: threading.Event = field(default_factory=threading.Event)
 
@@ -179,6 +185,7 @@ class CameraRenderer:
         health: Health | None = None,
         *,
         names: Mapping[str, str] = MappingProxyType({}),
+        varied: Sequence[str] = (),
         dialect: Dialect = ALPHA,
     ) -> None:
         """Prepare for a scene; nothing is drawn, and no OpenGL looked for, before a frame is wanted.
@@ -190,6 +197,7 @@ class CameraRenderer:
             quality: How well to draw.
             health: Told when the thread that draws dies.
             names: What articulations are called in requests and replies, by key; that, for those not mentioned.
+            varied: Fields of the model that pictures depend on, and that change from reset to reset.
             dialect: Decides what cameras are called there.
         """
         self._scene = scene
@@ -205,6 +213,7 @@ class CameraRenderer:
                 robot = names.get(index.key, index.key)
                 self._by_name[f"{robot}/{dialect.camera_part(info.name)}"] = camera
                 self._bare[dialect.camera_key(robot, info.name)] = camera  # of several, the last
+        self._varied = tuple(varied)
         self._episode = 0
         self._model: mujoco.MjModel | None = None
         self._spare: list[mujoco.MjData] = []  # making one takes longer than copying a state
@@ -311,6 +320,7 @@ class CameraRenderer:
         """
         self._given_up = [job for job in self._given_up if not job.done.is_set()]
         now, draw = self._now(), draw and not self._broken and len(self._given_up) < GIVEN_UP
+        look = self._copy_look()
         jobs: list[Exposure] = []
         past: dict[Latency, Past] = {}
         cameras: list[_Camera] = []
@@ -321,9 +331,10 @@ class CameraRenderer:
             elif shot.late not in past and (seen := shot.late.revealed(now)) is not None:
                 past[shot.late] = seen
                 if seen.frame is None and draw:
-                    jobs.append(Exposure([shot.camera], self._past_state(seen), now.wall, seen.frame_id, seen))
+                    jobs.append(Exposure([shot.camera], self._past_state(seen), now.wall, seen.frame_id, seen, look))
         if cameras and draw:
-            jobs.append(Exposure(cameras, self._copy_state(), now.wall, frame_id if self._stamped else None))
+            number = frame_id if self._stamped else None
+            jobs.append(Exposure(cameras, self._copy_state(), now.wall, number, look=look))
         return Film(now.wall, time.time(), jobs, past)
 
     def frames(
@@ -351,7 +362,7 @@ class CameraRenderer:
 
     def capture_viewport(self, picture: ViewportPicture) -> Painting:
         """Copy the state that `paint` draws; the caller holds the engine's lock."""
-        return Painting(picture, self._copy_state())
+        return Painting(picture, self._copy_state(), self._copy_look())
 
     def paint(self, job: Painting) -> Bytes:
         """Draw a picture of the viewport.
@@ -407,6 +418,10 @@ class CameraRenderer:
         mujoco.mj_copyData(data, self._model, self._scene.data)
         return data
 
+    def _copy_look(self) -> Look | None:
+        model = self._scene.model
+        return {name: np.array(getattr(model, name)) for name in self._varied} if self._varied else None
+
     def _past_state(self, past: Past) -> mujoco.MjData:
         data = self._copy_state()  # whatever the past does not hold is as it is now
         mujoco.mj_setState(self._scene.model, data, past.state, _VISIBLE)
@@ -457,6 +472,8 @@ class CameraRenderer:
         failed = 0
         while (job := self._queue.get()) is not None:
             try:
+                for name, values in (job.look or {}).items():
+                    getattr(self._model, name)[...] = values
                 stage.prepare(job.data)
                 self._draw_job(stage, job)
                 failed = 0
