@@ -58,6 +58,7 @@ ALLOWED: dict[str, frozenset[str]] = {
     "integrations": frozenset({"", "_installation", "_mujoco", "aio", "enums", "keys", "protocol", "server", "sync"}),
     "cluster": frozenset({"_installation", "integrations", "protocol", "sync"}),
     "web": frozenset({"_installation", "aio", "protocol"}),
+    "mcp": frozenset({"aio", "integrations", "protocol", "web"}),
     "cli": frozenset(
         {
             "",
@@ -68,6 +69,7 @@ ALLOWED: dict[str, frozenset[str]] = {
             "enums",
             "integrations",
             "keys",
+            "mcp",
             "protocol",
             "server",
             "sync",
@@ -215,7 +217,7 @@ def test_imports_inside_the_large_layers_point_one_way() -> None:
 
 
 # What stands on the client uses its public API alone.
-ON_THE_CLIENT = ("integrations", "cluster", "web", "cli")
+ON_THE_CLIENT = ("integrations", "cluster", "web", "mcp", "cli")
 # Public by the reference all the same.
 PUBLIC_ALL_THE_SAME = frozenset({"_data_lock"})
 

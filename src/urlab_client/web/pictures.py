@@ -22,7 +22,7 @@ from urlab_client.protocol.messages.streams import CameraSample
 if TYPE_CHECKING:
     from urlab_client.aio import URLabCameraView, URLabClient
 
-__all__ = ["EncodedPicture", "Feed", "jpeg"]
+__all__ = ["EncodedPicture", "Feed", "encoded"]
 
 _FASTEST_S = 1 / 30
 _LOOK_S = 0.5
@@ -39,10 +39,10 @@ class EncodedPicture:
         head: What the browser is told about it.
     """
 
-    def __init__(self, seq: int, received_ns: int, sim_time: float | None, mode: str, encoded: bytes) -> None:
+    def __init__(self, seq: int, received_ns: int, sim_time: float | None, mode: str, data: bytes) -> None:
         self.seq = seq
         self.received_ns = received_ns
-        self.jpeg = encoded
+        self.jpeg = data
         self.head = msgspec.json.encode({"seq": seq, "received": received_ns / 1e6, "sim_time": sim_time, "mode": mode})
 
     def frame(self) -> bytes:
@@ -129,23 +129,32 @@ class Feed:
 
     async def _publish(self, pixels: Any, received_ns: int, sim_time: float | None) -> None:
         mode = str(self.view.mode)
-        encoded = await anyio.to_thread.run_sync(jpeg, pixels, mode, abandon_on_cancel=True)
+        data = await anyio.to_thread.run_sync(encoded, pixels, mode, abandon_on_cancel=True)
         self._seq += 1
         async with self._changed:
-            self.newest = EncodedPicture(self._seq, received_ns, sim_time, mode, encoded)
+            self.newest = EncodedPicture(self._seq, received_ns, sim_time, mode, data)
             self._changed.notify_all()
 
 
-def jpeg(pixels: Any, mode: str) -> bytes:
-    """Encode a camera's pixels; depth becomes grey, near is bright."""
+def encoded(pixels: Any, mode: str, kind: str = "JPEG", *, size: int | None = None) -> bytes:
+    """Encode a camera's pixels; depth becomes grey, near is bright.
+
+    Args:
+        pixels: What the camera gave.
+        mode: What the camera shows.
+        kind: `JPEG` or `PNG`.
+        size: Longest side in pixels, at most; default: as it is.
+    """
     if mode == CameraMode.DEPTH:
         image = Image.fromarray(_grey(np.asarray(pixels)))
     elif mode == CameraMode.REAL:
         image = Image.fromarray(np.ascontiguousarray(pixels[..., :3]))
     else:
         image = Image.fromarray(np.ascontiguousarray(pixels[..., 2::-1]))
+    if size is not None:
+        image.thumbnail((size, size))
     buffer = io.BytesIO()
-    image.save(buffer, "JPEG", quality=_QUALITY)
+    image.save(buffer, kind, quality=_QUALITY)
     return buffer.getvalue()
 
 
