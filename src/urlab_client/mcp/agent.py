@@ -99,6 +99,11 @@ class Agent:
             on_read_resource=self._read_resource,
         )
 
+    @property
+    def idle(self) -> bool:
+        """Whether no call drives at the moment."""
+        return self._tools.driving.idle
+
     @contextlib.asynccontextmanager
     async def lifespan(self) -> AsyncGenerator[None]:
         """Finish what goes on when the body ends."""

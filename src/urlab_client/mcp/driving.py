@@ -63,6 +63,11 @@ class Driving:
         self._limits = limits
         self._one = anyio.Lock()
 
+    @property
+    def idle(self) -> bool:
+        """Whether no call drives at the moment."""
+        return not self._one.locked()
+
     def seconds(self, seconds: float) -> float:
         """Return a duration of simulation time that a call may take.
 

@@ -34,9 +34,10 @@ class Toolset:
         self.client = console.client
         self.limits = limits
         self.driving = Driving(console, limits)
+        self._known = ""
 
     async def connected(self) -> None:
-        """Wait until the console's session is open.
+        """Wait until the console's session is open, and read where the simulation stands when it is a new one.
 
         Raises:
             URLabConnectionError: It is not, and why.
@@ -55,6 +56,9 @@ class Toolset:
                 f"There is no connection to {self.client.address}: {link.reason or link.state}.",
                 hint="It is tried again all the time. Call again later.",
             )
+        if self._known != self.client.session_id:
+            await self.client.resync()
+            self._known = self.client.session_id
 
     def robot(self, name: str) -> URLabArticulation:
         """Return a robot.
