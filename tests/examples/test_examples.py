@@ -10,8 +10,12 @@ from pathlib import Path
 
 import pytest
 
-# Examples that need an extra which the test command does not install, by the marker of their tests.
-MARKED = {"ray_rollouts": pytest.mark.ray, "view_rerun": pytest.mark.view}
+# Examples that need an extra which the test command does not install, or several seconds: the marker of their tests.
+MARKED = {
+    "ray_rollouts": pytest.mark.ray,
+    "view_rerun": pytest.mark.view,
+    **dict.fromkeys(("gym_env", "record_run", "run_policy", "vector_env"), pytest.mark.long),
+}
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.py"))
 

@@ -60,7 +60,10 @@ def test_gymnasiums_checker_finds_nothing(make_env: MakeEnv, options: dict[str, 
         check_env(make_env(n_substeps=2, reset_noise=0.05, **options), skip_close_check=True)
 
 
-@pytest.mark.parametrize("task_id", TASKS)
+@pytest.mark.parametrize(
+    "task_id",
+    [pytest.param(task, marks=[pytest.mark.long] if number else []) for number, task in enumerate(sorted(TASKS))],
+)
 def test_a_registered_task_passes_the_checker_and_closes_its_server(task_id: str) -> None:
     env = gymnasium.make(task_id, render_mode="rgb_array")
     with without_advice():

@@ -16,18 +16,29 @@ target=$(mkdir -p "$1" && cd "$1" && pwd)
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 project=$(cd "$here/../.." && pwd)
 site=$target/py/Lib/site-packages
+export WINEDLLOVERRIDES='winedbg.exe,winemenubuilder.exe,mscoree,mshtml=d'
 
-fetch() { # fetch FOLDER PACKAGE...: download wheels for Windows
-    local folder=$1
-    shift
-    python3 -m pip --disable-pip-version-check download -q -d "$folder" --platform win_amd64 --python-version 3.11 \
-        --implementation cp --only-binary=:all: "$@"
+# within SECONDS WHAT COMMAND...: say what is done, do it, and end with a line where it fails or takes longer.
+within() {
+    local limit=$1 what=$2 status=0
+    shift 2
+    printf 'Windows: %s, at most %s s\n' "$what" "$limit"
+    timeout --kill-after=5 "$limit" "$@" </dev/null || status=$?
+    case $status in
+        0) return ;;
+        124 | 137) printf 'Windows: %s: given up after %s s\n' "$what" "$limit" ;;
+        *) printf 'Windows: %s: exit code %s\n' "$what" "$status" ;;
+    esac
+    exit 1
 }
+
+pip=(python3 -m pip --disable-pip-version-check -qq --timeout 20 --retries 2)
+windows_wheels=(download --platform win_amd64 --python-version 3.11 --implementation cp --only-binary=:all:)
 
 if [[ ! -e $target/py/python.exe ]]; then
     work=$(mktemp -d)
     # Panda3D's wheel for Windows carries CPython's own DLL and extension modules, to put them beside frozen programs.
-    fetch "$work" --no-deps panda3d
+    within 120 'downloading the interpreter' "${pip[@]}" "${windows_wheels[@]}" -d "$work" --no-deps panda3d
     python3 -m zipfile -e "$work"/panda3d-*.whl "$work/x"
     rm -rf "$target/py" && mkdir -p "$target/py/DLLs"
     cp "$work"/x/deploy_libs/*.pyd "$work"/x/deploy_libs/*.dll "$target/py/DLLs/"
@@ -55,10 +66,13 @@ if [[ ! -e $target/py/python.exe ]]; then
     rm -rf "$work"
 fi
 
-# Under Wine the interpreter starts only where its output is a pipe.
+# Under Wine the interpreter starts only where its output is a pipe. Wine's own .NET and browser, which it would ask for
+# on a screen, and entries in menus are not needed.
 cat >"$target/winpy" <<EOF
 #!/usr/bin/env bash
-export WINEPREFIX=\${WINEPREFIX:-$target/prefix} WINEDEBUG=\${WINEDEBUG:--all} WINEARCH=win64 WINEDLLOVERRIDES=winedbg.exe=d PYTHONDONTWRITEBYTECODE=1
+export WINEPREFIX=\${WINEPREFIX:-$target/prefix} WINEDEBUG=\${WINEDEBUG:--all} WINEARCH=win64 PYTHONDONTWRITEBYTECODE=1
+export WINEDLLOVERRIDES='$WINEDLLOVERRIDES'
+[[ ! -p /dev/stdout ]] || exec wine "$target/py/python.exe" "\$@" 2>&1 </dev/null
 set -o pipefail
 wine "$target/py/python.exe" "\$@" 2>&1 </dev/null | cat
 EOF
@@ -80,7 +94,7 @@ EOF
 )
 if [[ $(cat "$site/.packages" 2>/dev/null) != "${packages[*]}" ]]; then
     wheels=$(mktemp -d)
-    fetch "$wheels" "${packages[@]}"
+    within 180 'downloading the dependencies' "${pip[@]}" "${windows_wheels[@]}" -d "$wheels" "${packages[@]}"
     for wheel in "$wheels"/*.whl; do
         python3 -m zipfile -e "$wheel" "$site/"
     done
@@ -101,9 +115,25 @@ EOF
     printf '%s' "${packages[*]}" >"$site/.packages"
 fi
 built=$(mktemp -d)
-python3 -m pip --disable-pip-version-check wheel -q --no-deps -w "$built" "$project"
+within 120 "building the project's wheel" "${pip[@]}" wheel --no-deps -w "$built" "$project"
 rm -rf "$site"/{urlab_client,pytest_urlab,urlab_client-*.dist-info}
 python3 -m zipfile -e "$built"/*.whl "$site/"
 rm -rf "$built"
-[[ -d $target/prefix ]] || WINEPREFIX=$target/prefix WINEDEBUG=-all WINEARCH=win64 wineboot -i </dev/null >/dev/null 2>&1
-"$target/winpy" -c 'import sys, numpy, zmq, mujoco; print(sys.version, numpy.__version__, zmq.__version__, mujoco.__version__)'
+# What Wine leaves running keeps the output of who started it open: none of ours may be among it.
+kill_wine() {
+    grep -lzsx "WINEPREFIX=$target/prefix" /proc/[0-9]*/environ | cut -d / -f 3 | xargs -r kill -9 || true
+}
+trap kill_wine EXIT
+if [[ ! -e $target/prefix/.made ]]; then
+    rm -rf "$target/prefix"
+    within 120 'setting up Wine' env -u DISPLAY WINEPREFIX="$target/prefix" WINEDEBUG=-all WINEARCH=win64 \
+        bash -c 'exec wineboot -i >/dev/null 2>&1'
+    touch "$target/prefix/.made"
+fi
+rm -f "$target/version"
+within 60 'starting the interpreter' env WINEPREFIX="$target/prefix" bash -c 'exec "$0" "$@" > >(cat >/dev/null)' \
+    "$target/winpy" -c 'import sys, numpy, zmq, mujoco
+with open(sys.argv[1], "w") as file:
+    print(sys.version, numpy.__version__, zmq.__version__, mujoco.__version__, file=file)' "Z:$target/version"
+cat "$target/version"
+trap - EXIT

@@ -171,7 +171,7 @@ class ClientState:
     def describe(self) -> SceneDescription:
         """Return everything that moves, as of the last reply: robots, other bodies, cameras of the scene.
 
-        Sends nothing. `msgspec.json.encode` and `msgspec.to_builtins` take the result as it is.
+        Sends nothing. `to_dict()` and `to_json()` of the result make plain data of it.
         """
         with self._state.mirror.lock:
             described = [entity.describe() for entity in self.entities.values()]

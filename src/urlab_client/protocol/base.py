@@ -16,6 +16,8 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
+from urlab_client.protocol.serializable import Serializable
+
 __all__ = [
     "EDITOR_TIMEOUT_S",
     "ActorId",
@@ -70,7 +72,7 @@ RequiresPieRestart: TypeAlias = Annotated[
 ]
 
 
-class Reply(Struct, tag_field="op", kw_only=True):
+class Reply(Serializable, Struct, tag_field="op", kw_only=True):
     """A successful answer; the tag is its `op` on the wire."""
 
 

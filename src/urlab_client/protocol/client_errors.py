@@ -57,6 +57,16 @@ class URLabError(Exception):
         text = str(self.args[0]) if self.args else ""
         return f"{_sentence(text)} {self.hint}" if self.hint else text
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the error as data that JSON can hold: `error` (the class), `message`, `op`, `code` and `hint`."""
+        return {
+            "error": type(self).__name__,
+            "message": str(self),
+            "op": self.op,
+            "code": self.code,
+            "hint": self.hint,
+        }
+
     def __reduce__(self) -> tuple[Any, ...]:
         return _rebuild, (type(self), self.args, dict(self.__dict__))
 

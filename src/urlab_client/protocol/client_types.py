@@ -12,6 +12,7 @@ from msgspec.structs import asdict
 from urlab_client.protocol.enums import StepMode, Transport
 from urlab_client.protocol.features import Features
 from urlab_client.protocol.messages.session import InstanceInfo
+from urlab_client.protocol.serializable import Serializable
 
 __all__ = [
     "ClientConfig",
@@ -31,7 +32,7 @@ class Verdict(StrEnum):
     PROBLEM = "problem"
 
 
-class Finding(Struct, frozen=True):
+class Finding(Serializable, Struct, frozen=True):
     """One thing that `client.explain()` looked at.
 
     Attributes:
@@ -45,7 +46,7 @@ class Finding(Struct, frozen=True):
     text: str
 
 
-class Diagnosis(Struct, frozen=True):
+class Diagnosis(Serializable, Struct, frozen=True):
     """What `client.explain()` found, from the sockets inwards; `print()` shows it line by line.
 
     Attributes:
@@ -69,7 +70,7 @@ class Diagnosis(Struct, frozen=True):
         return "\n".join(f"{finding.verdict:<8}{finding.subject}: {finding.text}" for finding in self.findings)
 
 
-class Resync(Struct, frozen=True, kw_only=True):
+class Resync(Serializable, Struct, frozen=True, kw_only=True):
     """What `client.resync()` found out.
 
     Attributes:
@@ -98,7 +99,7 @@ class Resync(Struct, frozen=True, kw_only=True):
     settled: bool = True
 
 
-class ClientConfig(Struct, frozen=True, kw_only=True):
+class ClientConfig(Serializable, Struct, frozen=True, kw_only=True):
     """The arguments a client was made with; see `URLabClient` for their meaning."""
 
     address: str = "tcp://localhost"
@@ -125,7 +126,7 @@ class ClientConfig(Struct, frozen=True, kw_only=True):
         return asdict(self)
 
 
-class ServerInfo(Struct, frozen=True, kw_only=True):
+class ServerInfo(Serializable, Struct, frozen=True, kw_only=True):
     """What a server is and can do; see `client.server`.
 
     Attributes:

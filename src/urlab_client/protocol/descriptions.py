@@ -7,6 +7,7 @@ from typing import Literal
 from msgspec import Struct
 
 from urlab_client.protocol.base import Quat, Vec3
+from urlab_client.protocol.serializable import Serializable
 
 __all__ = [
     "ActuatorDescription",
@@ -29,7 +30,7 @@ SetPointMeaning = Literal["force", "position", "velocity", ""]
 """What an actuator does with a set-point: make a force of it, or pull towards it; empty where that is not known."""
 
 
-class Pose(Struct, frozen=True, kw_only=True):
+class Pose(Serializable, Struct, frozen=True, kw_only=True):
     """Where something is, in the world frame.
 
     Attributes:
@@ -41,7 +42,7 @@ class Pose(Struct, frozen=True, kw_only=True):
     quaternion: Quat
 
 
-class JointDescription(Struct, frozen=True, kw_only=True):
+class JointDescription(Serializable, Struct, frozen=True, kw_only=True):
     """One joint and where it is.
 
     Attributes:
@@ -61,7 +62,7 @@ class JointDescription(Struct, frozen=True, kw_only=True):
     velocity: float | list[float]
 
 
-class ActuatorDescription(Struct, frozen=True, kw_only=True):
+class ActuatorDescription(Serializable, Struct, frozen=True, kw_only=True):
     """One actuator and what it is told.
 
     Attributes:
@@ -88,7 +89,7 @@ class ActuatorDescription(Struct, frozen=True, kw_only=True):
     set_point: float
 
 
-class SensorDescription(Struct, frozen=True, kw_only=True):
+class SensorDescription(Serializable, Struct, frozen=True, kw_only=True):
     """One sensor and what it reads.
 
     Attributes:
@@ -106,7 +107,7 @@ class SensorDescription(Struct, frozen=True, kw_only=True):
     reading: list[float] | None
 
 
-class CameraDescription(Struct, frozen=True, kw_only=True):
+class CameraDescription(Serializable, Struct, frozen=True, kw_only=True):
     """One camera.
 
     Attributes:
@@ -124,7 +125,7 @@ class CameraDescription(Struct, frozen=True, kw_only=True):
     fovy: float
 
 
-class ControllerDescription(Struct, frozen=True, kw_only=True):
+class ControllerDescription(Serializable, Struct, frozen=True, kw_only=True):
     """The controller of an articulation.
 
     Attributes:
@@ -136,7 +137,7 @@ class ControllerDescription(Struct, frozen=True, kw_only=True):
     in_force: bool
 
 
-class ArticulationDescription(Struct, frozen=True, kw_only=True):
+class ArticulationDescription(Serializable, Struct, frozen=True, kw_only=True):
     """One robot: what it is made of, where it is, what it is told.
 
     Joints and sensors are known with a local model only.
@@ -166,7 +167,7 @@ class ArticulationDescription(Struct, frozen=True, kw_only=True):
     control_owner: str | None
 
 
-class EntityDescription(Struct, frozen=True, kw_only=True):
+class EntityDescription(Serializable, Struct, frozen=True, kw_only=True):
     """One dynamic body that is not part of a robot.
 
     Attributes:
@@ -180,7 +181,7 @@ class EntityDescription(Struct, frozen=True, kw_only=True):
     pose: Pose | None
 
 
-class SceneDescription(Struct, frozen=True, kw_only=True):
+class SceneDescription(Serializable, Struct, frozen=True, kw_only=True):
     """Everything that moves, as of the last reply.
 
     Attributes:

@@ -159,6 +159,12 @@ class URLabRPCError(URLabError):
         self.message = message
         self.details = dict(details or {})
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the error as data that JSON can hold; besides what every error has, `details`."""
+        from urlab_client.protocol.serializable import plain  # noqa: PLC0415  # errors alone need no NumPy
+
+        return {**super().to_dict(), "details": plain(self.details, "list")}
+
 
 def rpc_error(
     code: str, message: str, *, op: str | None = None, details: Mapping[str, Any] | None = None

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.layouts import BytesLike, damaged
+from urlab_client.protocol.serializable import Serializable
 
 __all__ = [
     "CameraImage",
@@ -32,7 +33,7 @@ _MAX_SIDE = 16_384  # what graphics cards render at most
 _CENTIMETRES = np.float32(100)
 
 
-class CameraImage(Struct, frozen=True, eq=False):
+class CameraImage(Serializable, Struct, frozen=True, eq=False):
     """One picture.
 
     Attributes:

@@ -18,6 +18,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from urlab_client.protocol.layouts import INT32, BytesLike, check_size, damaged, floats32, vector
+from urlab_client.protocol.serializable import Serializable
 from urlab_client.protocol.topics import SCENE_SIZES, StreamTopic, TopicKind
 
 __all__ = ["ActionsRow", "BaseStateRow", "JointRow", "Row", "SceneRow", "SensorRow", "TwistRow", "decode_row"]
@@ -27,7 +28,7 @@ _SENSOR = Layout("<ii")
 _TWIST = Layout("<fff")
 
 
-class JointRow(Struct, frozen=True):
+class JointRow(Serializable, Struct, frozen=True):
     """State of a hinge or slide joint. Of a ball joint it carries only the first components.
 
     Attributes:
@@ -56,7 +57,7 @@ class JointRow(Struct, frozen=True):
             return INT32.pack(self.id) + floats32([self.position, self.velocity, self.acceleration]).tobytes()
 
 
-class BaseStateRow(Struct, frozen=True, eq=False):
+class BaseStateRow(Serializable, Struct, frozen=True, eq=False):
     """State of a free joint.
 
     Attributes:
@@ -96,7 +97,7 @@ class BaseStateRow(Struct, frozen=True, eq=False):
         return floats32(np.concatenate(parts)).tobytes()
 
 
-class SensorRow(Struct, frozen=True, eq=False):
+class SensorRow(Serializable, Struct, frozen=True, eq=False):
     """Reading of one sensor.
 
     Attributes:
@@ -127,7 +128,7 @@ class SensorRow(Struct, frozen=True, eq=False):
         return _SENSOR.pack(self.id, values.size) + vector("values", values, values.size).tobytes()
 
 
-class TwistRow(Struct, frozen=True):
+class TwistRow(Serializable, Struct, frozen=True):
     """The twist commanded to an articulation by keyboard or `set_twist`, not a measurement.
 
     Attributes:
@@ -151,7 +152,7 @@ class TwistRow(Struct, frozen=True):
         return floats32([self.vx, self.vy, self.yaw_rate]).tobytes()
 
 
-class ActionsRow(Struct, frozen=True):
+class ActionsRow(Serializable, Struct, frozen=True):
     """Action keys held down. Sent only on ticks with at least one: a tick without the row means none.
 
     Attributes:
@@ -176,7 +177,7 @@ class ActionsRow(Struct, frozen=True):
         return INT32.pack(self.mask)
 
 
-class SceneRow(Struct, frozen=True, eq=False):
+class SceneRow(Serializable, Struct, frozen=True, eq=False):
     """One quantity of a body that belongs to no articulation, in MuJoCo's order and precision.
 
     Attributes:

@@ -8,6 +8,7 @@ from typing import Protocol, TypeVar
 from msgspec import Struct
 
 from urlab_client.protocol.base import Quat, Vec3
+from urlab_client.protocol.serializable import Serializable
 
 __all__ = [
     "ActorBounds",
@@ -33,7 +34,7 @@ class HasArticulations(Protocol[A_co]):
     def articulations_by_id(self) -> Mapping[str, A_co]: ...
 
 
-class URLabAsset(Struct):
+class URLabAsset(Serializable, Struct):
     """One robot to place with `scene.apply_scene`.
 
     Attributes:
@@ -53,7 +54,7 @@ class URLabAsset(Struct):
     scale: Sequence[float] = (1, 1, 1)
 
 
-class URLabBlueprint(Struct, frozen=True):
+class URLabBlueprint(Serializable, Struct, frozen=True):
     """An imported MJCF, ready for `scene.spawn_actor`.
 
     Attributes:
@@ -67,7 +68,7 @@ class URLabBlueprint(Struct, frozen=True):
     imported_now: bool
 
 
-class URLabSpawnHandle(Struct, frozen=True):
+class URLabSpawnHandle(Serializable, Struct, frozen=True):
     """A placed actor.
 
     Attributes:
@@ -95,7 +96,7 @@ class URLabSpawnHandle(Struct, frozen=True):
         return client.articulations_by_id.get(self.actor_id)
 
 
-class URLabLightHandle(Struct, frozen=True):
+class URLabLightHandle(Serializable, Struct, frozen=True):
     """A placed light.
 
     Attributes:
@@ -121,7 +122,7 @@ class URLabLightHandle(Struct, frozen=True):
     requires_pie_restart: bool
 
 
-class ActorInfo(Struct, frozen=True):
+class ActorInfo(Serializable, Struct, frozen=True):
     """One actor of the world.
 
     Attributes:
@@ -162,7 +163,10 @@ class ActorInfo(Struct, frozen=True):
 
 
 class BlueprintInfo(
-    Struct, frozen=True, rename={"class_path": "blueprint_class_path", "short_name": "blueprint_short_name"}
+    Serializable,
+    Struct,
+    frozen=True,
+    rename={"class_path": "blueprint_class_path", "short_name": "blueprint_short_name"},
 ):
     """One articulation blueprint of the project.
 
@@ -179,7 +183,7 @@ class BlueprintInfo(
     parent_class: str
 
 
-class SceneActor(Struct, frozen=True):
+class SceneActor(Serializable, Struct, frozen=True):
     """One actor of a snapshot.
 
     Attributes:
@@ -211,7 +215,7 @@ class SceneActor(Struct, frozen=True):
     cameras: tuple[str, ...] = ()
 
 
-class SceneSnapshot(Struct, frozen=True):
+class SceneSnapshot(Serializable, Struct, frozen=True):
     """Every visible actor with articulation metadata.
 
     Attributes:
@@ -225,7 +229,7 @@ class SceneSnapshot(Struct, frozen=True):
     level_path: str
 
 
-class ActorHierarchyNode(Struct, frozen=True, rename={"actor_class": "class"}):
+class ActorHierarchyNode(Serializable, Struct, frozen=True, rename={"actor_class": "class"}):
     """An actor and the actors attached to it.
 
     Attributes:
@@ -241,7 +245,7 @@ class ActorHierarchyNode(Struct, frozen=True, rename={"actor_class": "class"}):
     children: list[ActorHierarchyNode]
 
 
-class ActorBounds(Struct, frozen=True):
+class ActorBounds(Serializable, Struct, frozen=True):
     """Axis-aligned box in the world frame, metres.
 
     Attributes:

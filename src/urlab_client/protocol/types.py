@@ -8,6 +8,7 @@ from msgspec import Struct
 
 from urlab_client.protocol.base import Quat, Vec3
 from urlab_client.protocol.enums import PIEState
+from urlab_client.protocol.serializable import Serializable
 
 __all__ = [
     "CameraPose",
@@ -27,7 +28,7 @@ __all__ = [
 ]
 
 
-class PIEStartResult(Struct):
+class PIEStartResult(Serializable, Struct):
     """How `sim.start()` ended.
 
     Attributes:
@@ -47,7 +48,7 @@ class PIEStartResult(Struct):
         return self.state == PIEState.READY
 
 
-class UploadProgress(Struct, frozen=True, kw_only=True):
+class UploadProgress(Serializable, Struct, frozen=True, kw_only=True):
     """How far `scene.upload_model` is.
 
     Attributes:
@@ -61,7 +62,7 @@ class UploadProgress(Struct, frozen=True, kw_only=True):
     total_bytes: int
 
 
-class PIEStatus(Struct, frozen=True):
+class PIEStatus(Serializable, Struct, frozen=True):
     """Where Play-In-Editor stands.
 
     Attributes:
@@ -75,7 +76,7 @@ class PIEStatus(Struct, frozen=True):
     sim_time: float | None = None
 
 
-class SimOptions(Struct, omit_defaults=True):
+class SimOptions(Serializable, Struct, omit_defaults=True):
     """The `mjOption` fields the server exposes. None means "not mentioned".
 
     Attributes:
@@ -131,7 +132,7 @@ class SimOptions(Struct, omit_defaults=True):
     max_worker_threads: int | None = None
 
 
-class CameraPose(Struct, frozen=True):
+class CameraPose(Serializable, Struct, frozen=True):
     """Pose of the editor's viewport camera; local +x looks forward, +z is up.
 
     Attributes:
@@ -147,7 +148,7 @@ class CameraPose(Struct, frozen=True):
     fov: float
 
 
-class KeyframeInfo(Struct, frozen=True):
+class KeyframeInfo(Serializable, Struct, frozen=True):
     """One compiled keyframe, vectors in compiled order.
 
     Attributes:
@@ -169,7 +170,7 @@ class KeyframeInfo(Struct, frozen=True):
     mocap_quat: list[float]
 
 
-class Contact(Struct, frozen=True):
+class Contact(Serializable, Struct, frozen=True):
     """One active contact.
 
     Attributes:
@@ -193,7 +194,7 @@ class Contact(Struct, frozen=True):
     force: tuple[float, float, float, float, float, float]
 
 
-class JobStatus(Struct, frozen=True):
+class JobStatus(Serializable, Struct, frozen=True):
     """How far an editor's job is.
 
     Attributes:
@@ -209,7 +210,7 @@ class JobStatus(Struct, frozen=True):
     elapsed_s: float
 
 
-class ContactsResult(Struct, frozen=True):
+class ContactsResult(Serializable, Struct, frozen=True):
     """Active contacts at one moment.
 
     Attributes:
@@ -223,7 +224,7 @@ class ContactsResult(Struct, frozen=True):
     contacts: list[Contact]
 
 
-class MocapPose(Struct, frozen=True):
+class MocapPose(Serializable, Struct, frozen=True):
     """Stored pose of a mocap body.
 
     Attributes:
@@ -237,7 +238,7 @@ class MocapPose(Struct, frozen=True):
     quat: Quat
 
 
-class RecordingHandle(Struct, frozen=True):
+class RecordingHandle(Serializable, Struct, frozen=True):
     """A running recording.
 
     Attributes:
@@ -249,7 +250,7 @@ class RecordingHandle(Struct, frozen=True):
     max_duration_s: float
 
 
-class RecordingSummary(Struct, frozen=True):
+class RecordingSummary(Serializable, Struct, frozen=True):
     """A finished recording.
 
     Attributes:
@@ -261,7 +262,7 @@ class RecordingSummary(Struct, frozen=True):
     sim_duration_s: float
 
 
-class ReplaySession(Struct, frozen=True):
+class ReplaySession(Serializable, Struct, frozen=True):
     """A loaded replay session.
 
     Attributes:
@@ -271,7 +272,7 @@ class ReplaySession(Struct, frozen=True):
     name: str
 
 
-class ReplayStatus(Struct, frozen=True):
+class ReplayStatus(Serializable, Struct, frozen=True):
     """A started replay.
 
     Attributes:

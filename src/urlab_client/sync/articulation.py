@@ -280,7 +280,7 @@ class URLabArticulation(URLabEntity, twin=aio.URLabArticulation):
     def describe(self) -> ArticulationDescription:
         """Return its parts, its state and its set-points, as of the last reply.
 
-        `msgspec.json.encode` and `msgspec.to_builtins` accept the result directly.
+        `to_dict()` and `to_json()` of the result make plain data of it.
         """
         return self._aio.describe()
 

@@ -18,6 +18,7 @@ from urlab_client.integrations.policy.policy import Policy
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.enums import ActuatorType, ControllerKind, ControlMode, StepMode
 from urlab_client.protocol.errors import URLabError
+from urlab_client.protocol.serializable import Serializable
 from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
 
@@ -31,7 +32,7 @@ OnAction = Callable[["PolicyRun"], None]
 """Called after each action with the run so far."""
 
 
-class PolicyRun(Struct):
+class PolicyRun(Serializable, Struct):
     """What came of running a policy.
 
     Attributes:

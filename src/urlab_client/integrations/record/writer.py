@@ -37,6 +37,7 @@ from urlab_client.integrations._feed.scene_messages import SceneMessages, Simula
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import CameraFrame, EntityState, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
+from urlab_client.protocol.serializable import Serializable
 
 __all__ = ["FORMAT", "RecorderStats", "RecordingError", "WriterOptions", "WriterThread"]
 
@@ -82,7 +83,7 @@ class WriterOptions:
     about: Mapping[str, str]
 
 
-class RecorderStats(Struct, kw_only=True, frozen=True):
+class RecorderStats(Serializable, Struct, kw_only=True, frozen=True):
     """Counters of a recording.
 
     Attributes:

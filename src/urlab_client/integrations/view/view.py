@@ -24,6 +24,7 @@ from urlab_client.protocol.base import Floats
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import EntityState, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
+from urlab_client.protocol.serializable import Serializable
 from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
 
@@ -34,7 +35,7 @@ log = logging.getLogger("urlab_client.view")
 _NS = 1_000_000_000
 
 
-class ViewStats(Struct, kw_only=True, frozen=True):
+class ViewStats(Serializable, Struct, kw_only=True, frozen=True):
     """Counters of a view.
 
     Attributes:

@@ -7,6 +7,7 @@ from typing import Annotated, Final
 from msgspec import Struct
 
 from urlab_client.protocol.base import Needs, Op, Reply, Request, doc
+from urlab_client.protocol.serializable import Serializable
 
 __all__ = [
     "OPS",
@@ -21,14 +22,14 @@ __all__ = [
 ]
 
 
-class CameraTransports(Struct, kw_only=True, omit_defaults=True):
+class CameraTransports(Serializable, Struct, kw_only=True, omit_defaults=True):
     """Where a camera is to stream: what is not mentioned is switched off, unless nothing is mentioned."""
 
     zmq: Annotated[bool | None, doc("On its socket.")] = None
     shm: Annotated[bool | None, doc("In shared memory.")] = None
 
 
-class CameraStreaming(Struct, kw_only=True, omit_defaults=True):
+class CameraStreaming(Serializable, Struct, kw_only=True, omit_defaults=True):
     """Where a camera streams."""
 
     streaming: Annotated[bool, doc("Whether it streams at all.")]
@@ -50,7 +51,7 @@ class SetCameraStreaming(Request[SetCameraStreamingOk], tag="set_camera_streamin
     cameras: Annotated[dict[str, bool | CameraTransports], doc("Camera to on or off, or to where it is to stream.")]
 
 
-class CameraDelay(Struct, kw_only=True, omit_defaults=True):
+class CameraDelay(Serializable, Struct, kw_only=True, omit_defaults=True):
     """Latency that a camera is to have."""
 
     delay_s: Annotated[float, doc("Seconds between a picture and its release.")] = 0.0
@@ -61,7 +62,7 @@ class CameraDelay(Struct, kw_only=True, omit_defaults=True):
     max_fps: Annotated[float | None, doc("Pictures per second at most, 0 for no limit; None keeps it.")] = None
 
 
-class CameraDelayInForce(Struct, kw_only=True):
+class CameraDelayInForce(Serializable, Struct, kw_only=True):
     """Latency that a camera has."""
 
     delay_s: Annotated[float, doc("Seconds between a picture and its release.")]

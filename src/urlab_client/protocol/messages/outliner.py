@@ -22,6 +22,7 @@ from urlab_client.protocol.base import (
     doc,
 )
 from urlab_client.protocol.scene_types import ActorBounds, BlueprintInfo
+from urlab_client.protocol.serializable import Serializable
 
 __all__ = [
     "OPS",
@@ -44,7 +45,7 @@ __all__ = [
 ]
 
 
-class QuickConvert(Struct, kw_only=True):
+class QuickConvert(Serializable, Struct, kw_only=True):
     """Settings that make a static mesh a MuJoCo body."""
 
     static: Annotated[bool, doc("No free joint: the body is fixed.")]
@@ -54,7 +55,7 @@ class QuickConvert(Struct, kw_only=True):
     friction: Annotated[Vec3, doc("Sliding, torsional, rolling.")]
 
 
-class ActorRow(Struct, kw_only=True, omit_defaults=True):
+class ActorRow(Serializable, Struct, kw_only=True, omit_defaults=True):
     """One actor. `list_actors` sends the flags, `find_actors` the tags."""
 
     name: Annotated[str, doc("Engine actor name.")]

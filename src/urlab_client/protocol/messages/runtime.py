@@ -20,6 +20,7 @@ from urlab_client.protocol.base import (
     Vec3,
     doc,
 )
+from urlab_client.protocol.serializable import Serializable
 from urlab_client.protocol.types import Contact, KeyframeInfo, MocapPose, SimOptions
 
 __all__ = [
@@ -178,7 +179,7 @@ class GetContactsOk(Reply, tag="get_contacts_ok", kw_only=True):
     contacts: Annotated[list[Contact], doc("In the order of `mjData.contact`.")]
 
 
-class ContactFilter(Struct, kw_only=True, omit_defaults=True):
+class ContactFilter(Serializable, Struct, kw_only=True, omit_defaults=True):
     """Exact compiled names, combined with AND and compared by position in the contact."""
 
     body1: Annotated[str | None, doc("Body of the first geom.")] = None

@@ -24,6 +24,7 @@ from urlab_client.protocol.base import (
     doc,
 )
 from urlab_client.protocol.scene_types import ActorHierarchyNode
+from urlab_client.protocol.serializable import Serializable
 
 __all__ = [
     "OPS",
@@ -167,7 +168,7 @@ class SpawnActor(Request[SpawnActorOk], tag="spawn_actor", kw_only=True, omit_de
     scale: Annotated[Vec3, doc("Scale factors.")] = (1.0, 1.0, 1.0)
 
 
-class GridCell(Struct, kw_only=True):
+class GridCell(Serializable, Struct, kw_only=True):
     """One actor of a grid."""
 
     actor_id: ActorId
@@ -312,7 +313,7 @@ class ActorHierarchy(Request[ActorHierarchyOk], tag="actor_hierarchy", kw_only=T
     target_by: TargetBy = "actor_id"
 
 
-class UrlabBlock(Struct, kw_only=True):
+class UrlabBlock(Serializable, Struct, kw_only=True):
     """Articulation metadata of a snapshot row."""
 
     mj_class: Annotated[str, doc("Always `articulation`.")]
@@ -322,7 +323,7 @@ class UrlabBlock(Struct, kw_only=True):
     cameras: Annotated[list[str], doc("Camera names.")]
 
 
-class SnapshotRow(Struct, kw_only=True, omit_defaults=True):
+class SnapshotRow(Serializable, Struct, kw_only=True, omit_defaults=True):
     """One actor of a snapshot."""
 
     name: Annotated[str, doc("Engine actor name.")]

@@ -9,6 +9,7 @@ import msgspec
 from msgspec import Struct, field
 
 from urlab_client.protocol.base import ControlRequest, Effect, Floats, Needs, Op, QuatWXYZ, Reply, Request, Vec3, doc
+from urlab_client.protocol.serializable import Serializable
 
 __all__ = [
     "NOT_SENT",
@@ -70,28 +71,28 @@ class ErrorReply(Reply, tag="error", kw_only=True, omit_defaults=True):
     lease_id: Annotated[str | None, doc("Lease of the holder, with code `busy`.")] = None
 
 
-class Clock(Struct, kw_only=True):
+class Clock(Serializable, Struct, kw_only=True):
     """A point in time as two integers, truncated, not rounded."""
 
     sec: Annotated[int, doc("Whole seconds.")]
     nsec: Annotated[int, doc("Nanoseconds within the second.")]
 
 
-class TwistState(Struct, kw_only=True):
+class TwistState(Serializable, Struct, kw_only=True):
     """The last commanded twist, not a measured velocity."""
 
     linear: Annotated[Vec3, doc("(vx, vy, 0), m/s, base frame.")]
     angular: Annotated[Vec3, doc("(0, 0, yaw rate), rad/s, base frame.")]
 
 
-class BodyPose(Struct, kw_only=True):
+class BodyPose(Serializable, Struct, kw_only=True):
     """World pose of one body."""
 
     xpos: Annotated[Vec3, doc("Position, metres, world frame.")]
     xquat: QuatWXYZ
 
 
-class ArticulationState(Struct, kw_only=True, omit_defaults=True):
+class ArticulationState(Serializable, Struct, kw_only=True, omit_defaults=True):
     """State of one articulation. Arrays follow its joints or actuators in ascending MuJoCo id."""
 
     qpos: Annotated[Floats, doc("Joint positions, shape (nq of the articulation,).")]
@@ -122,7 +123,7 @@ class ArticulationState(Struct, kw_only=True, omit_defaults=True):
     actions: Annotated[int | None, doc("Bit field of pressed action keys, bits 0 to 9.")] = None
 
 
-class EntityState(Struct, kw_only=True, omit_defaults=True):
+class EntityState(Serializable, Struct, kw_only=True, omit_defaults=True):
     """State of one dynamic body outside any articulation."""
 
     xpos: Annotated[Vec3, doc("Position, metres, world frame.")]
@@ -131,7 +132,7 @@ class EntityState(Struct, kw_only=True, omit_defaults=True):
     qvel: Annotated[Floats | None, doc("Free joint velocity, shape (6,): linear world, angular body frame.")] = None
 
 
-class CameraFrame(Struct, kw_only=True, omit_defaults=True):
+class CameraFrame(Serializable, Struct, kw_only=True, omit_defaults=True):
     """Pixels of one camera, top row first."""
 
     width: Annotated[int, doc("Pixels per row.")]
@@ -142,7 +143,7 @@ class CameraFrame(Struct, kw_only=True, omit_defaults=True):
     data: Annotated[bytes, doc("width * height * 4 bytes.")]
 
 
-class Perturbation(Struct, kw_only=True):
+class Perturbation(Serializable, Struct, kw_only=True):
     """A mouse drag in the editor's viewport."""
 
     body_id: Annotated[int, doc("MuJoCo body id, above 0.")]
@@ -170,7 +171,7 @@ class StateReply(Reply, kw_only=True, omit_defaults=True):
             self.per_articulation = self.arts
 
 
-class ReplayProgress(Struct, kw_only=True):
+class ReplayProgress(Serializable, Struct, kw_only=True):
     """Where a replay stands."""
 
     current_frame: Annotated[int, doc("Index, from 0, of the newest frame that has been reached.")]
@@ -199,7 +200,7 @@ class StepOk(StateReply, tag="step_ok", kw_only=True, omit_defaults=True):
             self.entities = self.scene
 
 
-class ArticulationCommand(Struct, kw_only=True, omit_defaults=True):
+class ArticulationCommand(Serializable, Struct, kw_only=True, omit_defaults=True):
     """What a direct or live step tells one articulation."""
 
     ctrl: Annotated[list[float] | None, doc("Set-points, in the order of the state's `ctrl`.")] = None
@@ -259,7 +260,7 @@ class Forward(Request[ForwardOk], tag="forward", kw_only=True):
     """Run `mj_forward`: kinematics and dynamics without integration; time and step counter stay."""
 
 
-class ControllerInfo(Struct, kw_only=True):
+class ControllerInfo(Serializable, Struct, kw_only=True):
     """Controller attached to an articulation."""
 
     kind: Annotated[str, doc("`pd`; the plugin's passthrough controller says `base`.")]
@@ -267,7 +268,7 @@ class ControllerInfo(Struct, kw_only=True):
     schema: Annotated[dict[str, dict[str, Any]], doc("Parameter name to `{type, dtype, min}`.")]
 
 
-class CameraInfo(Struct, kw_only=True):
+class CameraInfo(Serializable, Struct, kw_only=True):
     """One camera of an articulation."""
 
     mode: Annotated[str, doc("`real`, `depth`, `semantic` or `instance`.")]
@@ -277,7 +278,7 @@ class CameraInfo(Struct, kw_only=True):
     zmq_topic: Annotated[str, doc("Topic without the trailing space that messages carry.")]
 
 
-class OriginalNames(Struct, kw_only=True):
+class OriginalNames(Serializable, Struct, kw_only=True):
     """Live short name to MJCF name, for elements whose name had to change."""
 
     actuators: Annotated[dict[str, str], doc("Renamed actuators.")] = {}
@@ -286,7 +287,7 @@ class OriginalNames(Struct, kw_only=True):
     bodies: Annotated[dict[str, str], doc("Renamed bodies.")] = {}
 
 
-class ArticulationInfo(Struct, kw_only=True, omit_defaults=True):
+class ArticulationInfo(Serializable, Struct, kw_only=True, omit_defaults=True):
     """One articulation as the handshake describes it."""
 
     prefix: Annotated[str, doc("Articulation key, no trailing underscore.")]
@@ -314,7 +315,7 @@ class ArticulationInfo(Struct, kw_only=True, omit_defaults=True):
         return self.prefix if self.actor_name is None else self.actor_name
 
 
-class EntityInfo(Struct, kw_only=True, omit_defaults=True):
+class EntityInfo(Serializable, Struct, kw_only=True, omit_defaults=True):
     """One dynamic body outside any articulation."""
 
     id: Annotated[int, doc("MuJoCo body id.")]
@@ -332,7 +333,7 @@ class RobotEntry(ArticulationInfo, kw_only=True, omit_defaults=True):
     actor_id: Annotated[str, doc("Stable id; empty when unset.")] = ""
 
 
-class InstanceInfo(Struct, kw_only=True):
+class InstanceInfo(Serializable, Struct, kw_only=True):
     """Which of several servers this is."""
 
     instance_id: Annotated[str, doc("Configured id, else `live` or `instance_<index>`.")] = ""
@@ -350,7 +351,7 @@ class InstanceInfo(Struct, kw_only=True):
     )
 
 
-class ShmRpcInfo(Struct, kw_only=True):
+class ShmRpcInfo(Serializable, Struct, kw_only=True):
     """Where requests go in shared memory."""
 
     session: Annotated[str, doc("Name of the regions' session.")]
@@ -412,7 +413,7 @@ class Hello(Request[HelloOk], tag="hello", kw_only=True, omit_defaults=True):
     include_assets: Annotated[bool, doc("Ship the model as MJCF with its assets, too.")] = False
 
 
-class OpInfo(Struct, kw_only=True, omit_defaults=True):
+class OpInfo(Serializable, Struct, kw_only=True, omit_defaults=True):
     """One op as the server lists it."""
 
     name: Annotated[str, doc("Name of the op.")]

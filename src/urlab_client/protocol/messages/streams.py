@@ -16,6 +16,7 @@ from urlab_client.protocol.layouts import BytesLike
 from urlab_client.protocol.messages.session import ArticulationState, Clock, EntityState, StateReply, StepOk
 from urlab_client.protocol.pixels import Pixels
 from urlab_client.protocol.rows import Row
+from urlab_client.protocol.serializable import Serializable
 from urlab_client.protocol.topics import TopicKind
 
 __all__ = [
@@ -49,7 +50,7 @@ class StreamPolicy(StrEnum):
     """Every message, up to a limit."""
 
 
-class StreamItem(Struct, kw_only=True, omit_defaults=True):
+class StreamItem(Serializable, Struct, kw_only=True, omit_defaults=True):
     """How an item of a stream was delivered."""
 
     seq: Annotated[int, doc("Number of the message among all that this stream received, from 1.")] = 0
@@ -66,7 +67,7 @@ class StreamItem(Struct, kw_only=True, omit_defaults=True):
     recv_wall_time_ns: Annotated[int, doc("This machine's UTC clock when the message arrived, nanoseconds.")] = 0
 
 
-class StreamStats(Struct, kw_only=True, frozen=True):
+class StreamStats(Serializable, Struct, kw_only=True, frozen=True):
     """Counters of one stream. What was received is delivered, dropped, malformed or still waiting."""
 
     received: Annotated[int, doc("Messages received.")]

@@ -7,6 +7,7 @@ from typing import Annotated, Final
 from msgspec import Struct, field
 
 from urlab_client.protocol.base import Needs, Op, Reply, Request, doc
+from urlab_client.protocol.serializable import Serializable
 
 __all__ = [
     "MAX_ASSETS",
@@ -29,7 +30,7 @@ MAX_ASSETS: Final = 4096
 MAX_CHUNK_BYTES: Final = 4 << 20
 
 
-class AssetDigest(Struct, kw_only=True):
+class AssetDigest(Serializable, Struct, kw_only=True):
     """One file of a model."""
 
     name: Annotated[str, doc("Bare file name, as the document says it.")]

@@ -1,0 +1,236 @@
+"""Structs as fields of pydantic models: what pydantic asks for, as the plain dictionaries that it takes. No I/O.
+
+Pydantic is not imported: it calls this, from the hooks of `Serializable`. Values go out as `plain` makes them.
+"""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import Callable, Mapping
+from contextvars import ContextVar
+from types import UnionType
+from typing import Annotated, Any, Final, Literal, Union, cast, get_args, get_origin
+
+import msgspec
+import numpy as np
+from msgspec import NODEFAULT, Struct
+from numpy.typing import NDArray
+
+from urlab_client.protocol.serializable import plain
+
+__all__ = ["core_schema", "json_schema", "kinds_of"]
+
+Schema = dict[str, Any]
+
+_UNDER_WAY: ContextVar[frozenset[str]] = ContextVar("structs that are being described")
+
+
+def core_schema(struct: type[Struct], handler: Any) -> Schema:
+    """Return the schema by which pydantic validates and serialises a struct.
+
+    Args:
+        struct: The struct, or the base of several kinds, which then stands for any of them.
+        handler: Pydantic's `GetCoreSchemaHandler`.
+    """
+    ref = f"{struct.__module__}.{struct.__qualname__}:{id(struct)}"
+    under_way = _UNDER_WAY.get(frozenset())
+    if ref in under_way:
+        return {"type": "definition-ref", "schema_ref": ref}
+    token = _UNDER_WAY.set(under_way | {ref})
+    try:
+        kinds = kinds_of(struct)
+        inner = _one_of(kinds, handler) if kinds else _of_fields(struct, handler)
+    finally:
+        _UNDER_WAY.reset(token)
+    return {
+        **inner,
+        "ref": ref,
+        "serialization": {"type": "function-plain", "function": _serialized, "info_arg": True},
+    }
+
+
+def json_schema(struct: type[Struct], schema: Schema, handler: Any) -> Schema:
+    """Return the JSON schema of a struct, with its descriptions.
+
+    Args:
+        struct: The struct.
+        schema: What `core_schema` returned.
+        handler: Pydantic's `GetJsonSchemaHandler`.
+    """
+    made = handler(schema)
+    own = handler.resolve_ref_schema(made)
+    text = struct.__doc__ or ""
+    own |= {"title": struct.__name__, "description": text.partition("\n\n")[0].strip()}
+    said = dict(_ATTRIBUTE.findall(text.partition("Attributes:\n")[2]))
+    properties: dict[str, Schema] = own.get("properties", {})
+    for field in msgspec.structs.fields(struct):
+        description = _annotated(field.type) or " ".join(said.get(field.name, "").split())
+        if description and field.name in properties:
+            properties[field.name]["description"] = description
+    return made
+
+
+_ATTRIBUTE = re.compile(r"^ {8}(\w+): (.*(?:\n {9,}.*)*)", re.MULTILINE)
+
+
+def _annotated(annotation: Any) -> str:
+    notes = get_args(annotation)[1:] if get_origin(annotation) is Annotated else ()
+    return next((note.description for note in notes if isinstance(note, msgspec.Meta) and note.description), "")
+
+
+def kinds_of(struct: type[Struct]) -> dict[str, type[Struct]]:
+    """Return the structs that a base stands for, by tag; none if it stands for itself."""
+    config = struct.__struct_config__
+    if config.tag_field is None or config.tag != struct.__name__:  # which is what a struct gets that names no tag
+        return {}
+    kinds: dict[str, type[Struct]] = {}
+    for child in struct.__subclasses__():
+        kinds |= kinds_of(child) or {str(child.__struct_config__.tag): child}
+    return kinds
+
+
+def _one_of(kinds: Mapping[str, type[Struct]], handler: Any) -> Schema:
+    tag_field = next(iter(kinds.values())).__struct_config__.tag_field
+
+    def tag(value: Any) -> Any:
+        if isinstance(value, Struct):
+            return value.__struct_config__.tag
+        return cast("Mapping[Any, Any]", value).get(tag_field) if isinstance(value, Mapping) else None
+
+    choices = {name: handler.generate_schema(kind) for name, kind in kinds.items()}
+    return {"type": "tagged-union", "discriminator": tag, "choices": choices}
+
+
+def _of_fields(struct: type[Struct], handler: Any) -> Schema:
+    def make(value: Any, inner: Callable[[Any], dict[str, Any]]) -> Any:
+        if isinstance(value, struct):
+            return value
+        return struct(**{name: item for name, item in inner(value).items() if name != config.tag_field})
+
+    config = struct.__struct_config__
+    fields: Schema = {}
+    if config.tag_field is not None:
+        tag = {"type": "literal", "expected": [config.tag]}
+        fields[config.tag_field] = {"type": "typed-dict-field", "schema": tag, "required": False}
+    for field in msgspec.structs.fields(struct):
+        kind = _understood(field.type)
+        if kind is not msgspec.Raw:
+            schema = handler.generate_schema(kind)
+            if field.default is not NODEFAULT:
+                schema = {"type": "default", "schema": schema, "default": field.default}
+            fields[field.name] = {"type": "typed-dict-field", "schema": schema, "required": field.required}
+    return {
+        "type": "function-wrap",
+        "function": {"type": "no-info", "function": make},
+        "schema": {"type": "typed-dict", "fields": fields, "cls_name": struct.__name__},
+    }
+
+
+def _serialized(value: Any, info: Any) -> Any:
+    """Serialise for pydantic; whoever wants other arrays says so: `dump_json(…, context={"arrays": "base64"})`."""
+    context: dict[str, Any] = info.context or {}
+    return plain(value, context.get("arrays", "list") if info.mode == "json" else None)
+
+
+# Types that JSON, or pydantic, spells otherwise.
+
+
+def _understood(annotation: Any) -> Any:
+    """Return a type with everything in it that pydantic does not know made known."""
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if annotation in _LEAVES:
+        return _LEAVES[annotation]
+    if origin is np.ndarray:
+        return Annotated[Any, _Array(np.dtype(get_args(arguments[1])[0]))]
+    if origin is Annotated:
+        return _understood(arguments[0])  # msgspec's notes, which mean nothing to it
+    if origin is Literal or not arguments:
+        return annotation
+    inner = tuple(map(_understood, arguments))
+    return Union[inner] if origin in {Union, UnionType} else origin[inner]  # noqa: UP007  # made at run time
+
+
+class Number:
+    """A number, which need not be finite."""
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> Schema:
+        return {"type": "float", "ref": f"{cls.__module__}.{cls.__qualname__}"}  # a name of its own in JSON schemas
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, schema: Any, handler: Any) -> Schema:
+        made = handler(schema)
+        own = handler.resolve_ref_schema(made)
+        own.pop("type")
+        own |= {"anyOf": [{"type": "number"}, {"enum": ["NaN", "Infinity", "-Infinity"]}]}
+        return made
+
+
+class _Bytes:
+    """Bytes, in JSON base64 text."""
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> Schema:
+        return {"type": "function-plain", "function": {"type": "no-info", "function": _bytes}}
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, schema: Any, handler: Any) -> Schema:
+        return {"type": "string", "contentEncoding": "base64"}
+
+
+class _Array:
+    """A NumPy array, in JSON in one of two forms."""
+
+    def __init__(self, dtype: np.dtype[Any]) -> None:
+        self._dtype = dtype
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Schema:
+        # Arrays of the wire are float64 and flat; others are pictures.
+        items = handler.generate_schema(Number if self._dtype == np.float64 else list[Any])
+
+        def read(value: Any, inner: object) -> NDArray[Any]:
+            return _array(value, self._dtype)
+
+        return {
+            "type": "function-wrap",
+            "function": {"type": "no-info", "function": read},
+            "schema": {"type": "list", "items_schema": items},  # for JSON schemas only
+        }
+
+
+_LEAVES: Final[Mapping[Any, Any]] = {float: Number, bytes: _Bytes}
+
+
+def _bytes(data: Any) -> bytes:
+    if isinstance(data, bytes):
+        return data
+    if not isinstance(data, str):
+        raise ValueError(f"{type(data).__name__} is not base64 text")  # noqa: TRY004  # pydantic reports ValueError only
+    return base64.b64decode(data, validate=True)
+
+
+def _array(data: Any, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Read an array from either form, or take one as it is.
+
+    Raises:
+        ValueError: It is neither, or its numbers do not fit the type.
+    """
+    try:
+        match data:
+            case np.ndarray():
+                array = cast("NDArray[Any]", data)
+            case {"dtype": str(name), "shape": shape, "base64": numbers}:
+                stored = np.dtype(name).newbyteorder("<")
+                array = np.frombuffer(_bytes(numbers), stored).reshape(shape).astype(stored.newbyteorder("="))
+            case list():
+                array = np.array(data, dtype if dtype.kind == "f" or not data else None)
+            case _:
+                raise ValueError("an array is a list of numbers, or has dtype, shape and base64")
+    except TypeError as error:  # which pydantic does not report, but raises
+        raise ValueError(str(error)) from None
+    with np.errstate(invalid="ignore"):
+        exact = array.astype(dtype, copy=False)
+    if not np.can_cast(array.dtype, dtype, "same_kind") and (array != exact).any():
+        raise ValueError(f"the numbers are not {dtype.name}")
+    return exact
