@@ -240,6 +240,7 @@ async def test_a_scene_is_edited_by_names(tmp_path: Path) -> None:
 
 async def test_recordings_have_a_name_of_their_own(server: SimulatedServer, tmp_path: Path) -> None:
     async with desk(server, recordings=tmp_path) as one:
+        await one.call("run", steps=1)
         first = await one.call("record", action="start", name="a", cameras=["arm/overview"])
         assert "a.mcap is being recorded" in await one.refused("record", action="start")
         await one.call("run", seconds=0.1)

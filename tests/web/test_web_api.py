@@ -117,6 +117,20 @@ def test_openapi_describes_every_op_that_is_served(http: TestClient) -> None:
     assert {part.partition('"')[0] for part in named} <= set(document["components"]["schemas"])
 
 
+def test_openapi_says_where_it_is_mounted(server: SimulatedServer) -> None:
+    for proxy in ("", "/behind/proxy"):
+        outer = mounted(server, "/lab", Access(hosts=["robots.example"], tokens=False))
+        with TestClient(outer, base_url="http://robots.example", root_path=proxy) as client:
+            told = client.get(f"{proxy}/lab/api/openapi.json").json()
+        assert told["servers"] == [{"url": f"{proxy}/lab"}]
+
+
+def test_it_says_why_a_robot_does_not_move(http: TestClient) -> None:
+    http.post("/api/run", json={"running": False})
+    findings = http.get("/api/explain").json()["findings"]
+    assert any(finding["verdict"] == "problem" and "paused" in finding["text"] for finding in findings)
+
+
 def test_an_op_is_done_and_a_refusal_is_said(http: TestClient) -> None:
     assert http.post("/api/ops/set_sim_speed", json={"percent": 300}).json()["percent"] == 100
     wrong = http.post("/api/ops/set_sim_speed", json={"percent": "fast"})
