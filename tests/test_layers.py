@@ -88,6 +88,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
         "mutex",
         "stream_buffer",
         "transport",
+        "call_records",
         "launch",
         "control",
         "jobs",

@@ -8,7 +8,16 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from urlab_client.protocol.client_types import ClientConfig, Diagnosis, Finding, Resync, ServerInfo, Verdict
+    from urlab_client.protocol.client_types import (
+        CallOutcome,
+        CallRecord,
+        ClientConfig,
+        Diagnosis,
+        Finding,
+        Resync,
+        ServerInfo,
+        Verdict,
+    )
     from urlab_client.protocol.descriptions import (
         ActuatorDescription,
         ArticulationDescription,
@@ -246,6 +255,8 @@ __all__ = [
     "BadValue",
     "BlueprintInfo",
     "Body",
+    "CallOutcome",
+    "CallRecord",
     "CameraDelay",
     "CameraDelayInForce",
     "CameraDescription",

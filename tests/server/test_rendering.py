@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import concurrent.futures
+import contextlib
 import logging
 import math
+import sys
+import threading
+import types
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,7 +21,7 @@ from wire import Wire
 from urlab_client.server import SimulatedServer
 from urlab_client.server.render import camera_renderer, drawing, opengl
 from urlab_client.server.render.drawing import NO_HIT_CM
-from urlab_client.server.render.opengl import find_backend
+from urlab_client.server.render.opengl import Backend, find_backend, free_context, make_context
 from urlab_client.server.render.tints import tint
 
 # Looks along +x at a wall 2 m away, whose upper half is red and whose lower half is blue.
@@ -325,3 +330,32 @@ def test_play_can_start_again(play: Play) -> None:
         assert wire.ask("step", include_cameras={"above": "sync"})["cameras"]
         wire.ask("stop_pie")
         wire.ask("begin_pie")
+
+
+def test_contexts_are_made_and_freed_one_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """GLFW crashes where two threads are in it: two servers of a process on Windows."""
+    both = threading.Barrier(2)
+    met: list[str] = []
+
+    class Context:
+        def __init__(self, width: int, height: int) -> None:
+            self.meet("making")
+
+        def make_current(self) -> None:
+            self.meet("making current")
+
+        def free(self) -> None:
+            self.meet("freeing")
+
+        def meet(self, what: str) -> None:
+            with contextlib.suppress(threading.BrokenBarrierError):
+                both.wait(0.1)
+                met.append(what)
+
+    def one(_: int) -> None:
+        free_context(make_context(Backend("glfw", "a card"), 16, 16))
+
+    monkeypatch.setitem(sys.modules, "mujoco.glfw", types.SimpleNamespace(GLContext=Context))
+    with concurrent.futures.ThreadPoolExecutor(2) as pool:
+        list(pool.map(one, range(2)))
+    assert met == []

@@ -42,7 +42,7 @@ from urlab_client.aio.transport.curve import client_keys, is_local
 from urlab_client.aio.transport.server_regions import SharedMemoryRegions
 from urlab_client.aio.transport.shm import ShmTransport
 from urlab_client.protocol.base import Reply, Request
-from urlab_client.protocol.client_types import ClientConfig, Diagnosis, Resync
+from urlab_client.protocol.client_types import CallRecord, ClientConfig, Diagnosis, Resync
 from urlab_client.protocol.enums import CameraTiming, ObservationLevel, StepMode, Transport
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.runtime import SetMode
@@ -92,8 +92,12 @@ class URLabClient(ClientState):
             server and network those that nobody looks at; `frames()` is received all the same.
         claim_control: Take control of a robot with the first write to it, where robots have one owner. False is for
             those who look on, and for those who say `articulation.claim()`.
+        observe: Called with a `CallRecord` when a request is over, whatever became of it: op, bytes, time in the queue,
+            round trip, outcome. It runs on the client's event loop, so it must be quick and must not call the client;
+            what it raises is logged and changes nothing.
 
     Raises:
+        TypeError: `observe` is not a plain function.
         KeyFileError: A key file cannot be used.
         ValueError: The address or an option is malformed.
     """
@@ -119,6 +123,7 @@ class URLabClient(ClientState):
         trust_server: bool = False,
         live_pictures: bool = True,
         claim_control: bool = True,
+        observe: Callable[[CallRecord], object] | None = None,
     ) -> None:
         config = ClientConfig(
             address=address,
@@ -150,7 +155,9 @@ class URLabClient(ClientState):
         memory = SharedMemoryRegions(shm_dir) if Transport(transport) is Transport.SHM else None
         plain = transport_to(address, step_port, keys, shm=memory is not None)
         self._transport = plain if memory is None else ShmTransport(plain, memory)
-        session = Session(self._transport, default_timeout=rcv_timeout_ms / 1000, json=encoding == "json")
+        session = Session(
+            self._transport, default_timeout=rcv_timeout_ms / 1000, json=encoding == "json", observe=observe
+        )
         session.control = Control(session, wanted=claim_control)
         self._publishers = Publishers(
             lambda: self._transport.endpoint,

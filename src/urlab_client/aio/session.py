@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
 
+from urlab_client.aio.call_records import CallRecords, Observe
 from urlab_client.aio.control import Control
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.event_loop import running_loop
@@ -68,7 +69,14 @@ class Session:
         editing: Held while the editor has a job.
     """
 
-    def __init__(self, transport: RequestTransport, *, default_timeout: float | None, json: bool = False) -> None:
+    def __init__(
+        self,
+        transport: RequestTransport,
+        *,
+        default_timeout: float | None,
+        json: bool = False,
+        observe: Observe | None = None,
+    ) -> None:
         self.session_id = ""
         self.greeted = False
         self.features = Features()
@@ -76,6 +84,8 @@ class Session:
         self.on_refusal: Callable[[URLabRPCError], None] | None = None
         self.confirmed = False
         self._transport = transport
+        self._call_records = None if observe is None else CallRecords(observe, transport)
+        self._way = self._call_records or transport
         self._default_timeout = default_timeout
         self._json = json
         self.control = Control(self)
@@ -236,11 +246,14 @@ class Session:
         """Send a request and return its answer; for whoever holds the line."""
         if self.features.claims and isinstance(request, ControlRequest):
             return self.control.send(request, self._ask, limits)
+        if self._call_records is not None:
+            return self._call_records.record(op, self._answer(request, op, limits))
         return self._answer(request, op, limits)
 
     async def _ask(self, request: Request[R], limits: Limits) -> R:
         op = op_of(request)
-        return at_once(op, await self._answer(request, op, limits))
+        answer = self._answer(request, op, limits)
+        return at_once(op, await (answer if self._call_records is None else self._call_records.record(op, answer)))
 
     async def _answer(self, request: Request[R], op: Op, limits: Limits, *, again: bool = False) -> R | OpStarted:
         # One coroutine, though it does several things: each one between a step and its socket costs every step.
@@ -255,7 +268,7 @@ class Session:
         try:
             try:
                 deadline, connect_by = limits
-                answer = await self._transport.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
+                answer = await self._way.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
             except ConnectionLost as lost:
                 answer = await self._ask_again(frame, op, lost, limits)
             finally:
@@ -337,7 +350,7 @@ class Session:
             log.debug("%s: asking again, because the connection was lost", op.name)
             try:
                 deadline, connect_by = limits
-                return await self._transport.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
+                return await self._way.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
             except ConnectionLost as again:
                 lost = again
             except ServerUnreachable as unreachable:
@@ -351,6 +364,10 @@ class Session:
         """
         if lock.acquire_nowait():
             return
+        waiting = self._wait_for(lock, op, deadline)
+        await (waiting if self._call_records is None else self._call_records.queued(op, waiting))
+
+    async def _wait_for(self, lock: Mutex, op: Op, deadline: float | None) -> None:
         if self._aside is not None:
             self._aside.cancel()
         self._queued += 1

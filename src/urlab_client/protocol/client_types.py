@@ -15,6 +15,8 @@ from urlab_client.protocol.messages.session import InstanceInfo
 from urlab_client.protocol.serializable import Serializable
 
 __all__ = [
+    "CallOutcome",
+    "CallRecord",
     "ClientConfig",
     "Diagnosis",
     "Finding",
@@ -97,6 +99,50 @@ class Resync(Serializable, Struct, frozen=True, kw_only=True):
     steps_applied: int | None = None
     reset_applied: bool | None = None
     settled: bool = True
+
+
+class CallOutcome(StrEnum):
+    """What became of a request."""
+
+    OK = "ok"
+    REFUSED = "refused"
+    """The server answered with an error."""
+    TIMEOUT = "timeout"
+    """No reply in time, or no turn: the bytes sent tell which."""
+    LOST = "lost"
+    """No connection, or it broke."""
+    CANCELLED = "cancelled"
+    FAILED = "failed"
+    """The request was malformed, or the reply."""
+
+
+class CallRecord(Serializable, Struct, frozen=True, kw_only=True):
+    """One request of a client, as `observe=` is told of it when it is over.
+
+    What follows from one call of a method may be several: `discover()` sends `hello` and `meta`, an editor's job is
+    asked after with `op_status`.
+
+    Attributes:
+        op: Its op.
+        endpoint: The server's address.
+        started_ns: This machine's UTC clock when the request came up, nanoseconds.
+        queued_s: Seconds that it waited for other requests of this client.
+        round_trip_s: Seconds from sending to the reply, with the wait for a connection; 0 if it never got so far.
+        sent_bytes: Size of the request; with each repetition after a lost connection. 0 if it never got so far.
+        received_bytes: Size of the reply; 0 without one.
+        outcome: What became of it.
+        error: The server's code for what it refused, else the name of the exception; empty if all went well.
+    """
+
+    op: str
+    endpoint: str
+    started_ns: int
+    queued_s: float
+    round_trip_s: float
+    sent_bytes: int
+    received_bytes: int
+    outcome: CallOutcome
+    error: str = ""
 
 
 class ClientConfig(Serializable, Struct, frozen=True, kw_only=True):

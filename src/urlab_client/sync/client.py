@@ -14,7 +14,7 @@ from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.session_level import SESSION_LEVEL, SessionLevel
 from urlab_client.aio.streams import BUFFER_BYTES, BUFFER_ITEMS
 from urlab_client.protocol.base import Reply, Request
-from urlab_client.protocol.client_types import Diagnosis, Resync
+from urlab_client.protocol.client_types import CallRecord, Diagnosis, Resync
 from urlab_client.protocol.enums import CameraTiming, ObservationLevel, StepMode, Transport
 from urlab_client.protocol.messages.session import OpInfo, ResetOk, StepOk
 from urlab_client.protocol.messages.streams import ClientEvent, RowSample, StateSnapshot, StreamPolicy
@@ -68,8 +68,12 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
             server and network those that nobody looks at; `frames()` is received all the same.
         claim_control: Take control of a robot with the first write to it, where robots have one owner. False is for
             those who look on, and for those who say `articulation.claim()`.
+        observe: Called with a `CallRecord` when a request is over, whatever became of it: op, bytes, time in the queue,
+            round trip, outcome. It runs on the client's event loop, so it must be quick and must not call the client;
+            what it raises is logged and changes nothing.
 
     Raises:
+        TypeError: `observe` is not a plain function.
         KeyFileError: A key file cannot be used.
         ValueError: The address or an option is malformed.
     """
@@ -98,6 +102,7 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
         trust_server: bool = False,
         live_pictures: bool = True,
         claim_control: bool = True,
+        observe: Callable[[CallRecord], object] | None = None,
     ) -> None:
         super().__init__(
             aio.URLabClient(
@@ -119,6 +124,7 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
                 trust_server=trust_server,
                 live_pictures=live_pictures,
                 claim_control=claim_control,
+                observe=observe,
             )
         )
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from typing import Any
 
 import mujoco
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client.protocol.base import Floats
-from urlab_client.server.render.opengl import need_backend
+from urlab_client.server.render.opengl import free_context, make_context, need_backend
 
 __all__ = ["BatchPictures"]
 
@@ -39,8 +38,7 @@ class BatchPictures:
         width, height = (int(pixels) for pixels in model.cam_resolution[self._view.fixedcamid])
         width, height = (width, height) if width > 1 else (640, 480)
         self._area = mujoco.MjrRect(0, 0, width, height)
-        self._gl: Any = importlib.import_module(f"mujoco.{need_backend().name}").GLContext(width, height)
-        self._gl.make_current()
+        self._gl = make_context(need_backend(), width, height)
         self._option = mujoco.MjvOption()
         self._scene = mujoco.MjvScene(model, maxgeom=max(10_000, 2 * model.ngeom + 1000))
         self._context: Any = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
@@ -69,4 +67,4 @@ class BatchPictures:
     def close(self) -> None:
         """Free the context."""
         self._context.free()
-        self._gl.free()
+        free_context(self._gl)

@@ -15,7 +15,7 @@ from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraFrame
 from urlab_client.server.compile.scene_index import SceneCamera
 from urlab_client.server.editor.viewport import ViewMode
-from urlab_client.server.render.opengl import Backend
+from urlab_client.server.render.opengl import Backend, free_context, make_context
 from urlab_client.server.render.tints import Tints
 from urlab_client.server.render.viewport_picture import (
     ViewportPicture,
@@ -75,8 +75,7 @@ class Stage:
         self._view = mujoco.MjvCamera()
         self._scene = mujoco.MjvScene(model, maxgeom=max(10_000, 2 * model.ngeom + 1000))
         width, height = model.vis.global_.offwidth, model.vis.global_.offheight
-        self._gl: Any = importlib.import_module(f"mujoco.{backend.name}").GLContext(width, height)
-        self._gl.make_current()
+        self._gl = make_context(backend, width, height)
         self._renderer: Any = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._renderer)
         self._renderer.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
@@ -92,7 +91,7 @@ class Stage:
     ) -> None:
         with contextlib.suppress(Exception):  # a driver that is in trouble is so here, too
             self._renderer.free()
-            self._gl.free()
+            free_context(self._gl)
 
     def prepare(self, data: mujoco.MjData) -> None:
         """Bring what is drawn up to the state: after a step it is that of the step's beginning."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
 import os
 import subprocess
@@ -10,12 +11,20 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Final
+from typing import Any, Final
 
 from urlab_client._children import APART
 from urlab_client.protocol.errors import URLabError
 
-__all__ = ["Backend", "RenderingUnavailable", "find_backend", "need_backend", "search_backend"]
+__all__ = [
+    "Backend",
+    "RenderingUnavailable",
+    "find_backend",
+    "free_context",
+    "make_context",
+    "need_backend",
+    "search_backend",
+]
 
 logger = logging.getLogger("urlab_client.server")
 
@@ -98,6 +107,27 @@ def need_backend() -> Backend:
     if isinstance(found, Backend):
         return found
     raise RenderingUnavailable(f"nothing can be drawn here: {found}")
+
+
+def make_context(backend: Backend, width: int, height: int) -> Any:
+    """Return a new context of a size in pixels, current in this thread.
+
+    GLFW, which makes them on Windows, has one state for all threads: two that make or free contexts at the same time
+    crash.
+    """
+    with _contexts:
+        context = importlib.import_module(f"mujoco.{backend.name}").GLContext(width, height)
+        context.make_current()
+    return context
+
+
+def free_context(context: Any) -> None:
+    """Free a context, in the thread that made it."""
+    with _contexts:
+        context.free()
+
+
+_contexts = threading.Lock()
 
 
 def search_backend() -> Backend | str:
