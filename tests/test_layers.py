@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "src" / "urlab_client"
 
 # Layer -> the layers it may import besides itself. The empty name is the public package, `urlab_client` itself.
 ALLOWED: dict[str, frozenset[str]] = {
-    "protocol": frozenset(),
+    "protocol": frozenset({"_extras"}),
     "keys": frozenset({"protocol"}),
     "aio": frozenset(
         {
@@ -50,18 +50,22 @@ ALLOWED: dict[str, frozenset[str]] = {
     "_landlock": frozenset(),
     "_mjcf_files": frozenset(),
     "_mujoco": frozenset(),
+    "_extras": frozenset({"_installation"}),
     "_installation": frozenset(),
     "_processors": frozenset(),
     "_uninterrupted": frozenset(),
     "_windows": frozenset(),
     "": frozenset({"_installation", "sync", "enums", "protocol"}),
-    "integrations": frozenset({"", "_installation", "_mujoco", "aio", "enums", "keys", "protocol", "server", "sync"}),
+    "integrations": frozenset(
+        {"", "_extras", "_installation", "_mujoco", "aio", "enums", "keys", "protocol", "server", "sync"}
+    ),
     "cluster": frozenset({"_installation", "integrations", "protocol", "sync"}),
     "web": frozenset({"_installation", "aio", "protocol"}),
     "mcp": frozenset({"aio", "integrations", "protocol", "web"}),
     "cli": frozenset(
         {
             "",
+            "_extras",
             "_installation",
             "_mujoco",
             "_windows",
@@ -84,6 +88,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "aio": (
         "event_loop",
         "deadline",
+        "arguments",
         "session_level",
         "mutex",
         "stream_buffer",

@@ -55,7 +55,7 @@ done
 [[ -d /usr/lib/python3.11 ]] || not_run 'there is no /usr/lib/python3.11, whose standard library would be used'
 
 folder=${URLAB_WINDOWS:-$scratch/windows}
-within 600 bash tools/windows/make_python.sh "$folder" || not_run 'the interpreter for Windows could not be made'
+bash tools/windows/make_python.sh "$folder" "$((limit - SECONDS))" || not_run 'the interpreter for Windows could not be made'
 
 # The Python of this system that says which tests run on Linux.
 python=.venv/bin/python

@@ -199,7 +199,7 @@ async def test_waiting_ends_when_it_is_so(moving: Any) -> None:
 
 async def test_waiting_in_vain_ends(moving: Any) -> None:
     before = moving.sim_time
-    with pytest.raises(URLabTimeoutError, match=r"not so within 0\.05 s of simulation time"):
+    with pytest.raises(URLabTimeoutError, match=r"did not hold within 0\.05 s of simulation time"):
         await moving.wait_until(lambda: False, timeout=0.05)
     assert moving.sim_time - before >= 0.05 - 1e-9 or str(moving.step_mode) == "live"
 

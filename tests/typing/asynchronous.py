@@ -47,8 +47,10 @@ from urlab_client.aio.namespaces.runtime import RuntimeNamespace
 from urlab_client.aio.namespaces.scene import SceneNamespace
 from urlab_client.aio.namespaces.sim import SimNamespace
 from urlab_client.aio.namespaces.viewport import ViewportNamespace
+from urlab_client.aio.streams import Stream
 from urlab_client.protocol.messages.scene import CurrentLevel, CurrentLevelOk
 from urlab_client.protocol.messages.session import ArticulationState, OpInfo, ResetOk, StepOk
+from urlab_client.protocol.messages.streams import CameraSample, ClientEvent, PlayEnded
 from urlab_client.protocol.names import NameMap
 
 Floats = NDArray[np.float64]
@@ -138,6 +140,9 @@ async def running(client: URLabClient) -> None:
     assert_type(await client.runtime.get_contacts(body1="robot_foot"), ContactsResult)
     assert_type(await client.runtime.set_sim_options(timestep=0.001), SimOptions)
     assert_type(await client.runtime.list_keyframes(), list[KeyframeInfo])
+    assert_type(await client.camera("eye").capture(), CameraSample)
+    assert_type(await client.capture(["eye"]), dict[str, CameraSample])
+    assert_type(client.events(kinds=["lost", PlayEnded]), Stream[ClientEvent])
     assert_type(await client.viewport.get_camera(timeout=None), CameraPose)
 
 

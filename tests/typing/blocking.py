@@ -40,6 +40,7 @@ from urlab_client import (
 )
 from urlab_client.protocol.messages.scene import CurrentLevel, CurrentLevelOk
 from urlab_client.protocol.messages.session import ArticulationState, OpInfo, ResetOk, StepOk
+from urlab_client.protocol.messages.streams import CameraSample, ClientEvent, PlayEnded
 from urlab_client.protocol.names import NameMap
 from urlab_client.sync.namespaces.debug import DebugNamespace
 from urlab_client.sync.namespaces.outliner import OutlinerNamespace
@@ -48,6 +49,7 @@ from urlab_client.sync.namespaces.runtime import RuntimeNamespace
 from urlab_client.sync.namespaces.scene import SceneNamespace
 from urlab_client.sync.namespaces.sim import SimNamespace
 from urlab_client.sync.namespaces.viewport import ViewportNamespace
+from urlab_client.sync.streams import Stream
 
 Floats = NDArray[np.float64]
 
@@ -136,6 +138,9 @@ def running(client: URLabClient) -> None:
     assert_type(client.runtime.get_contacts(body1="robot_foot"), ContactsResult)
     assert_type(client.runtime.set_sim_options(timestep=0.001), SimOptions)
     assert_type(client.runtime.list_keyframes(), list[KeyframeInfo])
+    assert_type(client.camera("eye").capture(), CameraSample)
+    assert_type(client.capture(["eye"]), dict[str, CameraSample])
+    assert_type(client.events(kinds=["lost", PlayEnded]), Stream[ClientEvent])
     assert_type(client.viewport.get_camera(timeout=None), CameraPose)
 
 

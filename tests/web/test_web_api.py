@@ -15,7 +15,6 @@ from starlette.applications import Starlette
 from starlette.routing import Mount
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
-from waiting import eventually
 
 from urlab_client.aio import URLabClient
 from urlab_client.protocol.registry import OPS
@@ -255,16 +254,25 @@ def test_a_replay_goes_to_any_frame_of_it(http: TestClient) -> None:
         http.post("/api/ops/set_mode", json={"mode": "live"})
 
 
-def test_live_pictures_come_as_files_too(http: TestClient) -> None:
-    http.post("/api/run", json={"running": True})
+def test_pictures_come_as_files_too_while_running_paused_and_stepped(http: TestClient) -> None:
+    def shown(kind: str) -> tuple[int, int]:
+        answer = http.get(f"/api/cameras/arm/overview.{kind}")
+        assert answer.status_code == 200, answer.text
+        assert answer.headers["content-type"] == {"jpg": "image/jpeg", "png": "image/png"}[kind]
+        return Image.open(io.BytesIO(answer.content)).size
 
-    def shown() -> bytes | None:  # the answer does not wait long for a first picture
-        answer = http.get("/api/cameras/arm/overview.jpg")
-        return answer.content if answer.status_code == 200 else None
-
-    picture = eventually(shown)
-    assert Image.open(io.BytesIO(picture)).size == (64, 48)
-    assert http.get("/api/cameras/arm/nothing.jpg").status_code == 404
+    try:
+        for prepare in (
+            lambda: http.post("/api/run", json={"running": True}),
+            lambda: http.post("/api/run", json={"running": False}),
+            lambda: http.post("/api/ops/set_mode", json={"mode": "direct"}),
+        ):
+            prepare()
+            assert shown("jpg") == shown("png") == (64, 48)
+    finally:
+        http.post("/api/ops/set_mode", json={"mode": "live"})
+    for kind in ("jpg", "png"):
+        assert http.get(f"/api/cameras/arm/nothing.{kind}").status_code == 404
 
 
 def test_the_viewer_gets_the_model_and_the_state_that_is_shown(http: TestClient) -> None:

@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# A CPython for Windows under Wine, with this project in it: make_python.sh FOLDER
+# A CPython for Windows under Wine, with this project in it: make_python.sh FOLDER [SECONDS]
 #
 # FOLDER gets the interpreter (python311.dll and extension modules as published for Windows, the standard library of
 # this machine's Python 3.11, a launcher of ten lines), the Windows wheels of the test dependencies, and the project's
-# wheel. Run programs with FOLDER/winpy:
+# wheel. SECONDS are for everything, where there is no more time than that. Run programs with FOLDER/winpy:
 #
 #     FOLDER/winpy -m urlab_client --version
 #     FOLDER/winpy -m pytest tests/protocol
@@ -12,6 +12,7 @@
 # them. What it does not: times, OpenGL, the console's Ctrl-C, and whatever Wine does differently from Windows. Needs
 # wine, x86_64-w64-mingw32-gcc and /usr/lib/python3.11, all of which Debian 12 has.
 set -euo pipefail
+until_s=${2:-1000000}
 target=$(mkdir -p "$1" && cd "$1" && pwd)
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 project=$(cd "$here/../.." && pwd)
@@ -20,10 +21,15 @@ export WINEDLLOVERRIDES='winedbg.exe,winemenubuilder.exe,mscoree,mshtml=d'
 
 # within SECONDS WHAT COMMAND...: say what is done, do it, and end with a line where it fails or takes longer.
 within() {
-    local limit=$1 what=$2 status=0
+    local limit=$1 what=$2 left=$((until_s - SECONDS)) status=0
     shift 2
-    printf 'Windows: %s, at most %s s\n' "$what" "$limit"
-    timeout --kill-after=5 "$limit" "$@" </dev/null || status=$?
+    limit=$((left < 0 ? 0 : limit < left ? limit : left))
+    if ((limit > 0)); then
+        printf 'Windows: %s, at most %s s\n' "$what" "$limit"
+        timeout --kill-after=5 "$limit" "$@" </dev/null || status=$?
+    else
+        status=124
+    fi
     case $status in
         0) return ;;
         124 | 137) printf 'Windows: %s: given up after %s s\n' "$what" "$limit" ;;
@@ -35,8 +41,15 @@ within() {
 pip=(python3 -m pip --disable-pip-version-check -qq --timeout 20 --retries 2)
 windows_wheels=(download --platform win_amd64 --python-version 3.11 --implementation cp --only-binary=:all:)
 
-if [[ ! -e $target/py/python.exe ]]; then
-    work=$(mktemp -d)
+# What Wine leaves running keeps the output of who started it open: none of ours may be among it.
+kill_wine() {
+    grep -lzsx "WINEPREFIX=$target/prefix" /proc/[0-9]*/environ | cut -d / -f 3 | xargs -r kill -9 || true
+}
+
+work=$(mktemp -d)
+trap 'rm -rf "$work"' EXIT
+
+if [[ ! -e $target/py/python3.dll ]]; then
     # Panda3D's wheel for Windows carries CPython's own DLL and extension modules, to put them beside frozen programs.
     within 120 'downloading the interpreter' "${pip[@]}" "${windows_wheels[@]}" -d "$work" --no-deps panda3d
     python3 -m zipfile -e "$work"/panda3d-*.whl "$work/x"
@@ -63,7 +76,6 @@ if [[ ! -e $target/py/python.exe ]]; then
             grep -oE '\b_?Py\w+$' | sort -u | sed 's/.*/& = python311.&/'
     } >"$work/python3.def"
     x86_64-w64-mingw32-gcc -shared -static-libgcc -o "$target/py/python3.dll" "$work/python3.def"
-    rm -rf "$work"
 fi
 
 # Under Wine the interpreter starts only where its output is a pipe. Wine's own .NET and browser, which it would ask for
@@ -93,12 +105,10 @@ for requirement in [*project["dependencies"], *project["optional-dependencies"][
 EOF
 )
 if [[ $(cat "$site/.packages" 2>/dev/null) != "${packages[*]}" ]]; then
-    wheels=$(mktemp -d)
-    within 180 'downloading the dependencies' "${pip[@]}" "${windows_wheels[@]}" -d "$wheels" "${packages[@]}"
-    for wheel in "$wheels"/*.whl; do
+    within 180 'downloading the dependencies' "${pip[@]}" "${windows_wheels[@]}" -d "$work/wheels" "${packages[@]}"
+    for wheel in "$work"/wheels/*.whl; do
         python3 -m zipfile -e "$wheel" "$site/"
     done
-    rm -rf "$wheels"
     mkdir -p "$target/py/Scripts"
     find "$site" -path '*.data/scripts/*.exe' -exec mv {} "$target/py/Scripts/" \;
     python3 - "$site" <<'EOF'
@@ -114,16 +124,11 @@ for path in pathlib.Path(sys.argv[1]).rglob("*"):
 EOF
     printf '%s' "${packages[*]}" >"$site/.packages"
 fi
-built=$(mktemp -d)
-within 120 "building the project's wheel" "${pip[@]}" wheel --no-deps -w "$built" "$project"
+within 120 "building the project's wheel" "${pip[@]}" wheel --no-deps -w "$work/built" "$project"
 rm -rf "$site"/{urlab_client,pytest_urlab,urlab_client-*.dist-info}
-python3 -m zipfile -e "$built"/*.whl "$site/"
-rm -rf "$built"
-# What Wine leaves running keeps the output of who started it open: none of ours may be among it.
-kill_wine() {
-    grep -lzsx "WINEPREFIX=$target/prefix" /proc/[0-9]*/environ | cut -d / -f 3 | xargs -r kill -9 || true
-}
-trap kill_wine EXIT
+python3 -m zipfile -e "$work"/built/*.whl "$site/"
+
+trap 'kill_wine; rm -rf "$work"' EXIT
 if [[ ! -e $target/prefix/.made ]]; then
     rm -rf "$target/prefix"
     within 120 'setting up Wine' env -u DISPLAY WINEPREFIX="$target/prefix" WINEDEBUG=-all WINEARCH=win64 \
@@ -136,4 +141,4 @@ within 60 'starting the interpreter' env WINEPREFIX="$target/prefix" bash -c 'ex
 with open(sys.argv[1], "w") as file:
     print(sys.version, numpy.__version__, zmq.__version__, mujoco.__version__, file=file)' "Z:$target/version"
 cat "$target/version"
-trap - EXIT
+trap 'rm -rf "$work"' EXIT

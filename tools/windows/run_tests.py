@@ -87,9 +87,12 @@ class Clock:
 def on_linux(python: str, paths: list[str]) -> collections.Counter[str]:
     """Return the number of tests that run on Linux, by file."""
     command = [python, "-m", "pytest", "--collect-only", "-q", "-n", "0", "-p", "no:cacheprovider", *paths]
-    done = subprocess.run(  # noqa: S603
-        command, cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False, timeout=COLLECT_S
-    )
+    try:
+        done = subprocess.run(  # noqa: S603
+            command, cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False, timeout=COLLECT_S
+        )
+    except subprocess.TimeoutExpired:
+        sys.exit(f"the tests could not be collected here within {COLLECT_S} s")
     if done.returncode:
         sys.exit(f"the tests cannot be collected here:\n{done.stdout}{done.stderr}")
     return collections.Counter(line.partition("::")[0] for line in done.stdout.splitlines() if "::" in line)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from urlab_client.aio.arguments import mapping
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.control import CLAIM_S
 from urlab_client.aio.controllers import URLabController, make_controller
@@ -15,7 +16,7 @@ from urlab_client.aio.live.publishers import Publishers
 from urlab_client.aio.model.articulation_state import MirroredArticulation, MirroredEntity
 from urlab_client.aio.model.elements import Actuator, ArticulationElements, Body, Joint, Sensor, make_elements
 from urlab_client.aio.model.layout import ArticulationLayout
-from urlab_client.aio.model.numbers import finite, finite_array
+from urlab_client.aio.model.numbers import finite, finite_array, is_array
 from urlab_client.aio.motion import Motion
 from urlab_client.aio.session import Session
 from urlab_client.protocol.base import Floats
@@ -354,7 +355,10 @@ class URLabArticulation(URLabEntity):
             ValueError: A value is NaN, infinite, or, with `error`, out of range; nothing was set.
         """
         rule = OutOfRange(out_of_range)
-        found = [(self.actuators[name], value) for name, value in values.items()]
+        found = [
+            (self.actuators[name], value)
+            for name, value in mapping("set_ctrl", values, "actuator names to numbers").items()
+        ]
         checked = [actuator.checked(value, rule) for actuator, value in found]
         if checked:
             self._record.drive()
@@ -476,7 +480,7 @@ class URLabArticulation(URLabEntity):
             ControlClaimed: Another client controls it; `.owner` names it.
             ValueError: `ttl` is negative or not a number.
         """
-        await self._session.control.claim(self.prefix, force=force, ttl=ttl, timeout=timeout)
+        await self._session.control.claim(self.prefix, force=force, ttl=finite("claim: ttl", ttl), timeout=timeout)
         self._record.drive()
 
     async def release(self, *, timeout: Timeout = DEFAULT) -> None:
@@ -504,10 +508,14 @@ class URLabArticulation(URLabEntity):
 
 
 def _wrench(force: Sequence[float], torque: Sequence[float]) -> list[float]:
-    if len(force) != 3 or len(torque) != 3:
-        raise ValueError(f"force and torque need three components each, got {len(force)} and {len(torque)}")
-    named = (("force", force), ("torque", torque))
-    return [finite(f"apply_xfrc: {what}[{i}]", v) for what, vector in named for i, v in enumerate(vector)]
+    values: list[float] = []
+    for what, vector in (("force", force), ("torque", torque)):
+        if not is_array(vector):
+            raise TypeError(f"apply_xfrc: {what} takes 3 numbers, got {vector!r:.80}.")
+        if len(vector) != 3:
+            raise ValueError(f"apply_xfrc: {what} takes 3 numbers, got {len(vector)}.")
+        values += [finite(f"apply_xfrc: {what}[{i}]", v) for i, v in enumerate(vector)]
+    return values
 
 
 def _to_world(quat: Floats, vector: Floats) -> Floats:

@@ -80,6 +80,30 @@ class URLabCameraView:
         width, height = self.resolution
         return CameraDescription(name=self.name, mode=str(self.mode), width=width, height=height, fovy=self.fovy)
 
+    async def capture(self, *, timeout: Timeout = DEFAULT) -> CameraSample:
+        """Take a picture now, in any step mode, without a step; it is then also `latest_frame`.
+
+        It shows the simulation after this call, and time does not pass for it: in `direct` and `puppet` mode the
+        server is brought into live mode for a moment, paused, which takes a few requests; a picture of every step is
+        quicker with `step(include_cameras=…)`. A camera that is switched off is switched on for as long. A server of
+        the alpha does not number its pictures: there the second one counts that arrives after the call.
+
+        Args:
+            timeout: Seconds to wait; None waits without limit. By default the client's, or 30 where that is less and
+                no picture of this camera has come before: the server may still be looking for OpenGL.
+
+        Returns:
+            The picture; `.png()` and `.jpeg()` encode it.
+
+        Raises:
+            PictureTimeout: None came in time: the camera is off in the editor, or the server cannot draw.
+            NoActiveManager: No play session runs.
+            ModeLocked: The project pins a mode in which pictures come with steps only.
+            URLabError: The camera is not in the scene any more.
+        """
+        (sample,) = await self._publishers.capture([self], timeout)
+        return sample
+
     def frames(
         self,
         policy: str | StreamPolicy = "latest",

@@ -5,13 +5,13 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import operator
 import os
 from collections.abc import Callable, Collection, Mapping
 from types import TracebackType
 from typing import NoReturn, Self, TypeVar
 
 from urlab_client.aio.address import transport_to
+from urlab_client.aio.arguments import integer
 from urlab_client.aio.client_state import ClientState
 from urlab_client.aio.control import Control
 from urlab_client.aio.deadline import DEFAULT, Timeout
@@ -30,6 +30,7 @@ from urlab_client.aio.namespaces.sim import SimNamespace
 from urlab_client.aio.namespaces.viewport import ViewportNamespace
 from urlab_client.aio.session import Session
 from urlab_client.aio.session_level import SESSION_LEVEL, SessionLevel
+from urlab_client.aio.state.capturing import Capturing
 from urlab_client.aio.state.connection_monitor import ConnectionMonitor
 from urlab_client.aio.state.discovery import Discovery
 from urlab_client.aio.state.recovery import resync
@@ -48,7 +49,7 @@ from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.protocol.messages.session import Hello, MetaOk, OpInfo, Reset, ResetOk, Step, StepOk
 from urlab_client.protocol.messages.session import Meta as MetaRequest
-from urlab_client.protocol.messages.streams import ClientEvent, RowSample, StateSnapshot, StreamPolicy
+from urlab_client.protocol.messages.streams import CameraSample, ClientEvent, RowSample, StateSnapshot, StreamPolicy
 from urlab_client.protocol.topics import TopicKind
 
 __all__ = ["URLabClient"]
@@ -177,6 +178,7 @@ class URLabClient(ClientState):
         state = SimState(
             session, self._publishers, self._motion, wanted_mode=StepMode(step_mode), live_pictures=live_pictures
         )
+        self._publishers.capture = Capturing(state, rcv_timeout_ms / 1000).take
         super().__init__(config, session, state)
         self._discovery = Discovery(
             state,
@@ -301,7 +303,7 @@ class URLabClient(ClientState):
             ValueError: A set-point is NaN or infinite, or in puppet mode something in `data`; nothing was sent.
             NoSession: `discover()` was not called, or was broken off; nothing was sent.
         """
-        n_steps = operator.index(n_steps)  # a hot op: its request is not checked again before it is sent
+        n_steps = integer("step: n_steps", n_steps)  # a hot op: its request is not checked again before it is sent
         level = None if observations is SESSION_LEVEL else ObservationLevel(observations)
         turn = self._session.turn(Step, timeout=timeout)
         if not turn.begin_at_once():  # which `async with` would take three coroutines for
@@ -391,6 +393,38 @@ class URLabClient(ClientState):
             TypeError: The predicate returns an awaitable.
         """
         return await self._motion.wait_until(predicate, timeout)
+
+    async def capture(
+        self, cameras: Collection[str] | None = None, *, timeout: Timeout = DEFAULT
+    ) -> dict[str, CameraSample]:
+        """Take pictures of several cameras now, in any step mode, without a step; see `URLabCameraView.capture`.
+
+        In `direct` and `puppet` mode, and while paused, all of them show the same moment.
+
+        Args:
+            cameras: Names, as `camera()` takes them; None for all there are.
+            timeout: Seconds to wait for all of them together; None waits without limit.
+
+        Returns:
+            The pictures by the names given.
+
+        Raises:
+            KeyError: There is no such camera, or there are several; nothing was sent.
+            TypeError: `cameras` is a name by itself.
+            PictureTimeout: Some came not in time; `.cameras` names them.
+            NoActiveManager: No play session runs.
+            ModeLocked: The project pins a mode in which pictures come with steps only.
+        """
+        objects = self._state.objects
+        if isinstance(cameras, str):
+            raise TypeError(f"capture takes several names; one: client.camera({cameras!r}).capture()")
+        if cameras is None:
+            names = {shown: name for name, shown in objects.shown_cameras(objects.camera_names()).items()}
+        else:
+            names = {name: name for name in cameras}
+        views = [self.camera(name) for name in names.values()]
+        samples = await self._publishers.capture(views, timeout) if views else []
+        return dict(zip(names, samples, strict=True))
 
     def state_stream(
         self,

@@ -11,6 +11,7 @@ from collections.abc import AsyncGenerator, Callable, Mapping
 from contextlib import aclosing
 from typing import TYPE_CHECKING, Protocol
 
+from urlab_client.aio.arguments import mapping
 from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.model.elements import Actuator, Joint
 from urlab_client.aio.model.numbers import finite
@@ -85,6 +86,9 @@ class Motion:
     async def wait_until(self, predicate: Callable[[], object], timeout: float) -> float:
         """See `URLabClient.wait_until`."""
 
+        if not callable(predicate):
+            raise TypeError(f"wait_until takes a function without arguments, got {predicate!r:.80}.")
+
         def holds() -> bool:
             answer = predicate()
             if inspect.isawaitable(answer):
@@ -97,7 +101,8 @@ class Motion:
         passed, so = await self._until(holds, "wait_until", limit, _LOOK_S)
         if not so:
             raise URLabTimeoutError(
-                f"wait_until: not so within {limit:g} s of simulation time.", hint=await self._findings()
+                f"wait_until: the condition did not hold within {limit:g} s of simulation time.",
+                hint=await self._findings(),
             )
         return passed
 
@@ -106,7 +111,10 @@ class Motion:
     ) -> float:
         """See `URLabArticulation.move_to`."""
         tolerance, limit = _positive("move_to: tolerance", tolerance), _positive("move_to: timeout", timeout)
-        aims = [_Aim(articulation, name, target) for name, target in targets.items()]
+        aims = [
+            _Aim(articulation, name, target)
+            for name, target in mapping("move_to", targets, "joint names to numbers").items()
+        ]
         for aim in aims:
             aim.actuator.set_control(aim.set_point)
         passed, settled = await self._until(

@@ -122,6 +122,8 @@ class Session:
             TypeError, ValueError: The request is malformed; nothing was sent.
         """
         op = op_of(request)
+        if on_progress is not None and not callable(on_progress):
+            raise TypeError(f"{op.name}: on_progress takes a function, got {on_progress!r:.80}.")
         self.check_offered(op)
         limits = self.limits(op, timeout, self.bound_loop().time())
         if op.needs is not Needs.EDITOR:

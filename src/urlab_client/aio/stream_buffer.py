@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from typing import Any
 
+from urlab_client.aio.arguments import integer
 from urlab_client.protocol.messages.streams import StreamPolicy
 
 __all__ = ["BufferedMessage", "StreamBuffer"]
@@ -64,6 +65,7 @@ class StreamBuffer:
     """
 
     def __init__(self, policy: StreamPolicy, max_items: int, max_bytes: int) -> None:
+        max_items, max_bytes = integer("buffer", max_items), integer("buffer_bytes", max_bytes)
         if max_items < 1 or max_bytes < 1:
             raise ValueError(f"a buffer holds at least one item and one byte, not {max_items} and {max_bytes}")
         self.policy = policy

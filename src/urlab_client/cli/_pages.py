@@ -3,13 +3,26 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import signal
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 
 import uvicorn
 from starlette.types import ASGIApp
 
-__all__ = ["bound", "serve"]
+__all__ = ["bound", "ending_well", "serve"]
+
+
+@contextlib.contextmanager
+def ending_well() -> Generator[None]:
+    """Let SIGTERM end the body as SIGINT does, and take that for its end."""
+    before = signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    try:
+        with contextlib.suppress(KeyboardInterrupt):  # in the moment before uvicorn listens for it
+            yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def bound(host: str, number: int) -> socket.socket:

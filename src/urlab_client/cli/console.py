@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import webbrowser
-from contextlib import suppress
 
 from urlab_client._installation import install_command
 from urlab_client.cli._arguments import (
@@ -87,7 +86,9 @@ def run(arguments: ConsoleArguments) -> int:
     if arguments.host not in {"127.0.0.1", "::1", "localhost"} and not arguments.allow_host:
         raise CommandError(f"--host {arguments.host}: pass --allow-host NAME, the name under which browsers reach it")
     import_mujoco()
-    with suppress(KeyboardInterrupt):  # Ctrl-C in the moment before uvicorn listens for it
+    from urlab_client.cli._pages import ending_well  # noqa: PLC0415
+
+    with ending_well():
         asyncio.run(_serve(arguments))
     return 0
 

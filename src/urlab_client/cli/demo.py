@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from urlab_client._extras import need
 from urlab_client.cli._arguments import Commands, ServerArguments, add_keys, add_ports, count, running_address
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._files import replaced
 from urlab_client.cli._mujoco import import_mujoco
 from urlab_client.cli._output import output
-from urlab_client.integrations._extras import need
 
 if TYPE_CHECKING:
     from rich.console import Console

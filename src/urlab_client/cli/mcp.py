@@ -7,7 +7,6 @@ import os
 import secrets
 import sys
 import webbrowser
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -65,7 +64,8 @@ def add_parser(commands: Commands) -> None:
         description="Serve tools for agents over the Model Context Protocol, on standard input and output or, with "
         "--http, at an address on this machine. Without --allow-drive and --allow-edit an agent can only look. The "
         "console shows what it does; whoever acts there takes the controls from the agent. Messages for you, as the "
-        "console's link, are on standard error.",
+        "console's link, are on standard error. Ends with exit code 0 when its input ends, on SIGINT (Ctrl-C) and on "
+        "SIGTERM.",
         examples=(
             ("urlab mcp sim://quadruped --allow-drive", "a simulated robot for an agent that starts this command"),
             ("urlab mcp tcp://localhost", "look at a running server, and change nothing"),
@@ -147,7 +147,9 @@ def run(arguments: McpArguments) -> int:
         sim_seconds=arguments.max_seconds,
         wall_seconds=arguments.max_wall,
     )
-    with suppress(KeyboardInterrupt):
+    from urlab_client.cli._pages import ending_well  # noqa: PLC0415
+
+    with ending_well():
         asyncio.run(_serve(arguments, limits))
     return 0
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client._extras import need
 from urlab_client.cli._arguments import (
     Commands,
     ServerArguments,
@@ -21,7 +22,6 @@ from urlab_client.cli._arguments import (
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._files import check_ending, replaced
 from urlab_client.cli._mujoco import import_mujoco
-from urlab_client.integrations._extras import need
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.errors import URLabTimeoutError
 from urlab_client.protocol.names import did_you_mean

@@ -3,7 +3,7 @@
 Needs the extra `mcp`. `urlab mcp` runs it; `Agent` is for programs that bring their own client or transport.
 """
 
-from urlab_client.integrations._extras import need
+from urlab_client._extras import need
 
 need("mcp", "mcap", "PIL", "starlette", extra="mcp")
 

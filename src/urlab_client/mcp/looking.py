@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -17,8 +16,9 @@ from urlab_client.mcp.driving import Limits
 from urlab_client.mcp.results import Contacts, Explained, Log, Picture, RobotState, World
 from urlab_client.mcp.toolset import Toolset
 from urlab_client.protocol.client_types import Verdict
+from urlab_client.protocol.messages.streams import CameraSample
+from urlab_client.protocol.picture_files import JPEG_QUALITY
 from urlab_client.web.console_session import ConsoleSession
-from urlab_client.web.pictures import encoded
 
 __all__ = ["Looking"]
 
@@ -79,11 +79,9 @@ class Looking(Toolset):
         size: Annotated[int, Meta(description="Longest side in pixels, at most.", ge=16, le=1024)] = 512,
     ) -> tuple[Picture, bytes]:
         """Take a picture with a camera as the world is now. No time passes. Depth is grey, near is bright."""
-        view = self.client.camera(camera)
-        pixels = await view.capture()
-        jpeg = await anyio.to_thread.run_sync(partial(encoded, pixels, str(view.mode), size=size))
-        width, height = Image.open(io.BytesIO(jpeg)).size
-        shown = Picture(camera=camera, kind=str(view.mode), width=width, height=height)
+        sample = await self.client.camera(camera).capture()
+        jpeg, width, height = await anyio.to_thread.run_sync(_shrunk, sample, size)
+        shown = Picture(camera=camera, kind=str(sample.mode), width=width, height=height)
         return self.stamped(shown), jpeg
 
     @tool(Needs.READ, idempotent=True)
@@ -117,3 +115,12 @@ class Looking(Toolset):
         entries = [entry for entry in self.console.entries if entry.n > start]
         self._told = entries[-1].n if entries else start
         return self.stamped(Log(entries=entries, next=self._told))
+
+
+def _shrunk(sample: CameraSample, size: int) -> tuple[bytes, int, int]:
+    """Return a picture as JPEG with its longest side within a size, its width and its height."""
+    image = Image.open(io.BytesIO(sample.jpeg()))
+    image.thumbnail((size, size))
+    buffer = io.BytesIO()
+    image.save(buffer, "JPEG", quality=JPEG_QUALITY)
+    return buffer.getvalue(), *image.size

@@ -12,6 +12,7 @@ __all__ = [
     "ForkedError",
     "NotSettled",
     "OutcomeUnknown",
+    "PictureTimeout",
     "ProtocolError",
     "ServerUnreachable",
     "StreamOverflow",
@@ -127,6 +128,20 @@ class NotSettled(URLabTimeoutError):
     def __init__(self, message: str, *, remaining: dict[str, float], hint: str | None = None) -> None:
         super().__init__(message, hint=hint)
         self.remaining = remaining
+
+
+class PictureTimeout(URLabTimeoutError):
+    """Cameras delivered no picture in time.
+
+    Attributes:
+        cameras: Which ones.
+    """
+
+    cameras: list[str]
+
+    def __init__(self, message: str, *, cameras: list[str], hint: str | None = None) -> None:
+        super().__init__(message, hint=hint)
+        self.cameras = cameras
 
 
 class ProtocolError(URLabError):

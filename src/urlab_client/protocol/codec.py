@@ -115,7 +115,7 @@ def _to_wire(value: Any) -> Any:
         return cast("np.ndarray[Any, Any]", value).tolist()
     if isinstance(value, np.generic):
         return cast("np.generic[Any]", value).item()
-    raise TypeError(f"{type(value).__name__} cannot travel")
+    raise TypeError(f"a value of type {type(value).__name__} cannot be sent")
 
 
 _encoder = msgspec.msgpack.Encoder(enc_hook=_to_wire)
@@ -131,11 +131,14 @@ def encode_request(request: Request[Any], session_id: str, *, json: bool = False
     """Stamp `session_id` on `request` and return the bytes to send.
 
     Raises:
-        TypeError: A field holds something that cannot travel.
+        TypeError: A field holds something that cannot be sent.
         ValueError: The request is larger than `MAX_REQUEST_BYTES`.
     """
     request.session_id = session_id
-    frame = _json_ascii(request) if json else _encoder.encode(request)
+    try:
+        frame = _json_ascii(request) if json else _encoder.encode(request)
+    except TypeError as error:
+        raise TypeError(f"{op_of(request).name}: {error}") from None
     if len(frame) > MAX_REQUEST_BYTES:
         raise ValueError(
             f"{op_of(request).name}: a request of {len(frame)} bytes exceeds the limit {MAX_REQUEST_BYTES}"

@@ -7,15 +7,21 @@ wait, and one callback that takes the reply: the other looks find nothing, and t
 from __future__ import annotations
 
 import asyncio
+import select
+import selectors
 import sys
 import threading
+import time
 from collections import deque
+from collections.abc import Callable, Mapping
 from typing import Any
 
 __all__ = ["CallerLoop"]
 
 # Rounds of callbacks in a row after which sockets are looked at, though there are more callbacks to run.
 _ROUNDS = 4
+
+_READABLE = getattr(select, "EPOLLIN", None)
 
 # Of asyncio's own loop, not all of it public: unchanged from Python 3.11 to 3.14. Where one is missing, `run_forever`
 # does the work.
@@ -48,6 +54,8 @@ class CallerLoop(asyncio.SelectorEventLoop):
     def __init__(self) -> None:
         super().__init__()
         self._as_known = all(hasattr(self, name) for name in _NEEDED)
+        nothing: Mapping[int, Any] = {}
+        self._poll, self._keys = _parts(self._selector) if self._as_known else (None, nothing)
 
     def run_until_stopped(self) -> None:
         """Do what `run_forever` does. For whoever stops it soon."""
@@ -67,20 +75,49 @@ class CallerLoop(asyncio.SelectorEventLoop):
             sys.set_asyncgen_hooks(*hooks)
 
     def _run_rounds(self) -> None:
-        ready, select = self._ready, self._selector.select
+        ready = self._ready
         rounds = 0
         while not self._stopping:
             rounds += 1
             if ready and rounds < _ROUNDS:
                 for _ in range(len(ready)):
                     handle = ready.popleft()
-                    if not handle.cancelled():
+                    if not handle._cancelled:  # noqa: SLF001
                         handle._run()  # noqa: SLF001
                 continue
             rounds = 0
             scheduled = self._scheduled
-            left = scheduled[0].when() - self.time() if scheduled else None
+            left = scheduled[0]._when - time.monotonic() if scheduled else None  # noqa: SLF001  # the loop's own clock
             if ready or (left is not None and left <= 0):
                 self._run_once()  # which knows about timers
             else:
-                self._process_events(select(left))
+                self._wait(left)
+
+    def _wait(self, left: float | None) -> None:
+        """Wait for sockets, at most so many seconds, and run what one of them calls or queue what several call."""
+        poll = self._poll
+        if poll is None:
+            self._process_events(self._selector.select(left))
+            return
+        events = poll(left)
+        if len(events) == 1:
+            fd, mask = events[0]
+            key = self._keys.get(fd)
+            if mask == _READABLE and key is not None:
+                handle = key.data[0]
+                if handle is not None and not handle._cancelled:  # noqa: SLF001
+                    handle._run()  # noqa: SLF001  # nothing else is ready, so nothing is overtaken
+                    return
+        if events:  # they stay so until somebody has dealt with them
+            self._process_events(self._selector.select(0))
+
+
+def _parts(selector: Any) -> tuple[Callable[[float | None], list[tuple[int, int]]] | None, Mapping[int, Any]]:
+    """Return what an epoll selector asks the system with, and what it knows by descriptor: its own code takes longer.
+
+    None where it is another selector, or has other parts than from Python 3.11 to 3.14.
+    """
+    poll, keys = getattr(selector, "_selector", None), getattr(selector, "_fd_to_key", None)
+    if not isinstance(selector, getattr(selectors, "EpollSelector", ())) or poll is None or keys is None:
+        return None, {}
+    return poll.poll, keys

@@ -17,7 +17,7 @@ from urlab_client.protocol.base import Reply, Request
 from urlab_client.protocol.client_types import CallRecord, Diagnosis, Resync
 from urlab_client.protocol.enums import CameraTiming, ObservationLevel, StepMode, Transport
 from urlab_client.protocol.messages.session import OpInfo, ResetOk, StepOk
-from urlab_client.protocol.messages.streams import ClientEvent, RowSample, StateSnapshot, StreamPolicy
+from urlab_client.protocol.messages.streams import CameraSample, ClientEvent, RowSample, StateSnapshot, StreamPolicy
 from urlab_client.protocol.topics import TopicKind
 from urlab_client.sync._facade import FacadeRoot
 from urlab_client.sync.client_state import ClientState
@@ -308,6 +308,27 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
             TypeError: The predicate returns an awaitable.
         """
         return self._portal.call(self._aio.wait_until, predicate, timeout=timeout)
+
+    def capture(self, cameras: Collection[str] | None = None, *, timeout: Timeout = DEFAULT) -> dict[str, CameraSample]:
+        """Take pictures of several cameras now, in any step mode, without a step; see `URLabCameraView.capture`.
+
+        In `direct` and `puppet` mode, and while paused, all of them show the same moment.
+
+        Args:
+            cameras: Names, as `camera()` takes them; None for all there are.
+            timeout: Seconds to wait for all of them together; None waits without limit.
+
+        Returns:
+            The pictures by the names given.
+
+        Raises:
+            KeyError: There is no such camera, or there are several; nothing was sent.
+            TypeError: `cameras` is a name by itself.
+            PictureTimeout: Some came not in time; `.cameras` names them.
+            NoActiveManager: No play session runs.
+            ModeLocked: The project pins a mode in which pictures come with steps only.
+        """
+        return self._portal.call(self._aio.capture, cameras, timeout=timeout)
 
     def state_stream(
         self,

@@ -41,7 +41,6 @@ __all__ = ["app", "entrance"]
 
 _STATIC = Path(__file__).parent / "static"
 _LARGEST_BODY = 1024 * 1024
-_PICTURE_S = 5.0
 _AHEAD = 2  # states or pictures on their way to a browser that has not said that they came
 _VIEWER = "x-urlab-viewer"
 
@@ -139,7 +138,6 @@ class _Site:
             route("/api/connection", self._connection, "POST"),
             route("/api/invitations", self._invite, "POST"),
             Route("/api/session", entrance(self._access), methods=["POST"]),
-            route("/api/cameras/{path:path}.jpg", self._picture),
             WebSocketRoute("/api/live", self._live),
             WebSocketRoute("/api/cameras/{path:path}/live", self._pictures),
             Mount("/static", StaticFiles(directory=_STATIC)),
@@ -227,16 +225,6 @@ class _Site:
     async def _invite(self, request: Request) -> Response:
         token = self._access.invite()
         return _json(encode({"token": token, "path": f"{request.scope.get('root_path', '')}/?token={token}"}))
-
-    async def _picture(self, request: Request) -> Response:
-        feed = self.console.feed(request.path_params["path"])
-        if feed is None:
-            return _error(404, "unknown_camera", f"There is no camera {request.path_params['path']!r}.")
-        async with feed.watch():
-            with anyio.move_on_after(_PICTURE_S):
-                picture = await feed.after(0)
-                return Response(picture.jpeg, media_type="image/jpeg")
-        return _error(503, "no_picture", "The camera has sent no picture yet.", "Cameras send while physics runs live.")
 
     # WebSockets
 

@@ -230,4 +230,5 @@ _PATHS: dict[str, Any] = {
     "/api/invitations": _path("post", "invite", "Make a token for one more browser or program."),
     "/api/session": _path("post", "enter", "Spend a token for a key: `{token: str}`.", security=[]),
     "/api/cameras/{articulation}/{camera}.jpg": _path("get", "picture", "The newest picture of a camera."),
+    "/api/cameras/{articulation}/{camera}.png": _path("get", "png", "A picture without loss, taken now, in any mode."),
 }

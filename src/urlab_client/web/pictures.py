@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import io
 import time
 from collections.abc import AsyncGenerator
 from typing import TYPE_CHECKING, Any
@@ -12,17 +11,16 @@ from typing import TYPE_CHECKING, Any
 import anyio
 import anyio.to_thread
 import msgspec
-import numpy as np
-from PIL import Image
 
-from urlab_client.protocol.enums import CameraMode, StepMode
+from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import URLabError, URLabTimeoutError
 from urlab_client.protocol.messages.streams import CameraSample
+from urlab_client.protocol.picture_files import jpeg
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabCameraView, URLabClient
 
-__all__ = ["EncodedPicture", "Feed", "encoded"]
+__all__ = ["EncodedPicture", "Feed"]
 
 _FASTEST_S = 1 / 30
 _LOOK_S = 0.5
@@ -39,10 +37,10 @@ class EncodedPicture:
         head: What the browser is told about it.
     """
 
-    def __init__(self, seq: int, received_ns: int, sim_time: float | None, mode: str, data: bytes) -> None:
+    def __init__(self, seq: int, received_ns: int, sim_time: float | None, mode: str, encoded: bytes) -> None:
         self.seq = seq
         self.received_ns = received_ns
-        self.jpeg = data
+        self.jpeg = encoded
         self.head = msgspec.json.encode({"seq": seq, "received": received_ns / 1e6, "sim_time": sim_time, "mode": mode})
 
     def frame(self) -> bytes:
@@ -129,39 +127,8 @@ class Feed:
 
     async def _publish(self, pixels: Any, received_ns: int, sim_time: float | None) -> None:
         mode = str(self.view.mode)
-        data = await anyio.to_thread.run_sync(encoded, pixels, mode, abandon_on_cancel=True)
+        encoded = await anyio.to_thread.run_sync(jpeg, pixels, mode, _QUALITY, abandon_on_cancel=True)
         self._seq += 1
         async with self._changed:
-            self.newest = EncodedPicture(self._seq, received_ns, sim_time, mode, data)
+            self.newest = EncodedPicture(self._seq, received_ns, sim_time, mode, encoded)
             self._changed.notify_all()
-
-
-def encoded(pixels: Any, mode: str, kind: str = "JPEG", *, size: int | None = None) -> bytes:
-    """Encode a camera's pixels; depth becomes grey, near is bright.
-
-    Args:
-        pixels: What the camera gave.
-        mode: What the camera shows.
-        kind: `JPEG` or `PNG`.
-        size: Longest side in pixels, at most; default: as it is.
-    """
-    if mode == CameraMode.DEPTH:
-        image = Image.fromarray(_grey(np.asarray(pixels)))
-    elif mode == CameraMode.REAL:
-        image = Image.fromarray(np.ascontiguousarray(pixels[..., :3]))
-    else:
-        image = Image.fromarray(np.ascontiguousarray(pixels[..., 2::-1]))
-    if size is not None:
-        image.thumbnail((size, size))
-    buffer = io.BytesIO()
-    image.save(buffer, kind, quality=_QUALITY)
-    return buffer.getvalue()
-
-
-def _grey(depth: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    seen = depth[np.isfinite(depth)]
-    if not seen.size:
-        return np.zeros(depth.shape, np.uint8)
-    near, far = np.percentile(seen, [1, 95])
-    share = np.clip((far - np.nan_to_num(depth, posinf=far, neginf=near)) / max(far - near, 1e-6), 0, 1)
-    return (share * 255).astype(np.uint8)

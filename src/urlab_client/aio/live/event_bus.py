@@ -8,6 +8,7 @@ from typing import get_args
 
 import msgspec
 
+from urlab_client.aio.arguments import collection
 from urlab_client.aio.streams import Stream
 from urlab_client.aio.transport.subscriber import MessageHandler, client_closed
 from urlab_client.protocol.layouts import BytesLike
@@ -147,10 +148,8 @@ class _EventSource:
 
 
 def _topics(kinds: Collection[str | type[ClientEvent]]) -> frozenset[bytes]:
-    if isinstance(kinds, str):
-        raise TypeError(f"kinds takes a collection of kinds, such as ({kinds!r},), not one of them")
     names: set[str] = set()
-    for kind in kinds:
+    for kind in collection("kinds", kinds):
         name = kind if isinstance(kind, str) else next((name for name, one in _KINDS.items() if one is kind), None)
         if name not in _KINDS:
             suggested = did_you_mean(str(name), _KINDS)

@@ -174,7 +174,7 @@ class LatestPicture(MessageHandler):
         self._source.detach(self)
         self.newest()  # what the camera is like now may not hold when somebody looks
 
-    def deliver(self, pixels: Pixels, sim_time: float, frame_id: int | None = None) -> None:
+    def deliver(self, pixels: Pixels, sim_time: float | None, frame_id: int | None = None) -> None:
         """Take over a picture that a reply carried."""
         with self._lock:
             self._message = None

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 
 import numpy as np
 
+from urlab_client.aio.deadline import Timeout
 from urlab_client.aio.live.camera_source import CameraSource, HasCamera
 from urlab_client.aio.live.camera_switch import CameraSwitch
 from urlab_client.aio.live.derived_rows import DerivedRowSource, HasRows
@@ -19,7 +20,7 @@ from urlab_client.aio.transport.subscriber import Subscriptions, client_closed
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.features import Features
-from urlab_client.protocol.messages.streams import StreamPolicy
+from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
 from urlab_client.protocol.pixels import Pixels
 from urlab_client.protocol.topics import TopicKind
 
@@ -66,8 +67,11 @@ class Publishers:
         events: What happens to the client.
         regions: What is being received from shared memory; None for a client that does not.
         camera_switch: Switches cameras on and off; None where they stream anyway.
+        capture: Takes pictures of cameras without a step; the client sets it.
         own_steps: Feeds those who receive snapshots from the client's own steps.
     """
+
+    capture: Callable[[Sequence[HasCamera], Timeout], Awaitable[list[CameraSample]]]
 
     def __init__(
         self,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 
+from urlab_client.aio.arguments import collection
 from urlab_client.aio.live.source import PublishedSource
 from urlab_client.aio.live.state_source import StateSource
 from urlab_client.aio.transport.subscriber import Subscription, Subscriptions
@@ -61,8 +62,8 @@ class RowSource(PublishedSource):
         super().__init__(subscriptions)
         self._endpoint = endpoint
         self.articulations = frozenset(articulations)
-        self._components = frozenset(components)
-        self._kinds = frozenset(TopicKind(kind) for kind in kinds)
+        self._components = frozenset(collection("components", components))
+        self._kinds = frozenset(TopicKind(kind) for kind in collection("kinds", kinds))
         if not self._kinds:
             self._kinds = _OF_COMPONENT if components else _OF_ARTICULATION
             self._kinds |= _OF_SCENE if entities and not components else frozenset()

@@ -156,6 +156,7 @@ class Actuator:
             ValueError: It is not a position servo, or there is no local model to tell.
         """
         record, model = self._record, self._record.mirror.model
+        position = finite("set_point_for", position)
         if record.takes_positions:
             return position
         if model is None or set_point_meaning(model, self.id)[0] != "position":

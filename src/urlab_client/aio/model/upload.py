@@ -78,6 +78,7 @@ def flatten(model: str | os.PathLike[str] | mujoco.MjSpec) -> FlatModel:
     """Read a model and everything it includes, check it, and put it in the form in which it is sent. Blocking.
 
     Raises:
+        TypeError: It is neither a path nor a spec.
         FileNotFoundError: There is no such file.
         ValueError: MuJoCo rejects it, or it is larger than servers accept.
     """
@@ -86,6 +87,8 @@ def flatten(model: str | os.PathLike[str] | mujoco.MjSpec) -> FlatModel:
     from urlab_client._mujoco import flat_model  # noqa: PLC0415
 
     given = cast("Any", model)
+    if not isinstance(model, (str, os.PathLike, mujoco.MjSpec)):
+        raise TypeError(f"upload_model: model takes a path or an MjSpec, got {given!r:.80}.")
     path = None if isinstance(given, mujoco.MjSpec) else Path(given)
     if path is not None and not path.is_file():
         raise FileNotFoundError(f"upload_model: {path} does not exist or is not a file")

@@ -7,6 +7,7 @@ from typing import Literal, TypeVar, overload
 
 from msgspec import Struct
 
+from urlab_client.aio.arguments import numbers
 from urlab_client.aio.deadline import Timeout
 from urlab_client.aio.jobs import OnProgress
 from urlab_client.aio.session import Session
@@ -53,11 +54,12 @@ def as_vec3(name: str, values: Vector | None) -> Vec3 | None:
     """Return three numbers as a tuple, None for None.
 
     Raises:
+        TypeError: They are not numbers.
         ValueError: There are more or fewer.
     """
     if values is None:
         return None
-    x, y, z = _numbers(name, values, 3)
+    x, y, z = numbers(name, values, 3)
     return x, y, z
 
 
@@ -69,16 +71,10 @@ def as_quat(name: str, values: Vector | None) -> Quat | None:
     """Return four numbers as a tuple, None for None.
 
     Raises:
+        TypeError: They are not numbers.
         ValueError: There are more or fewer.
     """
     if values is None:
         return None
-    a, b, c, d = _numbers(name, values, 4)
+    a, b, c, d = numbers(name, values, 4)
     return a, b, c, d
-
-
-def _numbers(name: str, values: Vector, count: int) -> list[float]:
-    numbers = [float(value) for value in values]
-    if len(numbers) != count:
-        raise ValueError(f"{name} takes {count} numbers, got {len(numbers)}")
-    return numbers

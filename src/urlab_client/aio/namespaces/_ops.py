@@ -29,7 +29,6 @@ from urlab_client.protocol.messages.runtime import (
     ReadMocapPose,
     SetControlSource,
     SetMocapPose,
-    SetPaused,
     SetSimSpeed,
     SetTwist,
 )
@@ -59,19 +58,6 @@ __all__ = ["DebugOps", "FarmOps", "OutlinerOps", "ReplayOps", "RuntimeOps", "Sce
 
 class RuntimeOps(Namespace):
     """Generated part of `client.runtime`."""
-
-    async def set_paused(self, paused: bool, *, timeout: Timeout = DEFAULT) -> bool:
-        """Pause or resume physics and return the state in force.
-
-        Args:
-            paused: True to pause.
-            timeout: Seconds to wait; None waits without limit.
-
-        Raises:
-            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            MissingField: A required field is absent, empty or malformed.
-        """
-        return (await self._call(SetPaused(paused=paused), timeout)).paused
 
     async def set_sim_speed(self, percent: float, *, timeout: Timeout = DEFAULT) -> float:
         """Set the pacing of live mode and return the value in force.

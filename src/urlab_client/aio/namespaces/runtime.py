@@ -8,8 +8,9 @@ from typing import Any, cast
 import msgspec
 import numpy as np
 
+from urlab_client.aio.arguments import mapping
 from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.model.numbers import finite
+from urlab_client.aio.model.numbers import finite, is_array
 from urlab_client.aio.namespaces._base import Vector, fill, target_by
 from urlab_client.aio.namespaces._ops import RuntimeOps
 from urlab_client.aio.session import Session
@@ -30,6 +31,7 @@ from urlab_client.protocol.messages.runtime import (
     ContactFilter,
     GetContacts,
     SetMode,
+    SetPaused,
     SetQpos,
     SetSimOptions,
     SetUserChannels,
@@ -49,6 +51,17 @@ class RuntimeNamespace(RuntimeOps):
     def __init__(self, session: Session, state: SimState) -> None:
         super().__init__(session)
         self._state = state
+
+    async def set_paused(self, paused: bool, *, timeout: Timeout = DEFAULT) -> bool:
+        """Pause or resume physics and return the state in force.
+
+        Args:
+            paused: True to pause.
+            timeout: Seconds to wait; None waits without limit.
+        """
+        state = self._state
+        state.paused = (await self._call(SetPaused(paused=paused), timeout)).paused
+        return state.paused
 
     async def set_qpos(self, target: str, qpos: Vector, *, by_name: bool = False, timeout: Timeout = DEFAULT) -> None:
         """Write joint positions of an articulation, run `mj_forward`, and mirror the result into `client.data`.
@@ -74,6 +87,8 @@ class RuntimeNamespace(RuntimeOps):
             self._state.mirror_qpos(reply.actor_name, reply.qpos)
 
     def _positions(self, target: str, qpos: Vector, *, by_name: bool) -> Floats:
+        if not is_array(qpos):
+            raise TypeError(f"set_qpos takes numbers, got {qpos!r:.80}.")
         values = tuple(qpos)
         arts = self._state.objects.articulations if by_name else self._state.objects.articulations_by_id
         joints = {j.qpos_local_offset: name for name, j in arts[target].joints.items()} if target in arts else {}
@@ -167,10 +182,14 @@ class RuntimeNamespace(RuntimeOps):
             KeyError: Unknown articulation; nothing was sent.
             UnknownOp: The server has no such channels.
         """
+        given = mapping("set_user_channels: arts", arts or {}, "articulation keys to channels")
+        robots = {
+            key: dict(mapping(f"set_user_channels: {key!r}", channels, "channels to values"))
+            for key, channels in given.items()
+        }
         request = SetUserChannels(
-            arts={self._state.objects.articulations[key].prefix: dict(values) for key, values in (arts or {}).items()}
-            or None,
-            scene=None if scene is None else dict(scene),
+            arts={self._state.objects.articulations[key].prefix: channels for key, channels in robots.items()} or None,
+            scene=None if scene is None else dict(mapping("set_user_channels: scene", scene, "channels to values")),
         )
         return (await self._call(request, timeout)).rejected
 
@@ -196,7 +215,8 @@ class RuntimeNamespace(RuntimeOps):
             UnknownOp: A camera is to be switched off by a server whose cameras always stream; nothing was sent.
             GameThreadTimeout: The editor is busy; it may still do it later.
         """
-        wanted = {name: _transports(how) for name, how in cameras.items()}
+        given = mapping("set_camera_streaming", cameras, "cameras to whether, or where, they stream")
+        wanted = {name: _transports(name, how) for name, how in given.items()}
         topics = {name: self._camera_topic("set_camera_streaming", name) for name in wanted}
         switch = self._state.publishers.camera_switch
         if switch is None or not self._session.features.camera_switch:
@@ -224,7 +244,8 @@ class RuntimeNamespace(RuntimeOps):
             UnknownOp: The server has no such latency.
             GameThreadTimeout: The editor is busy; it may still do it later.
         """
-        wanted = {name: _latency(name, delay) for name, delay in cameras.items()}
+        given = mapping("set_camera_delay", cameras, "cameras to seconds")
+        wanted = {name: _latency(name, delay) for name, delay in given.items()}
         topics = {name: self._camera_topic("set_camera_delay", name) for name in wanted}
         request = SetCameraDelay(cameras={topics[name]: delay for name, delay in wanted.items()})
         told = (await self._call(request, timeout)).cameras if wanted else {}
@@ -279,9 +300,11 @@ class RuntimeNamespace(RuntimeOps):
             return reply
 
 
-def _transports(wanted: bool | CameraTransports) -> CameraTransports:
+def _transports(name: str, wanted: bool | CameraTransports) -> CameraTransports:
     if isinstance(wanted, bool):
         return CameraTransports(zmq=wanted, shm=wanted)
+    if not isinstance(wanted, CameraTransports):
+        raise TypeError(f"set_camera_streaming: camera {name!r} takes a bool or CameraTransports, got {wanted!r:.80}.")
     if wanted.zmq is None and wanted.shm is None:
         return CameraTransports(zmq=True, shm=True)
     return CameraTransports(zmq=bool(wanted.zmq), shm=bool(wanted.shm))

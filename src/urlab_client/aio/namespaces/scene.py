@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, TypeVar
 import anyio
 
 from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.model.numbers import finite
 from urlab_client.aio.model.upload import flatten, upload
 from urlab_client.aio.namespaces._base import Vector, as_quat, as_vec3, target_by
 from urlab_client.aio.namespaces._ops import SceneOps
@@ -154,7 +155,7 @@ class SceneNamespace(SceneOps):
             actor_id=actor_id,
             location=as_vec3("location", location),
             rotation_euler=euler,
-            intensity=float(intensity),
+            intensity=finite("spawn_light: intensity", intensity),
             color=as_vec3("color", color),
         )
         reply = await self._call(request, timeout)
@@ -368,7 +369,9 @@ class SceneNamespace(SceneOps):
             ValueError: Two assets share an actor id; nothing was done. Or two MJCF files would have to be uploaded.
             URLabRPCError: From the op that failed; what was placed before it stays.
         """
-        wanted = list(assets)
+        wanted = list(assets) if isinstance(assets, Iterable) else [assets]
+        if strange := [asset for asset in wanted if not isinstance(asset, URLabAsset)]:
+            raise TypeError(f"apply_scene takes URLabAsset objects, got {strange[0]!r:.80}.")
         ids = [asset.actor_id for asset in wanted]
         twice = sorted({i for i in ids if ids.count(i) > 1})
         if twice:
@@ -416,7 +419,11 @@ class SceneNamespace(SceneOps):
 
 
 def _class_path(blueprint: URLabBlueprint | str) -> str:
-    return blueprint if isinstance(blueprint, str) else blueprint.class_path
+    if isinstance(blueprint, str):
+        return blueprint
+    if not isinstance(blueprint, URLabBlueprint):
+        raise TypeError(f"blueprint takes what import_xml() returns, or a class path, got {blueprint!r:.80}.")
+    return blueprint.class_path
 
 
 def _scene_actor(row: SnapshotRow) -> SceneActor:

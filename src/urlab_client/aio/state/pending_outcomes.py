@@ -45,12 +45,14 @@ class PendingOutcomes:
         reset: Whether a reset is among them.
         keyframe: Compiled keyframe of that reset.
         mode: Step mode that was asked for, or None.
+        paused: Whether physics may be paused for pictures, see `stopped_live`.
         play: Whether a start of play was broken off, so that another world may be playing than the client knows.
     """
 
     def __init__(self) -> None:
         self.connects = 0
         self.mode: StepMode | str | None = None
+        self.paused = False
         self.play = False
         self.clear()
 

@@ -29,6 +29,7 @@ async def resync(state: SimState, discovery: Discovery, *, timeout: Timeout = DE
     """
     async with state.session.turn(Forward, timeout=timeout) as turn:
         pending, state.pending = state.pending, PendingOutcomes()
+        state.pending.paused = pending.paused
         try:
             return await _resync(state, discovery, pending, turn)
         except BaseException:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from urlab_client.aio.arguments import mapping, text
 from urlab_client.aio.model.mirror import model_names
 from urlab_client.aio.model.numbers import finite
 from urlab_client.aio.session import Turn
@@ -30,7 +31,8 @@ async def take_reset(
     """
     state.require_handshake("reset")
     articulations = state.objects.articulations
-    overrides = {articulations[key].prefix: _joint_values(state, key, values) for key, values in qpos.items()}
+    given = mapping("reset: per_articulation_qpos", qpos, "articulation keys to joint positions")
+    overrides = {articulations[key].prefix: _joint_values(state, key, values) for key, values in given.items()}
     request = Reset(
         keyframe_name=None if keyframe is None else _compiled_keyframe(state, keyframe),
         seed=seed,
@@ -49,12 +51,14 @@ async def take_reset(
 
 def _joint_values(state: SimState, key: str, values: Mapping[str, float]) -> dict[str, float]:
     joints = state.objects.articulations[key].joints
-    live = {(joints[name].name if joints else name): value for name, value in values.items()}
+    given = mapping(f"reset: per_articulation_qpos of {key!r}", values, "joint names to numbers")
+    live = {(joints[name].name if joints else name): value for name, value in given.items()}
     return {name: finite(f"reset: joint {name!r} of {key!r}", value) for name, value in live.items()}
 
 
 def _compiled_keyframe(state: SimState, name: str) -> str:
     """Return the compiled name; only that is known to the server."""
+    text("reset: keyframe_name", name)
     model = state.mirror.model
     if model is None:
         return name

@@ -7,6 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
 
+from urlab_client.aio.arguments import text
 from urlab_client.aio.articulation import URLabArticulation, URLabEntity
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.live.publishers import Publishers
@@ -91,7 +92,7 @@ class SceneObjects:
             KeyError: None of them, or several.
         """
         names = self.camera_names()
-        owner, slash, short = name.rpartition("/")
+        owner, slash, short = text("camera", name).rpartition("/")
         if slash:
             art = self.articulations.get(owner)
             found = [f"{art.prefix}/{short}"] if art is not None and short in art.cameras else []

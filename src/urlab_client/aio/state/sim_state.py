@@ -76,6 +76,7 @@ class SimState:
         promoted_from: Mode to go back to on close, after a promotion of our own; maybe one that only the server knows.
         mode_word: What the server called the step mode when it last told it.
         level: Observation level of the session.
+        paused: Whether this client has paused physics, as far as that lasts.
         sent_level: Observation level the server has, which an earlier step may have changed.
         hello: The last handshake, without the model's bytes.
         step_count: Steps since the last handshake or reset.
@@ -108,6 +109,7 @@ class SimState:
         self.promoted_from: StepMode | str | None = None
         self.mode_word = ""
         self.level = "standard"
+        self.paused = False
         self.sent_level = "standard"
         self.hello: HelloOk | None = None
         self.step_count = 0
@@ -382,6 +384,7 @@ class SimState:
         if self.publishers.camera_switch is not None:
             self.publishers.camera_switch.forget()
         self.mode = StepMode.LIVE
+        self.paused = False
         self.promoted_from = None
         if played:
             self.publishers.events.publish(PlayEnded(reason=reason))

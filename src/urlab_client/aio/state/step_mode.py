@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
+from collections.abc import AsyncGenerator
+
+import anyio
 
 from urlab_client.aio.session import Turn
 from urlab_client.aio.state.pending_outcomes import leaves_open
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.protocol.enums import LATER_MODE_NAMES, StepMode, known
 from urlab_client.protocol.errors import BadMode, ModeLocked
-from urlab_client.protocol.messages.runtime import SetMode, SetPaused
+from urlab_client.protocol.messages.runtime import SetMode, SetModeOk, SetPaused
 
-__all__ = ["ask_mode", "promote"]
+__all__ = ["ask_mode", "promote", "settle_mode", "stopped_live"]
 
 
 log = logging.getLogger("urlab_client.client")
@@ -27,12 +31,7 @@ async def ask_mode(state: SimState, turn: Turn, mode: StepMode | str) -> StepMod
     """
     try:
         with state.pending.about_mode(mode):
-            try:
-                reply = await turn.call(SetMode(mode=mode))
-            except BadMode:
-                # Servers after the beta call the modes by other names.
-                later = LATER_MODE_NAMES.get(mode) if isinstance(mode, StepMode) else None
-                reply = await turn.call(SetMode(mode=later or mode))
+            reply = await _request(turn, mode)
     except ModeLocked as locked:
         if locked.pinned is not None:
             state.mode = locked.pinned
@@ -54,7 +53,57 @@ async def ask_mode(state: SimState, turn: Turn, mode: StepMode | str) -> StepMod
             await _still_puppet(turn, previous if isinstance(previous, StepMode) else state.mode, current)
     finally:
         state.mode = current
+        if current is not StepMode.LIVE:
+            state.paused = False  # a change of mode resumes physics
     return previous
+
+
+async def _request(turn: Turn, mode: StepMode | str) -> SetModeOk:
+    try:
+        return await turn.call(SetMode(mode=mode))
+    except BadMode:
+        # Servers after the beta call the modes by other names.
+        later = LATER_MODE_NAMES.get(mode) if isinstance(mode, StepMode) else None
+        return await turn.call(SetMode(mode=later or mode))
+
+
+async def settle_mode(state: SimState, turn: Turn) -> None:
+    """Bring the server into the mode that it is to be in, where a lost reply or a broken-off call left it in doubt."""
+    pending = state.pending
+    if pending.mode is not None:
+        await ask_mode(state, turn, pending.mode)
+    if pending.paused:
+        await turn.call(SetPaused(paused=_rests(state)))
+        pending.paused = False
+
+
+def _rests(state: SimState) -> bool:
+    """Whether physics is paused while this client does not step, by the user or because it would idle."""
+    return state.paused or (state.mode is StepMode.PUPPET and state.session.features.idles_in_puppet)
+
+
+@contextlib.asynccontextmanager
+async def stopped_live(state: SimState, turn: Turn) -> AsyncGenerator[None]:
+    """Bring a server that steps on request into live mode, paused, so that the body finds time standing still there.
+
+    The client's own step mode stays what it is, and so does the simulation. If the way back fails, it is taken before
+    the next step.
+
+    Raises:
+        ModeLocked: The project pins the mode; nothing was changed.
+    """
+    mode = state.mode
+    await _request(turn, mode)  # changes nothing, but is refused where the mode is pinned
+    state.pending.mode, state.pending.paused = mode, True
+    try:
+        await turn.call(SetPaused(paused=True))  # before: entering live mode does not pause
+        await _request(turn, StepMode.LIVE)
+        yield
+    finally:
+        with anyio.CancelScope(shield=True):  # its requests have deadlines
+            await _request(turn, mode)
+            await turn.call(SetPaused(paused=_rests(state)))
+        state.pending.mode, state.pending.paused = None, False
 
 
 async def _still_puppet(turn: Turn, previous: StepMode, current: StepMode) -> None:

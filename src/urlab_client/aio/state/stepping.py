@@ -5,12 +5,13 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 
+from urlab_client.aio.arguments import mapping
 from urlab_client.aio.model.articulation_state import Carried, give_back
 from urlab_client.aio.session import Turn
 from urlab_client.aio.state.pending_outcomes import leaves_open
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_commands import direct_commands, live_commands, take_wrenches
-from urlab_client.aio.state.step_mode import ask_mode
+from urlab_client.aio.state.step_mode import settle_mode
 from urlab_client.aio.state.step_pictures import StepPictures
 from urlab_client.protocol.codec import op_of
 from urlab_client.protocol.enums import CameraTiming, StepMode
@@ -33,8 +34,7 @@ async def take_steps(state: SimState, turn: Turn, n_steps: int, cameras: Cameras
         asked: Observation level of the reply, None for the session's.
     """
     state.require_handshake("step")
-    if state.pending.mode is not None:
-        await ask_mode(state, turn, state.pending.mode)
+    await settle_mode(state, turn)
     mode = state.mode
     if n_steps < (0 if mode is StepMode.PUPPET else 1):
         raise ValueError(_too_few(n_steps, mode))
@@ -165,7 +165,11 @@ async def _pictures(state: SimState, turn: Turn, cameras: Cameras, n_steps: int)
         for observer in state.observers:
             await observer.ready()
     asked: bool | dict[str, str | None]
-    asked = cameras if isinstance(cameras, bool) else {name: str(CameraTiming(how)) for name, how in cameras.items()}
+    if isinstance(cameras, bool):
+        asked = cameras
+    else:
+        given = mapping("step: include_cameras", cameras, "camera names to 'latest' or 'sync', or a bool")
+        asked = {name: str(CameraTiming(how)) for name, how in given.items()}
     if state.observers:
         asked = state.objects.with_cameras(asked, state.observed_cameras(n_steps))
     pictures = StepPictures(state, asked)

@@ -24,6 +24,7 @@ from urlab_client.aio.transport import context as shared_context
 from urlab_client.aio.transport.base import LateReply, TransportStats
 from urlab_client.aio.transport.busy_poll import BusyPoll
 from urlab_client.aio.transport.curve import ClientKeys
+from urlab_client.aio.transport.delivery import deliver
 from urlab_client.aio.transport.readiness import Readiness, watch_socket
 from urlab_client.protocol.base import Effect, Op
 from urlab_client.protocol.codec import MAX_REPLY_BYTES
@@ -153,7 +154,7 @@ class ZmqTransport:
                     raise self._clogged(op) from None
                 continue
             break
-        reply = loop.create_future()
+        reply: asyncio.Future[bytes] = loop.create_future()
         self._sent[key] = _Sent(op, reply, started, deadline)
         self.stats.sent += 1
         sent = time.perf_counter()
@@ -294,7 +295,7 @@ class ZmqTransport:
         self._timer = loop.call_at(deadline, self._expire, loop)
 
     def _expire(self, loop: asyncio.AbstractEventLoop) -> None:
-        self._on_readable()  # what came while the loop was busy counts; uvloop looks at its timers first
+        self._take()  # what came while the loop was busy counts; uvloop looks at its timers first
         due = self._due  # and not the time: the loop may be early by its resolution
         self._timer = None
         for entry in self._sent.values():
@@ -321,39 +322,54 @@ class ZmqTransport:
         """Take what is there, where nothing has told that anything is."""
         socket = self._socket
         if socket is not None and not self._closed and cast("int", socket.get(_EVENTS)) & _POLLIN:
-            self._on_readable()
+            self._take()
 
     def _on_readable(self) -> None:
+        """Take what came; whoever waits for it goes on here. The loop's callback."""
+        answered = self._receive()
+        if answered is not None:
+            deliver(*answered)
+
+    def _take(self) -> None:
+        """Take what came; whoever waits for it goes on in the loop's next turn."""
+        answered = self._receive()
+        if answered is not None:
+            answered[0].set_result(answered[1])
+
+    def _receive(self) -> tuple[asyncio.Future[bytes], bytes] | None:
+        """Read until nothing is left that anybody waits for; return the last one who waits, and the reply."""
         socket = self._socket
         if socket is None or self._closed:
-            return
+            return None
         receive, get = socket.recv, cast("Callable[[int], int]", socket.get)
-        # The descriptor is edge-triggered: read until nothing is left.
         while True:
             try:
                 key = receive(_NOBLOCK)
                 delimiter = receive(_NOBLOCK)
                 last = receive(_NOBLOCK, copy=False)  # which says by itself whether it is the last
             except zmq.Again:
-                return
+                return None
             if delimiter or last.more:
                 while get(_RCVMORE):
                     receive(_NOBLOCK)
                 self._drop_stray()
-            else:
-                self._deliver(key, last.bytes)
-            if not get(_EVENTS) & _POLLIN:
-                return
-
-    def _deliver(self, key: bytes, answer: bytes) -> None:
-        if self._silent_since is not None and self._loop is not None:
-            silent, self._silent_since = self._loop.time() - self._silent_since, None
-            self._tell(ServerAnswers(endpoint=self._endpoint, silent_s=silent))
-        entry = self._sent.get(key)
-        if entry is not None and not entry.reply.done():
+                continue
+            if (silent := self._silent_since) is not None and self._loop is not None:
+                self._silent_since = None
+                self._tell(ServerAnswers(endpoint=self._endpoint, silent_s=self._loop.time() - silent))
+            entry = self._sent.get(key)
+            if entry is None or entry.reply.done():
+                self._deliver_late(key, last.bytes)
+                continue
             self.stats.received += 1
-            entry.reply.set_result(answer)
-        elif (late := self._late.pop(key, None)) is not None:
+            if len(self._sent) == 1 and not self._late:
+                # What may be left is a reply that nobody waits for. Before the next wait the socket is asked what it
+                # has: its descriptor does not tell of what has been there for long.
+                return entry.reply, last.bytes
+            entry.reply.set_result(last.bytes)
+
+    def _deliver_late(self, key: bytes, answer: bytes) -> None:
+        if (late := self._late.pop(key, None)) is not None:
             self.stats.late += 1
             late.set_result(answer)
         else:
@@ -410,7 +426,7 @@ class ZmqTransport:
         self.fail_waiting(AuthenticationFailed(text, hint=hint))
 
     def _lose(self) -> None:
-        self._on_readable()  # what arrived before the line broke still counts
+        self._take()  # what arrived before the line broke still counts
         if self._connected:
             log.info("lost %s; reconnecting", self._endpoint)
             if self._loop is not None:

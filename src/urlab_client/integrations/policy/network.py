@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from urlab_client.integrations._extras import need
+from urlab_client._extras import need
 from urlab_client.integrations.policy.spec import PolicyFileError
 from urlab_client.protocol.base import Floats
 

@@ -3,7 +3,7 @@
 Needs the extra `mcap`; `video` and `dataset` for some conversions.
 """
 
-from urlab_client.integrations._extras import need
+from urlab_client._extras import need
 
 need("mcap", "PIL", extra="mcap")
 

@@ -15,7 +15,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.integrations._extras import need
+from urlab_client._extras import need
 from urlab_client.integrations.record.lerobot_writer import write_lerobot
 from urlab_client.integrations.record.pixels import even, farthest, visible
 from urlab_client.integrations.record.reader import Run

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Literal, overload
 import numpy as np
 from msgspec import Struct
 
+from urlab_client._extras import need
 from urlab_client.aio.client import URLabClient as AsyncClient
-from urlab_client.integrations._extras import need
 from urlab_client.integrations._feed.messages import (
     ArticulationMessage,
     ContactsMessage,

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Literal, overload
 
 import numpy as np
 
+from urlab_client._extras import need
 from urlab_client.aio.client import URLabClient as AsyncClient
-from urlab_client.integrations._extras import need
 from urlab_client.integrations._feed.messages import FrameTransform, Time
 from urlab_client.integrations._feed.samples import CameraPicture, State, compressed
 from urlab_client.integrations._feed.scene_messages import SceneMessages, Simulation, calibration

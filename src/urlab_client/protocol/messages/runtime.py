@@ -270,9 +270,6 @@ OPS: Final = (
         ns="runtime",
         needs=Needs.MANAGER,
         errors=("not_ready", "missing_field"),
-        generated=True,
-        returns="paused",
-        positional=1,
     ),
     Op(
         request=ConfigureController,

@@ -14,6 +14,7 @@ from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.errors import ProtocolError
 from urlab_client.protocol.layouts import BytesLike
 from urlab_client.protocol.messages.session import ArticulationState, Clock, EntityState, StateReply, StepOk
+from urlab_client.protocol.picture_files import JPEG_QUALITY, jpeg, png
 from urlab_client.protocol.pixels import Pixels
 from urlab_client.protocol.rows import Row
 from urlab_client.protocol.serializable import Serializable
@@ -161,6 +162,28 @@ class CameraSample(StreamItem, kw_only=True, eq=False):
     frame_id: Annotated[int | None, doc("The server's number of the picture; None from the plugin.")] = None
     sim_time: Annotated[float | None, doc("Simulation time of the picture, seconds; None from the plugin.")] = None
     capture_time: Annotated[float | None, doc("Unix time of the picture, seconds; None from the plugin.")] = None
+
+    def png(self) -> bytes:
+        """Return it as PNG, without loss: colours as RGB, depth as 16-bit grey in millimetres, 0 beyond 65.535 m.
+
+        Encoding takes milliseconds, so async code calls it with `asyncio.to_thread`.
+
+        Raises:
+            MissingExtra: Pillow is not installed; the message has the command.
+        """
+        return png(self.pixels, self.mode)
+
+    def jpeg(self, quality: int = JPEG_QUALITY) -> bytes:
+        """Return it as JPEG, to be looked at: colours, or depth as grey, near is bright.
+
+        Args:
+            quality: 1 to 100.
+
+        Raises:
+            MissingExtra: Pillow is not installed; the message has the command.
+            ValueError: There is no such quality.
+        """
+        return jpeg(self.pixels, self.mode, quality)
 
 
 class ClientEvent(StreamItem, tag_field="event", kw_only=True, omit_defaults=True):

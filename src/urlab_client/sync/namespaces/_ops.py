@@ -20,19 +20,6 @@ class RuntimeOps(Facade, twin=aio.RuntimeOps):
     __slots__ = ()
     _aio: aio.RuntimeOps
 
-    def set_paused(self, paused: bool, *, timeout: Timeout = DEFAULT) -> bool:
-        """Pause or resume physics and return the state in force.
-
-        Args:
-            paused: True to pause.
-            timeout: Seconds to wait; None waits without limit.
-
-        Raises:
-            NotReady: The play session has no compiled model (yet), or the part of it the op needs is missing.
-            MissingField: A required field is absent, empty or malformed.
-        """
-        return self._portal.call(self._aio.set_paused, paused, timeout=timeout)
-
     def set_sim_speed(self, percent: float, *, timeout: Timeout = DEFAULT) -> float:
         """Set the pacing of live mode and return the value in force.
 

@@ -30,6 +30,15 @@ class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
     __slots__ = ()
     _aio: aio.RuntimeNamespace  # pyright: ignore[reportIncompatibleVariableOverride]  # never assigned after construction
 
+    def set_paused(self, paused: bool, *, timeout: Timeout = DEFAULT) -> bool:
+        """Pause or resume physics and return the state in force.
+
+        Args:
+            paused: True to pause.
+            timeout: Seconds to wait; None waits without limit.
+        """
+        return self._portal.call(self._aio.set_paused, paused, timeout=timeout)
+
     def set_qpos(self, target: str, qpos: Vector, *, by_name: bool = False, timeout: Timeout = DEFAULT) -> None:
         """Write joint positions of an articulation, run `mj_forward`, and mirror the result into `client.data`.
 

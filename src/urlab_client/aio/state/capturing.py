@@ -1,0 +1,279 @@
+"""Pictures without a step: `camera.capture()` and `client.capture()`.
+
+Newer servers draw on request in live mode, older ones only publish pictures there: then the client waits for one that
+was taken after the call. In `direct` and `puppet`, where a request for pictures would be a step, the server is brought
+into live mode for that long, paused.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from urlab_client.aio.cameras import URLabCameraView
+from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.live.camera_source import FIRST_PICTURE_S, CameraSource, HasCamera
+from urlab_client.aio.session import Turn
+from urlab_client.aio.state.sim_state import SimState
+from urlab_client.aio.state.step_mode import stopped_live
+from urlab_client.aio.streams import Stream
+from urlab_client.aio.transport.subscriber import MessageHandler
+from urlab_client.protocol.codec import op_of
+from urlab_client.protocol.enums import StepMode
+from urlab_client.protocol.errors import (
+    ModeLocked,
+    NoActiveManager,
+    PictureTimeout,
+    ProtocolError,
+    URLabError,
+    URLabTimeoutError,
+)
+from urlab_client.protocol.layouts import BytesLike
+from urlab_client.protocol.messages.session import Step
+from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
+from urlab_client.protocol.pixels import decode_camera, picture_stamp
+
+__all__ = ["Capturing"]
+
+_RENDER_S: Final = 2.0
+_AGAIN_S: Final = 0.05
+_PROOF_S: Final = 1.0
+
+_HINT = (
+    "Is the camera switched on in the editor, and can the server draw? Without OpenGL it sends no pictures; its log "
+    "says what it found."
+)
+_ASSUMED = (
+    "Which step mode the server is in is not known, and outside live mode it publishes no pictures: call "
+    "client.runtime.set_mode() first."
+)
+
+
+class Capturing:
+    """Takes pictures for one client.
+
+    Args:
+        state: The client's state.
+        default_timeout: Seconds that a camera has which has delivered before; None waits.
+    """
+
+    def __init__(self, state: SimState, default_timeout: float | None) -> None:
+        self._state = state
+        self._default_timeout = default_timeout
+
+    async def take(self, cameras: Sequence[HasCamera], timeout: Timeout) -> list[CameraSample]:
+        """Return a picture of each camera, taken after this call.
+
+        Raises:
+            URLabError: A camera is not in the scene any more; nothing was sent.
+            PictureTimeout: Cameras delivered none in time.
+            NoActiveManager: No play session runs.
+            ModeLocked: The project pins a mode in which pictures come with steps only.
+        """
+        state = self._state
+        async with state.session.turn(Step, timeout=timeout, each=True) as turn:
+            state.require_handshake("capture")
+            if state.hello is not None and not state.hello.manager_present:
+                raise NoActiveManager("no_active_manager", "no play session runs. Nothing was sent.", op="capture")
+            views = self._views(cameras)
+            taking = _Taking(state, turn, views, self._deadline(views, timeout))
+            if state.mode is StepMode.LIVE or state.mode_assumed:
+                await taking.in_live_mode(certain=await self._is_live(turn))
+            else:
+                try:
+                    async with stopped_live(state, turn):
+                        await taking.in_live_mode(certain=True)
+                except ModeLocked as locked:
+                    locked.hint = "Pictures come with steps here: client.step(include_cameras=…)."
+                    raise
+                taking.note_time(state.sim_time)
+        return taking.delivered()
+
+    def _views(self, cameras: Sequence[HasCamera]) -> list[URLabCameraView]:
+        there = {id(view): view for view in self._state.objects.views()}
+        gone = [camera.name for camera in cameras if id(camera) not in there]
+        if gone:
+            raise URLabError(
+                f"capture: camera {gone[0]!r} is not in the scene any more. Nothing was sent.",
+                hint="client.camera() finds those that are.",
+            )
+        return [there[id(camera)] for camera in cameras]
+
+    def _deadline(self, views: Sequence[URLabCameraView], timeout: Timeout) -> float | None:
+        seconds = self._default_timeout if timeout is DEFAULT else timeout
+        if seconds is None:
+            return None
+        if timeout is DEFAULT and any(view.latest_frame is None for view in views):
+            seconds = max(seconds, FIRST_PICTURE_S)
+        return asyncio.get_running_loop().time() + seconds
+
+    async def _is_live(self, turn: Turn) -> bool:
+        """Return whether the server is in live mode for certain: else a request for pictures might be a step."""
+        state = self._state
+        if not state.mode_assumed:
+            return True
+        if state.session.features.publishes_steps:
+            return False  # its snapshots come in every mode
+        snapshots = Stream(state.publishers.state(), policy=StreamPolicy.LATEST)
+        try:
+            async with snapshots:
+                await turn.aside(snapshots.receive(timeout=_PROOF_S))
+        except URLabTimeoutError:
+            return False
+        state.mode = StepMode.LIVE
+        return True
+
+
+class _Taking:
+    """One call: the pictures that have come and those that have not."""
+
+    def __init__(self, state: SimState, turn: Turn, views: Sequence[URLabCameraView], deadline: float | None) -> None:
+        self._state = state
+        self._turn = turn
+        self._views = views
+        self._deadline = deadline
+        self._found: dict[int, CameraSample] = {}
+
+    async def in_live_mode(self, *, certain: bool) -> None:
+        """Take the pictures of a server in live mode.
+
+        Args:
+            certain: Whether it is known to be, so that a `step` only asks.
+        """
+        state, features = self._state, self._state.session.features
+        try:
+            async with asyncio.timeout_at(self._deadline):
+                if certain and features.renders_sync:
+                    await self._ask()
+                else:
+                    # What the state is called that the pictures must not be older than, where they say what they show.
+                    reply = await self._turn.call(Step()) if certain and features.camera_switch else None
+                    await self._watch(None if reply is None else reply.frame_id)
+        except URLabTimeoutError:
+            raise
+        except TimeoutError:
+            late = [view.name for view in self._views if id(view) not in self._found]
+            raise PictureTimeout(
+                f"capture: no picture of {', '.join(map(repr, late))} came in time.",
+                cameras=late,
+                hint=_ASSUMED if state.mode_assumed else _HINT,
+            ) from None
+
+    def note_time(self, sim_time: float) -> None:
+        """Note what time it was, where the server does not say."""
+        for sample in self._found.values():
+            if sample.sim_time is None:
+                sample.sim_time = sim_time
+
+    def delivered(self) -> list[CameraSample]:
+        """Return the pictures, which are the cameras' newest ones from now on."""
+        for view in self._views:
+            sample = self._found[id(view)]
+            view.pictures.deliver(sample.pixels, sample.sim_time, sample.frame_id)
+            view.delivered = True
+        return [self._found[id(view)] for view in self._views]
+
+    async def _ask(self) -> None:
+        objects, turn = self._state.objects, self._turn
+        names = {id(objects.camera(name)): name for name in objects.camera_names()}
+        missing = {names[id(view)]: view for view in self._views if id(view) in names}
+        while True:
+            request = Step(include_cameras=dict.fromkeys(missing, "sync"), render="sync")
+            request.camera_timeout_ms = 1000.0 * _RENDER_S
+            reply = await turn.call(request, takes=(op_of(Step).timeout or 0.0) + _RENDER_S)
+            for name, frame in (reply.cameras or {}).items():
+                if name in missing and (frame.frame_id or 0) >= (reply.frame_id or 0):
+                    view = missing.pop(name)
+                    size = frame.width, frame.height
+                    self._keep(view, frame.data, size, frame_id=frame.frame_id, sim_time=frame.sim_time)
+            if not missing:
+                return
+            await turn.aside(asyncio.sleep(_AGAIN_S))
+
+    async def _watch(self, least: int | None) -> None:
+        publishers = self._state.publishers
+        waiting = [_NextPicture(publishers.camera(view, StreamPolicy.ALL), least) for view in self._views]
+        try:
+            for one in waiting:
+                one.source.attach(one)
+            await self._turn.aside(self._received(waiting))
+        finally:
+            for one in waiting:
+                one.source.detach(one)
+
+    async def _received(self, waiting: Sequence[_NextPicture]) -> None:
+        for _ in range(2):  # turns of the loop, after which nothing waits in a socket any more
+            await asyncio.sleep(0)
+        for one in waiting:
+            one.begin()
+        for view, one in zip(self._views, waiting, strict=True):
+            self._keep(view, await one.came, view.resolution)
+
+    def _keep(
+        self,
+        view: URLabCameraView,
+        payload: BytesLike,
+        size: tuple[int, int],
+        *,
+        frame_id: int | None = None,
+        sim_time: float | None = None,
+    ) -> None:
+        image = decode_camera(payload, view.mode, *size, where=view.name)
+        self._found[id(view)] = CameraSample(
+            camera=view.name,
+            mode=view.mode,
+            pixels=image.pixels,
+            frame_id=image.frame_id if frame_id is None else frame_id,
+            sim_time=image.sim_time if sim_time is None else sim_time,
+            capture_time=image.capture_time,
+            recv_wall_time_ns=time.time_ns(),
+        )
+
+
+class _NextPicture(MessageHandler):
+    """Waits for a picture that was taken after `begin`.
+
+    A picture that says which snapshot it shows is compared with `least`. Of others the second one counts: the first may
+    have been on its way.
+
+    Attributes:
+        source: The camera.
+        came: What came.
+    """
+
+    def __init__(self, source: CameraSource, least: int | None) -> None:
+        self.source = source
+        self.came: asyncio.Future[BytesLike] = asyncio.get_running_loop().create_future()
+        self._least = least
+        self._begun = False
+        self._before = 0
+
+    def begin(self) -> None:
+        """Take what comes from now on."""
+        self._begun = True
+
+    def on_message(self, topic: bytes, payload: BytesLike) -> None:
+        """Take one message."""
+        if not self._begun or self.came.done():
+            return
+        width, height = self.source.view.info.resolution
+        try:
+            stamp = picture_stamp(payload, width, height, where=self.source.view.name)
+        except ProtocolError as error:
+            self.came.set_exception(error)
+            return
+        told = None if stamp is None or self._least is None else stamp.frame_id >= self._least
+        fresh = self._before > 0 if told is None else told
+        self._before += 1
+        if fresh:
+            self.came.set_result(payload)
+
+    def on_malformed(self, problem: str) -> None:
+        """Leave it out."""
+
+    def on_end(self, error: Callable[[], URLabError]) -> None:
+        """Take note that the client was closed."""
+        if not self.came.done():
+            self.came.set_exception(error())

@@ -1,0 +1,88 @@
+"""Pictures as files: PNG and JPEG. Needs Pillow, which is loaded when the first one is encoded."""
+
+from __future__ import annotations
+
+import io
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from urlab_client._extras import need
+from urlab_client.protocol.enums import CameraMode
+from urlab_client.protocol.pixels import Pixels
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+__all__ = ["JPEG_QUALITY", "jpeg", "png"]
+
+JPEG_QUALITY: Final = 85
+"""Default quality of a JPEG, of 100."""
+
+_MILLIMETRES: Final = 1000.0
+_DEEPEST: Final = 65_535
+
+
+def png(pixels: Pixels, mode: CameraMode | str) -> bytes:
+    """Return a picture as PNG, without loss: colours as RGB, depth as 16-bit grey in millimetres.
+
+    Depths of 65.535 m and more, and those that are not numbers, are 0, as depth cameras say "nothing there".
+
+    Args:
+        pixels: As in `CameraSample`.
+        mode: What they mean.
+
+    Raises:
+        MissingExtra: Pillow is not installed.
+    """
+    if mode != CameraMode.DEPTH:
+        return _encoded(_image(_rgb(pixels, mode)), "PNG")
+    with np.errstate(invalid="ignore"):
+        depth = np.rint(np.asarray(pixels, np.float64) * _MILLIMETRES)
+        within = (depth >= 0) & (depth < _DEEPEST)
+    return _encoded(_image(np.where(within, depth, 0).astype(np.uint16)), "PNG")
+
+
+def jpeg(pixels: Pixels, mode: CameraMode | str, quality: int = JPEG_QUALITY) -> bytes:
+    """Return a picture as JPEG, to be looked at: colours, or depth as grey, near is bright.
+
+    Args:
+        pixels: As in `CameraSample`.
+        mode: What they mean.
+        quality: 1 to 100.
+
+    Raises:
+        MissingExtra: Pillow is not installed.
+        ValueError: There is no such quality.
+    """
+    if not 1 <= quality <= 100:
+        raise ValueError(f"the quality of a JPEG is 1 to 100, got {quality}")
+    shown = _grey(pixels) if mode == CameraMode.DEPTH else _rgb(pixels, mode)
+    return _encoded(_image(shown), "JPEG", quality=quality)
+
+
+def _image(array: NDArray[Any]) -> Image.Image:
+    need("PIL", extra="pillow")
+    from PIL import Image  # noqa: PLC0415
+
+    return Image.fromarray(array)
+
+
+def _encoded(image: Image.Image, kind: str, **options: Any) -> bytes:
+    buffer = io.BytesIO()
+    image.save(buffer, kind, **options)
+    return buffer.getvalue()
+
+
+def _rgb(pixels: Pixels, mode: CameraMode | str) -> NDArray[Any]:
+    return np.ascontiguousarray(pixels[..., :3] if mode == CameraMode.REAL else pixels[..., 2::-1])
+
+
+def _grey(depth: Pixels) -> NDArray[np.uint8]:
+    seen = depth[np.isfinite(depth)]
+    if not seen.size:
+        return np.zeros(depth.shape, np.uint8)
+    near, far = np.percentile(seen, [1, 95])
+    share = np.clip((far - np.nan_to_num(depth, posinf=far, neginf=near)) / max(far - near, 1e-6), 0, 1)
+    return (share * 255).astype(np.uint8)

@@ -1,0 +1,71 @@
+"""Arguments of the wrong type: the error is the method's, and says what it takes, whichever method it is."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from urlab_client import URLabClient, URLabError
+from urlab_client.server import SimulatedServer
+
+STRANGE = (None, "x", 1.5, object(), {"x": "y"})
+# They end play or the client, take over the server, run for as long as they are told, or take any value.
+LEFT_OUT = {
+    *("close", "discover", "resync", "start", "stop", "create_level", "load_level", "run_for", "matches"),
+    *("add_observer", "remove_observer", "acquire_lease", "release_lease"),
+}
+
+PYTHONS_OWN = re.compile(r"object is not|has no|not supported between|unsupported operand|must be real|expected str")
+
+
+@pytest.fixture(scope="module")
+def client() -> Iterator[URLabClient]:
+    with (
+        SimulatedServer("arm", dialect="beta", play=True) as server,
+        URLabClient(**server.client_options(), step_mode="direct", rcv_timeout_ms=2000) as client,
+    ):
+        client.discover()
+        yield client
+
+
+def methods(of: object) -> list[tuple[str, inspect.Signature]]:
+    found = inspect.getmembers(type(of), inspect.isfunction)
+    return [(name, inspect.signature(method)) for name, method in found if name[0] != "_" and name not in LEFT_OUT]
+
+
+@pytest.mark.parametrize(
+    "part",
+    ["client", "articulation", "joint", "actuator", "camera", "scene", "outliner", "runtime", "debug", "viewport"],
+)
+def test_the_error_says_what_was_wrong(client: URLabClient, part: str) -> None:
+    arm = client.articulations["arm"]
+    parts: dict[str, Any] = {
+        "client": client,
+        "articulation": arm,
+        "joint": arm.joints["elbow"],
+        "actuator": arm.actuators["elbow"],
+        "camera": arm.cameras["wrist"],
+    }
+    tried = parts.get(part) or getattr(client, part)
+    unnamed: list[str] = []
+    for method, signature in methods(tried):
+        named = [parameter for parameter in signature.parameters.values() if parameter.name not in {"self", "timeout"}]
+        needed = [parameter.name for parameter in named if parameter.default is parameter.empty]
+        for parameter in named:
+            for value in STRANGE:
+                given = dict.fromkeys(needed, "x") | {parameter.name: value}
+                shown = f"{part}.{method}({parameter.name}={value!r})"
+                try:
+                    getattr(tried, method)(**given)
+                except (URLabError, ValueError, KeyError, OSError):
+                    pass
+                except TypeError as error:
+                    if PYTHONS_OWN.search(str(error)):
+                        unnamed.append(f"{shown}: {error}")
+                except Exception as error:  # noqa: BLE001
+                    unnamed.append(f"{shown}: {error!r}")
+    assert not unnamed, "\n".join(unnamed)
