@@ -42,8 +42,10 @@ ALLOWED: dict[str, frozenset[str]] = {
             "_windows",
             "keys",
             "protocol",
+            "randomise",
         }
     ),
+    "randomise": frozenset({"protocol"}),
     "enums": frozenset({"protocol"}),
     "_children": frozenset(),
     "_confined": frozenset(),
@@ -57,11 +59,11 @@ ALLOWED: dict[str, frozenset[str]] = {
     "_windows": frozenset(),
     "": frozenset({"_installation", "sync", "enums", "protocol"}),
     "integrations": frozenset(
-        {"", "_extras", "_installation", "_mujoco", "aio", "enums", "keys", "protocol", "server", "sync"}
+        {"", "_extras", "_installation", "_mujoco", "aio", "enums", "keys", "protocol", "randomise", "server", "sync"}
     ),
     "cluster": frozenset({"_installation", "integrations", "protocol", "sync"}),
-    "web": frozenset({"_installation", "aio", "protocol"}),
-    "mcp": frozenset({"aio", "integrations", "protocol", "web"}),
+    "web": frozenset({"_extras", "_installation", "aio", "integrations", "protocol"}),
+    "mcp": frozenset({"_extras", "aio", "protocol", "web"}),
     "cli": frozenset(
         {
             "",
@@ -75,6 +77,7 @@ ALLOWED: dict[str, frozenset[str]] = {
             "keys",
             "mcp",
             "protocol",
+            "randomise",
             "server",
             "sync",
             "web",

@@ -69,10 +69,11 @@ async def test_an_agent_finds_out_why_nothing_moves_mends_it_and_records(tmp_pat
             assert picture.structured_content is not None
             assert (picture.structured_content["width"], picture.structured_content["height"]) == (32, 24)
 
-            await one.call("record", action="start", name="lift")
+            await one.call("record", action="start")
             await one.call("move_to", robot=robot["name"], joints={"elbow": 0.0})
             episode = await one.call("record", action="stop")
-    assert len(read_run(tmp_path / episode["file"]).table()) == episode["states"] > 10
+    assert (episode["robots"], episode["lost"]) == (["arm"], 0)
+    assert len(read_run(tmp_path / episode["file"]).table()) > 10
 
 
 async def test_tools_say_what_they_take_give_and_do(direct: Desk) -> None:
@@ -123,8 +124,7 @@ async def test_what_an_agent_gets_wrong_is_said_and_nothing_is_done(direct: Desk
         ("reset", {"keyframe": "nowhere"}, ["nowhere"]),
         ("reset", {"joints": {"arm": {"elbow": 9}}}, ["got 9"]),
         ("play", {"action": "pause"}, ["direct", "run"]),
-        ("record", {"action": "stop"}, ["Start first"]),
-        ("record", {"action": "start", "name": "../up"}, ["name"]),
+        ("record", {"action": "stop"}, ["no recording runs"]),
         ("import_model", {"model": "/etc/passwd"}, ["no model"]),
         ("spawn", {"blueprint": "../arm", "actor_id": "b", "position": [0, 0, 0]}, ["no blueprint"]),
         ("spawn", {"blueprint": "arm", "actor_id": "b", "position": [0, 0]}, ["position"]),
@@ -238,17 +238,18 @@ async def test_a_scene_is_edited_by_names(tmp_path: Path) -> None:
             await one.call("state", robot="arm")
 
 
-async def test_recordings_have_a_name_of_their_own(server: SimulatedServer, tmp_path: Path) -> None:
+async def test_a_person_sees_what_an_agent_records(server: SimulatedServer, tmp_path: Path) -> None:
     async with desk(server, recordings=tmp_path) as one:
         await one.call("run", steps=1)
-        first = await one.call("record", action="start", name="a", cameras=["arm/overview"])
-        assert "a.mcap is being recorded" in await one.refused("record", action="start")
+        first = await one.call("record", action="start", cameras=True)
+        assert one.console.recordings.running is not None
+        assert "runs already" in await one.refused("record", action="start")
         await one.call("run", seconds=0.1)
-        assert (await one.call("record", action="stop"))["pictures"] > 0
-        second = await one.call("record", action="start", name="a")
+        assert (await one.call("record", action="stop"))["cameras"] == ["arm/overview", "arm/wrist"]
+        second = await one.call("record", action="start")
         await one.call("run", seconds=0.1)
-    # What is not stopped is finished when the agent leaves.
-    assert len(read_run(tmp_path / first["file"]).table()) == len(read_run(tmp_path / second["file"]).table()) == 5
+    # What is not stopped is finished when the console closes.
+    assert [len(read_run(tmp_path / made["file"]).table()) for made in (first, second)] == [5, 5]
 
 
 async def test_resources(direct: Desk) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ from agents import ALL, text_of
 from http_served import served
 from mcp.client.stdio import StdioServerParameters, stdio_client
 from mcp.client.streamable_http import streamable_http_client
+from ports import free_port
 from waiting import DEADLINE_S
 
 from mcp import Client
@@ -43,6 +45,7 @@ async def test_an_agent_starts_the_command_and_drives(tmp_path: Path) -> None:
     assert "?token=" in lines[0]
 
 
+@pytest.mark.long
 def test_the_command_ends_with_its_input(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "urlab_client", "mcp", "sim://arm", "--no-console"],
@@ -55,6 +58,28 @@ def test_the_command_ends_with_its_input(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout, done.stderr) == (0, b"", b"")
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("command", [["console"], ["mcp"], ["mcp", "--http"]], ids=" ".join)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_command_that_serves_pages_in_good_order(
+    command: list[str], number: signal.Signals, tmp_path: Path
+) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-m", "urlab_client", *command, "sim://arm", "--port", str(free_port())],
+        cwd=tmp_path,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    ) as process:
+        assert process.stdout is not None
+        while "Ctrl-C ends it" not in process.stdout.readline():
+            pass
+        process.send_signal(number)
+        assert process.wait(DEADLINE_S) == 0
+        assert process.stdout.read() == ""
+
+
 async def test_over_http_a_token_is_needed_which_is_not_the_console_s() -> None:
     with SimulatedServer("arm", play=True) as server:
         async with URLabClient(**server.client_options(), step_mode="direct") as client:
@@ -62,7 +87,7 @@ async def test_over_http_a_token_is_needed_which_is_not_the_console_s() -> None:
             site = app(client, access=access)
             agent = Agent(site, ALL)
             application = http_application(agent, site, TOKEN, Access(tokens=False))
-            async with site.router.lifespan_context(site), agent.lifespan(), served(application) as http:
+            async with site.router.lifespan_context(site), served(application) as http:
                 assert (await http.post("/mcp")).json()["error"]["code"] == "bad_token"
                 bearer = {"authorization": f"Bearer {TOKEN}"}
                 for name, value in (("host", "evil.example"), ("origin", "http://evil.example")):

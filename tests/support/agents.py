@@ -66,12 +66,11 @@ async def desk(
     """Put an agent at a server."""
     # Patience with a time that stands still is the client's own deadline.
     client = URLabClient(**server.client_options(), step_mode=step_mode, live_pictures=False, rcv_timeout_ms=1000)
-    site = app(client, access=Access(tokens=False))
-    agent = Agent(site, limits, recordings=recordings, models=models)
+    site = app(client, access=Access(tokens=False), recordings=recordings)
+    agent = Agent(site, limits, models=models)
     async with (
         client,
         site.router.lifespan_context(site),
-        agent.lifespan(),
         Client(agent.server, read_timeout_seconds=60) as mcp,
     ):
         yield Desk(client, site.state.console, agent, mcp)

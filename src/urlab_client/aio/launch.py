@@ -20,7 +20,7 @@ import threading
 import warnings
 from collections.abc import Callable, Sequence
 from typing import IO
-from urllib.parse import parse_qsl
+from urllib.parse import parse_qsl, urlencode
 
 import msgspec
 from msgspec import Struct
@@ -39,6 +39,7 @@ __all__ = [
     "serve_arguments",
     "start_seconds",
     "with_model_options",
+    "with_option",
     "with_start_timeout",
 ]
 
@@ -104,6 +105,11 @@ def with_start_timeout(address: str, seconds: float) -> str:
     if not address.startswith(SCHEME) or _START_TIMEOUT in dict(parse_qsl(query, keep_blank_values=True)):
         return address
     return f"{address}{'&' if query else '?'}{_START_TIMEOUT}={seconds:g}"
+
+
+def with_option(address: str, name: str, value: str) -> str:
+    """Return a `sim://` address whose server gets a further option."""
+    return f"{address}{'&' if '?' in address else '?'}{urlencode({name: value})}"
 
 
 def with_model_options(address: str) -> str:

@@ -17,7 +17,7 @@ __all__ = ["bound", "ending_well", "serve"]
 @contextlib.contextmanager
 def ending_well() -> Generator[None]:
     """Let SIGTERM end the body as SIGINT does, and take that for its end."""
-    before = signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    before = signal.signal(signal.SIGTERM, lambda _number, _frame: signal.raise_signal(signal.SIGINT))
     try:
         with contextlib.suppress(KeyboardInterrupt):  # in the moment before uvicorn listens for it
             yield

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import webbrowser
+from pathlib import Path
 
 from urlab_client._installation import install_command
 from urlab_client.cli._arguments import (
@@ -31,6 +32,7 @@ class ConsoleArguments(ServerArguments):
     port: int
     allow_host: list[str]
     open: bool
+    recordings: Path
 
 
 def add_parser(commands: Commands) -> None:
@@ -67,6 +69,13 @@ def add_parser(commands: Commands) -> None:
         help="host name under which browsers reach the page, besides this machine's own; repeatable",
     )
     parser.add_argument("--open", action="store_true", help="open the page in the browser")
+    parser.add_argument(
+        "--recordings",
+        type=Path,
+        default=Path("recordings"),
+        metavar="FOLDER",
+        help="where recordings are kept, made with the first one (default: %(default)s)",
+    )
     parser.set_defaults(run=run)
 
 
@@ -78,6 +87,7 @@ def run(arguments: ConsoleArguments) -> int:
         OSError: The port is in use.
     """
     try:
+        import prometheus_client  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]
         import uvicorn  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]
 
         from urlab_client.web import Access  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]
@@ -94,14 +104,17 @@ def run(arguments: ConsoleArguments) -> int:
 
 
 async def _serve(arguments: ConsoleArguments) -> None:
+    from prometheus_client import REGISTRY  # noqa: PLC0415
+
     from urlab_client.aio import URLabClient  # noqa: PLC0415
     from urlab_client.cli._pages import bound, serve  # noqa: PLC0415
+    from urlab_client.integrations.telemetry import PrometheusObserver  # noqa: PLC0415
     from urlab_client.web import Access, app  # noqa: PLC0415
     from urlab_client.web.access import LOOPBACK  # noqa: PLC0415
 
     access = Access(hosts=[*LOOPBACK, *(name.lower() for name in arguments.allow_host)])
     # Each camera is streamed while somebody watches it.
-    client = make_client(URLabClient, arguments.address, arguments, live_pictures=False)
+    client = make_client(URLabClient, arguments.address, arguments, live_pictures=False, observe=PrometheusObserver())
     async with client:
         with bound(arguments.host, arguments.port) as listener:
             name = arguments.allow_host[0] if arguments.allow_host else "127.0.0.1"
@@ -112,4 +125,5 @@ async def _serve(arguments: ConsoleArguments) -> None:
                 if arguments.open:
                     webbrowser.open(link)
 
-            await serve(app(client, access=access), listener, started)
+            site = app(client, access=access, recordings=arguments.recordings, metrics=REGISTRY)
+            await serve(site, listener, started)

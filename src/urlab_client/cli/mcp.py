@@ -167,9 +167,9 @@ async def _serve(arguments: McpArguments, limits: Limits) -> None:
     async with client:
         if arguments.address.startswith("sim://"):  # which fails for good reasons; a server may still come
             await client.discover()
-        console = app(client, access=access)
-        agent = Agent(console, limits, models=_models(arguments.models), recordings=arguments.recordings)
-        async with console.router.lifespan_context(console), agent.lifespan():
+        console = app(client, access=access, recordings=arguments.recordings)
+        agent = Agent(console, limits, models=_models(arguments.models))
+        async with console.router.lifespan_context(console):
             if arguments.http:
                 await _serve_http(arguments, agent, console, access)
             else:

@@ -5,7 +5,7 @@ Needs the extra `mcp`. `urlab mcp` runs it; `Agent` is for programs that bring t
 
 from urlab_client._extras import need
 
-need("mcp", "mcap", "PIL", "starlette", extra="mcp")
+need("mcp", "mcap", "PIL", "starlette", "uvicorn", extra="mcp")
 
 from urlab_client.mcp.agent import Agent  # noqa: E402 - its libraries may be missing
 from urlab_client.mcp.driving import Limits  # noqa: E402

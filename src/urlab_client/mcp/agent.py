@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import base64
-import contextlib
 import json
 import math
 import time
-from collections.abc import AsyncGenerator, Mapping
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -62,7 +61,6 @@ class Agent:
         console: The console application of `urlab_client.web.app()`, or its session.
         limits: What the agent may do.
         models: MJCF files that the agent may import, by the names that it sees.
-        recordings: Folder for recordings.
 
     Attributes:
         server: The server of the MCP SDK, for a transport of your choice. Serve it while the console's lifespan runs.
@@ -74,12 +72,10 @@ class Agent:
         limits: Limits | None = None,
         *,
         models: Mapping[str, Path] | None = None,
-        recordings: Path = Path("recordings"),
     ) -> None:
         session: ConsoleSession = console if isinstance(console, ConsoleSession) else console.state.console
         self.limits = limits or Limits()
         self._tools = Tools(session, self.limits, models or {})
-        self._tools.recordings = recordings
         self._declared = declared(Tools)
         allowed = {Needs.READ: True, Needs.DRIVE: self.limits.drive, Needs.EDIT: self.limits.edit}
         self._offered = {name: one for name, one in self._declared.items() if allowed[one.needs]}
@@ -103,14 +99,6 @@ class Agent:
     def idle(self) -> bool:
         """Whether no call drives at the moment."""
         return self._tools.driving.idle
-
-    @contextlib.asynccontextmanager
-    async def lifespan(self) -> AsyncGenerator[None]:
-        """Finish what goes on when the body ends."""
-        try:
-            yield
-        finally:
-            await self._tools.finish_recording()
 
     async def _list_tools(
         self, context: ServerRequestContext[Any], params: PaginatedRequestParams | None

@@ -64,8 +64,8 @@ def http_application(agent: Agent, console: ASGIApp | None, token: str, access: 
     """Make an application with the agent's server at `/mcp`, and the console at all other paths.
 
     Args:
-        agent: The agent. Its lifespan, and that of the console, are the caller's.
-        console: The console, if it is shown.
+        agent: The agent.
+        console: The console, if it is shown. Its lifespan is the caller's.
         token: What agents bring as `Authorization: Bearer TOKEN`. Not a key of the console, which allows more.
         access: Under which host names agents come.
     """

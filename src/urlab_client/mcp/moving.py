@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from itertools import count
-from pathlib import Path
 from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from urlab_client.integrations.record import AsyncRecorder, record
 from urlab_client.mcp.declaration import Needs, tool
 from urlab_client.mcp.driving import Progress
 from urlab_client.mcp.looking import Looking, Robot
@@ -24,14 +21,7 @@ _RECORDED_S = 0.02
 
 
 class Moving(Looking):
-    """Tools that move robots.
-
-    Attributes:
-        recordings: Folder for recordings.
-    """
-
-    recordings = Path("recordings")
-    _recorder: AsyncRecorder | None = None
+    """Tools that move robots."""
 
     @tool(Needs.DRIVE)
     async def run(
@@ -53,7 +43,7 @@ class Moving(Looking):
         async def work() -> float:
             passed = 0.0
             # A recording has a state for each reply.
-            piece = _RECORDED_S if self._recorder is not None else limit
+            piece = _RECORDED_S if self.console.recordings.running is not None else limit
             while limit - passed > _RECORDED_S / 100:
                 passed += await self.client.run_for(min(piece, limit - passed))
             return passed
@@ -151,33 +141,21 @@ class Moving(Looking):
         self,
         progress: Progress,
         action: Literal["start", "stop"],
-        name: Annotated[
-            str, Meta(description="Name of the recording, for start.", pattern=r"^[\w-]{1,64}$")
-        ] = "episode",
-        cameras: Annotated[list[str] | None, Meta(description="Cameras to record, for start.")] = None,
+        cameras: Annotated[bool, Meta(description="Whether to record pictures of all cameras, too.")] = False,
     ) -> Recorded:
         """Record an episode: `start`, then move the robot, then `stop`. Writes an MCAP file with all states."""
-        recorder = self._recorder
+        recordings = self.console.recordings
         if action == "start":
-            if recorder is not None:
-                raise ValueError(f"{recorder.path.name} is being recorded. Stop that first.")
-            self.recordings.mkdir(parents=True, exist_ok=True)
-            names = (f"{name}-{number}.mcap" if number > 1 else f"{name}.mcap" for number in count(1))
-            file = next(self.recordings / one for one in names if not (self.recordings / one).exists())
-            recorder = record(self.client, file, cameras=cameras or ())
-            await self.driving.drive(recorder.__aenter__, progress)
-            self._recorder = recorder
-        elif recorder is None:
-            raise ValueError("Nothing is being recorded. Start first.")
-        else:
-            await self.finish_recording()
-        stats = recorder.stats
+            file = await self.driving.drive(lambda: recordings.start(cameras=cameras), progress)
+            return self.stamped(Recorded(file=file, running=True))
+        made = await recordings.stop()
         return self.stamped(
-            Recorded(file=recorder.path.name, running=action == "start", states=stats.states, pictures=stats.frames)
+            Recorded(
+                file=made["name"],
+                running=False,
+                seconds=made["seconds"],
+                robots=made["robots"],
+                cameras=made["cameras"],
+                lost=made["lost"],
+            )
         )
-
-    async def finish_recording(self) -> None:
-        """Finish the file that is being written, if any."""
-        recorder, self._recorder = self._recorder, None
-        if recorder is not None:
-            await recorder.__aexit__(None, None, None)

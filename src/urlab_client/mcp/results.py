@@ -127,19 +127,23 @@ class Log(Result, kw_only=True):
 
 
 class Recorded(Result, kw_only=True):
-    """A recording.
+    """A recording. What is in it is known when it has ended.
 
     Attributes:
         file: Name of the MCAP file in the folder for recordings.
         running: Whether it goes on.
-        states: States in it up to now.
-        pictures: Pictures in it up to now.
+        seconds: Its length, simulation time.
+        robots: Robots in it.
+        cameras: Cameras in it.
+        lost: States and pictures that came too fast to be written.
     """
 
     file: str
     running: bool
-    states: int
-    pictures: int
+    seconds: float = 0.0
+    robots: list[str] = []
+    cameras: list[str] = []
+    lost: int = 0
 
 
 class Edited(Result, kw_only=True):

@@ -241,7 +241,8 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
 
         Args:
             keyframe_name: Keyframe to reset to. The short name is enough where one articulation has it.
-            seed: Remembered by the server; no effect on MuJoCo.
+            seed: Remembered by the server. On a simulated server that varies its scene it decides on the episode's
+                numbers; else it has no effect on MuJoCo.
             per_articulation_qpos: Articulation key to joint name to the first component of its position.
             timeout: Seconds to wait; None waits without limit.
 

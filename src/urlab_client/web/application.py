@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import secrets
 import time
 from collections.abc import AsyncGenerator, Awaitable, Callable
@@ -33,8 +34,11 @@ from urlab_client.web.console_session import Audience, ConsoleSession
 from urlab_client.web.driving_lease import DrivingLease, NotDriving, Viewer
 from urlab_client.web.ops import encode, openapi, parse, served
 from urlab_client.web.reading_routes import ReadingRoutes
+from urlab_client.web.recording_routes import RecordingRoutes
 
 if TYPE_CHECKING:
+    from prometheus_client import CollectorRegistry
+
     from urlab_client.aio import URLabClient
 
 __all__ = ["app", "entrance"]
@@ -47,7 +51,14 @@ _VIEWER = "x-urlab-viewer"
 _Handler: TypeAlias = Callable[[Request], Awaitable[Response]]
 
 
-def app(client: URLabClient, *, access: Access | None = None, lease_seconds: float = 20.0) -> Starlette:
+def app(
+    client: URLabClient,
+    *,
+    access: Access | None = None,
+    lease_seconds: float = 20.0,
+    metrics: CollectorRegistry | None = None,
+    recordings: str | os.PathLike[str] = "recordings",
+) -> Starlette:
     """Make the application. It opens the client's session while its lifespan runs, and closes nothing at its end.
 
     To mount it in another application, enter `site.router.lifespan_context(site)` in that one's lifespan.
@@ -57,16 +68,22 @@ def app(client: URLabClient, *, access: Access | None = None, lease_seconds: flo
             other part of a program may.
         access: Who may come in; default: whoever brings a token of `site.state.access.invite()`, on this machine.
         lease_seconds: How long a viewer keeps the controls without using them.
+        metrics: What `/metrics` shows to Prometheus, behind the same access; None leaves the path out. The client's
+            requests are in it if the client was made with `observe=PrometheusObserver(metrics)`.
+        recordings: Folder of the recordings that viewers make, download and replay; made with the first one.
     """
     access = access or Access()
-    site = _Site(ConsoleSession(client, DrivingLease(lease_seconds)), access)
+    site = _Site(ConsoleSession(client, DrivingLease(lease_seconds), Path(recordings)), access)
 
     @contextlib.asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncGenerator[None]:
         async with site.console.open():
             yield
 
-    application = Starlette(routes=site.routes(), middleware=[Middleware(Guarded, access=access)], lifespan=lifespan)
+    routes = site.routes()
+    if metrics is not None:
+        routes.append(Route("/metrics", _metrics(metrics)))
+    application = Starlette(routes=routes, middleware=[Middleware(Guarded, access=access)], lifespan=lifespan)
     application.state.access = access
     application.state.console = site.console
     return application
@@ -84,16 +101,22 @@ def entrance(access: Access) -> _Handler:
     return _answering(enter)
 
 
+def _metrics(registry: CollectorRegistry) -> Callable[[Request], Response]:
+    from prometheus_client.exposition import choose_encoder  # noqa: PLC0415
+
+    def show(request: Request) -> Response:
+        encode_all, media_type = choose_encoder(request.headers.get("accept", ""))
+        return Response(encode_all(registry), headers={"content-type": media_type})
+
+    return show
+
+
 class _RunRequest(Struct):
     running: bool
 
 
 class _StepRequest(Struct):
     n_steps: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] = 1
-
-
-class _SeekRequest(Struct):
-    frame: int
 
 
 class _LoginRequest(Struct):
@@ -116,6 +139,7 @@ class _Site:
         self._access = access
         self._viewers: dict[str, Viewer] = {}
         self._reading = ReadingRoutes(console, self._viewer)
+        self._recordings = RecordingRoutes(console, self._viewer)
 
     def routes(self) -> list[Route | WebSocketRoute | Mount]:
         def route(path: str, handler: _Handler, *methods: str) -> Route:
@@ -133,7 +157,7 @@ class _Site:
             route("/api/ctrl", self._ctrl, "POST"),
             route("/api/run", self._run, "POST"),
             route("/api/step", self._step, "POST"),
-            route("/api/replay", self._seek, "POST"),
+            *(route(path, handler, *methods) for path, handler, methods in self._recordings.routes()),
             route("/api/lease", self._lease, "POST", "DELETE"),
             route("/api/connection", self._connection, "POST"),
             route("/api/invitations", self._invite, "POST"),
@@ -202,11 +226,6 @@ class _Site:
     async def _step(self, request: Request) -> Response:
         steps = msgspec.json.decode(await _body(request) or b"{}", type=_StepRequest)
         return _json(encode(await self.console.controls.step(self._viewer(request), steps.n_steps)))
-
-    async def _seek(self, request: Request) -> Response:
-        wanted = msgspec.json.decode(await _body(request), type=_SeekRequest).frame
-        frame, total = await self.console.controls.seek(self._viewer(request), wanted)
-        return _json(encode({"frame": frame, "total": total}))
 
     async def _lease(self, request: Request) -> Response:
         viewer = self._viewer(request)
@@ -431,7 +450,7 @@ def _answering(handler: _Handler) -> _Handler:
     async def answer(request: Request) -> Response:
         try:
             return await handler(request)
-        except (NotDriving, URLabError, ValueError, TypeError, KeyError, RecursionError) as error:
+        except (NotDriving, URLabError, OSError, ValueError, TypeError, KeyError, RecursionError) as error:
             status, said = _explain(error)
             return _json(encode({"error": said}), status)
 
@@ -456,6 +475,8 @@ def _explain(error: Exception) -> tuple[int, dict[str, Any]]:
             status, code = 503, "unreachable"
         case URLabError():
             status, code = 502, "failed"
+        case OSError():
+            status, code = 500, "io_failed"
         case _:
             status, code = 400, "bad_request"
     return status, {"code": code, "message": str(text), "hint": hint}

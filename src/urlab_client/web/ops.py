@@ -221,7 +221,20 @@ _PATHS: dict[str, Any] = {
     "/api/ctrl": _path("post", "ctrl", "Set set-points: `{articulation: {actuator: value}}`. Needs the controls."),
     "/api/run": _path("post", "run", "Let physics run or stop it: `{running: bool}`. Everybody may stop it."),
     "/api/step": _path("post", "step_many", "Step in direct mode: `{n_steps: int}`. Needs the controls."),
-    "/api/replay": _path("post", "seek", "Go to a frame of the replay: `{frame: int}`. Needs the controls."),
+    "/api/recording": {
+        **_path("post", "record", "Record into an MCAP file: `{cameras: bool}`. Needs the controls."),
+        **_path("delete", "stop_recording", "End the recording, and describe it. Needs the controls."),
+    },
+    "/api/recordings": _path("get", "recordings", "The recordings, the newest first."),
+    "/api/recordings/{name}": {
+        **_path("get", "download", "A recording, `?as=csv`, `npz` or `mp4&camera=…`; `?as=about` describes it."),
+        **_path("put", "upload", "Take a recording in that was made elsewhere: its bytes. Needs the controls."),
+        **_path("delete", "remove_recording", "Delete a recording. Needs the controls."),
+    },
+    "/api/replay": {
+        **_path("post", "replay", "Replay `{name, placing}`, or go on with `{time, playing, rate}`, seconds."),
+        **_path("delete", "end_replay", "Show what the server sends again. Needs the controls."),
+    },
     "/api/lease": {
         **_path("post", "take_controls", "Take the controls, or keep them."),
         **_path("delete", "release_controls", "Give the controls back."),

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import html
+import os
 import re
 from collections.abc import AsyncGenerator, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starlette.applications import Starlette
@@ -29,7 +31,13 @@ _PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="view
 <title>URLab consoles</title><body><h1>Servers</h1><ul>{items}</ul></body></html>"""
 
 
-def apps(clients: Mapping[str, URLabClient], *, access: Access | None = None, lease_seconds: float = 20.0) -> Starlette:
+def apps(
+    clients: Mapping[str, URLabClient],
+    *,
+    access: Access | None = None,
+    lease_seconds: float = 20.0,
+    recordings: str | os.PathLike[str] = "recordings",
+) -> Starlette:
     """Make one application of the consoles of several servers.
 
     Each console is at `/NAME/`, with its own controls, and `/` links to them; `GET /api/servers` lists them with the
@@ -41,6 +49,7 @@ def apps(clients: Mapping[str, URLabClient], *, access: Access | None = None, le
             `_` and `-`.
         access: Who may come in; default: whoever brings a token of `site.state.access.invite()`, on this machine.
         lease_seconds: How long a viewer keeps the controls of a server without using them.
+        recordings: Folder of the recordings, with a folder in it for each server.
 
     Raises:
         ValueError: There is no client, or a name cannot stand in a path.
@@ -51,7 +60,10 @@ def apps(clients: Mapping[str, URLabClient], *, access: Access | None = None, le
     if not clients:
         raise ValueError("apps takes one client or more")
     door = access or Access()
-    consoles = {name: app(client, access=door, lease_seconds=lease_seconds) for name, client in clients.items()}
+    consoles = {
+        name: app(client, access=door, lease_seconds=lease_seconds, recordings=Path(recordings) / name)
+        for name, client in clients.items()
+    }
 
     @contextlib.asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncGenerator[None]:

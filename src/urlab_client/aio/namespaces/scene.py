@@ -18,6 +18,7 @@ from urlab_client.protocol.base import Reply, Request
 from urlab_client.protocol.errors import CreateLevelFailed, ImportFailed, UnknownOp
 from urlab_client.protocol.messages.outliner import ListActors
 from urlab_client.protocol.messages.scene import (
+    CreateLevel,
     DestroyActor,
     DuplicateActor,
     ImportXml,
@@ -353,8 +354,9 @@ class SceneNamespace(SceneOps):
     ) -> dict[str, URLabSpawnHandle]:
         """Bring a level into a described state: load or create it, import each MJCF once, place each asset, save.
 
-        Safe to repeat: an actor whose id exists is moved, not spawned again. An MJCF that is on this machine only is
-        uploaded to servers that take models over the wire, one at most.
+        Safe to repeat: an actor whose id exists is moved, not spawned again. Other tasks' changes to the scene wait
+        until it is done. An MJCF that is on this machine only is uploaded to servers that take models over the wire,
+        one at most.
 
         Args:
             level_name: Short name or `/Game/` path.
@@ -376,27 +378,28 @@ class SceneNamespace(SceneOps):
         twice = sorted({i for i in ids if ids.count(i) > 1})
         if twice:
             raise ValueError(f"actor ids must differ, these are used twice: {', '.join(twice)}")
-        try:
-            await self.create_level(level_name, timeout=timeout)
-        except CreateLevelFailed:
-            await self.load_level(level_name, timeout=timeout)
-        await self.ensure_manager(timeout=timeout)
-        blueprints = await self._imported(list(dict.fromkeys(asset.xml for asset in wanted)), timeout)
-        handles = {
-            asset.actor_id: await self.spawn_actor(
-                blueprints[asset.xml],
-                asset.actor_id,
-                location=asset.location,
-                rotation_quat=asset.rotation_quat,
-                rotation_euler=asset.rotation_euler,
-                scale=asset.scale,
-                timeout=timeout,
-            )
-            for asset in wanted
-        }
-        if save:
-            await self.save_level(timeout=timeout)
-        return handles
+        async with self._session.composing(CreateLevel, timeout):
+            try:
+                await self.create_level(level_name, timeout=timeout)
+            except CreateLevelFailed:
+                await self.load_level(level_name, timeout=timeout)
+            await self.ensure_manager(timeout=timeout)
+            blueprints = await self._imported(list(dict.fromkeys(asset.xml for asset in wanted)), timeout)
+            handles = {
+                asset.actor_id: await self.spawn_actor(
+                    blueprints[asset.xml],
+                    asset.actor_id,
+                    location=asset.location,
+                    rotation_quat=asset.rotation_quat,
+                    rotation_euler=asset.rotation_euler,
+                    scale=asset.scale,
+                    timeout=timeout,
+                )
+                for asset in wanted
+            }
+            if save:
+                await self.save_level(timeout=timeout)
+            return handles
 
     async def _imported(self, files: list[str], timeout: Timeout) -> dict[str, URLabBlueprint]:
         """Import models from the server's disk, or else from this machine's where the server takes them so."""

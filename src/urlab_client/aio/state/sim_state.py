@@ -80,6 +80,7 @@ class SimState:
         sent_level: Observation level the server has, which an earlier step may have changed.
         hello: The last handshake, without the model's bytes.
         step_count: Steps since the last handshake or reset.
+        reset_seed: Seed of the last reset, None without one.
         sim_time: Simulation time of the last reply, seconds.
         on_adopted: Told of each handshake taken over, and of the end of play.
         pending: Requests whose replies were lost.
@@ -113,6 +114,7 @@ class SimState:
         self.sent_level = "standard"
         self.hello: HelloOk | None = None
         self.step_count = 0
+        self.reset_seed: int | None = None
         self.sim_time = 0.0
         self.sim_time_sec = self.sim_time_nsec = 0
         self.wall_time_sec = self.wall_time_nsec = 0

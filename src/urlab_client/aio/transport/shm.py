@@ -248,7 +248,7 @@ class ShmTransport:
                 looked = ", ".join(map(str, self._memory.candidates(file)))
                 raise FileNotFoundError(f"there is no {looked}")
             paths.append(path)
-        self._channel = RegionChannel(*paths)
+        self._channel = RegionChannel(paths[0], paths[1], self._memory.events(paths[0]))
         self._memory.connect_bell()
         self._used_at = asyncio.get_running_loop().time()
         log.info(

@@ -260,8 +260,9 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
     ) -> dict[str, URLabSpawnHandle]:
         """Bring a level into a described state: load or create it, import each MJCF once, place each asset, save.
 
-        Safe to repeat: an actor whose id exists is moved, not spawned again. An MJCF that is on this machine only is
-        uploaded to servers that take models over the wire, one at most.
+        Safe to repeat: an actor whose id exists is moved, not spawned again. Other tasks' changes to the scene wait
+        until it is done. An MJCF that is on this machine only is uploaded to servers that take models over the wire,
+        one at most.
 
         Args:
             level_name: Short name or `/Game/` path.
