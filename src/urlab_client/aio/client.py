@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import logging
 import os
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from types import TracebackType
 from typing import NoReturn, Self, TypeVar
 
@@ -190,8 +190,8 @@ class URLabClient(ClientState):
         self._watch = ConnectionMonitor(session, state)
         self._transport.on_event = self._watch.on_connection
         self._closed = False
-        self._scene = SceneNamespace(session)
         self._sim = SimNamespace(session, state, self._discovery)
+        self._scene = SceneNamespace(session, self._sim)
         self._runtime = RuntimeNamespace(session, state)
         self._outliner = OutlinerNamespace(session)
         self._debug = DebugNamespace(session)
@@ -396,7 +396,7 @@ class URLabClient(ClientState):
         return await self._motion.wait_until(predicate, timeout)
 
     async def capture(
-        self, cameras: Collection[str] | None = None, *, timeout: Timeout = DEFAULT
+        self, cameras: Iterable[str] | None = None, *, timeout: Timeout = DEFAULT
     ) -> dict[str, CameraSample]:
         """Take pictures of several cameras now, in any step mode, without a step; see `URLabCameraView.capture`.
 
@@ -417,6 +417,8 @@ class URLabClient(ClientState):
             ModeLocked: The project pins a mode in which pictures come with steps only.
         """
         objects = self._state.objects
+        if cameras is not None and not isinstance(cameras, Iterable):
+            raise TypeError(f"capture takes names of cameras, got {cameras!r:.80}.")
         if isinstance(cameras, str):
             raise TypeError(f"capture takes several names; one: client.camera({cameras!r}).capture()")
         if cameras is None:

@@ -41,6 +41,7 @@ _COMMANDS = (
     "convert",
     "plot",
     "run-policy",
+    "evaluate",
     "view",
 )
 

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from types import TracebackType
 from typing import Self, TypeVar
 
@@ -310,7 +310,7 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
         """
         return self._portal.call(self._aio.wait_until, predicate, timeout=timeout)
 
-    def capture(self, cameras: Collection[str] | None = None, *, timeout: Timeout = DEFAULT) -> dict[str, CameraSample]:
+    def capture(self, cameras: Iterable[str] | None = None, *, timeout: Timeout = DEFAULT) -> dict[str, CameraSample]:
         """Take pictures of several cameras now, in any step mode, without a step; see `URLabCameraView.capture`.
 
         In `direct` and `puppet` mode, and while paused, all of them show the same moment.

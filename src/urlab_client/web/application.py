@@ -32,6 +32,7 @@ from urlab_client.web import mujoco_viewer
 from urlab_client.web.access import Access, Guarded
 from urlab_client.web.console_session import Audience, ConsoleSession
 from urlab_client.web.driving_lease import DrivingLease, NotDriving, Viewer
+from urlab_client.web.metrics import showing
 from urlab_client.web.ops import encode, openapi, parse, served
 from urlab_client.web.reading_routes import ReadingRoutes
 from urlab_client.web.recording_routes import RecordingRoutes
@@ -82,7 +83,7 @@ def app(
 
     routes = site.routes()
     if metrics is not None:
-        routes.append(Route("/metrics", _metrics(metrics)))
+        routes.append(Route("/metrics", showing(metrics)))
     application = Starlette(routes=routes, middleware=[Middleware(Guarded, access=access)], lifespan=lifespan)
     application.state.access = access
     application.state.console = site.console
@@ -99,16 +100,6 @@ def entrance(access: Access) -> _Handler:
         return _json(encode({"key": key}))
 
     return _answering(enter)
-
-
-def _metrics(registry: CollectorRegistry) -> Callable[[Request], Response]:
-    from prometheus_client.exposition import choose_encoder  # noqa: PLC0415
-
-    def show(request: Request) -> Response:
-        encode_all, media_type = choose_encoder(request.headers.get("accept", ""))
-        return Response(encode_all(registry), headers={"content-type": media_type})
-
-    return show
 
 
 class _RunRequest(Struct):

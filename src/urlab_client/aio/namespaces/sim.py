@@ -10,6 +10,7 @@ import msgspec
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.namespaces._base import Namespace
+from urlab_client.aio.namespaces.lasting import Playing
 from urlab_client.aio.session import Session, Turn
 from urlab_client.aio.state.discovery import Discovery
 from urlab_client.aio.state.pending_outcomes import leaves_open
@@ -134,6 +135,24 @@ class SimNamespace(Namespace):
             finally:
                 self._state.stopping = False
             self._state.on_play_ended("stopped by this client")
+
+    def playing(self, level_path: str | None = None, *, timeout_s: float = 30.0) -> Playing:
+        """Play while a `with` block lasts: start it on entering, and stop it on leaving, also after an exception.
+
+        Play that runs already is taken over as `start()` does, and goes on after the block.
+
+        Args:
+            level_path: Level to open first, a full `/Game/` path; None for the open one.
+            timeout_s: Seconds to wait for the compile.
+
+        Raises:
+            URLabPIEError: On entering: play did not become ready. It is stopped again.
+
+        Example:
+            async with client.sim.playing():
+                await client.step(100)
+        """
+        return Playing(lambda: self.start(level_path, timeout_s=timeout_s), self.stop, self.status)
 
     async def status(self, *, timeout: Timeout = DEFAULT) -> PIEStatus:
         """Read the state of play."""

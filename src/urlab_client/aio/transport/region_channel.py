@@ -57,6 +57,9 @@ class RegionChannel:
         requests: File of the requests.
         replies: File of the replies.
         events: What their events are called on Windows.
+
+    Attributes:
+        limit: Largest payload that fits in both directions.
     """
 
     def __init__(self, requests: Path, replies: Path, events: tuple[str, str]) -> None:
@@ -66,17 +69,13 @@ class RegionChannel:
         except BaseException:
             self.requests.close()
             raise
+        self.limit = min(self.requests.region.max_payload, self.replies.region.max_payload)
         self._request_event, self.reply_event = map(NamedEvent, events)
         # A client that died here may have left a request behind whose reply is still to come.
         self.dirty = True
         self.seen = 0
         self._token = ""
         self._asked_at = 0.0
-
-    @property
-    def limit(self) -> int:
-        """Largest payload that fits in both directions."""
-        return min(self.requests.region.max_payload, self.replies.region.max_payload)
 
     def intact(self) -> bool:
         """Whether both regions are mapped in full still."""

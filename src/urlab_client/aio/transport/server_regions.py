@@ -32,6 +32,7 @@ class SharedMemoryRegions:
 
     def __init__(self, directory: str | os.PathLike[str] | None) -> None:
         self.directory: Path | None = None
+        # Replies last: whoever waits for one goes on within the call.
         self.rung: dict[bytes, list[Callable[[], None]]] = {doorbell.STATE: [], doorbell.CAMERA: [], doorbell.REPLY: []}
         self._told: dict[str, Path] = {}  # regions whose files the server names, whatever those are called
         self._events = "", ""
