@@ -88,6 +88,7 @@ def test_servers_batches_and_single_environments_vary_bit_for_bit_alike(
         made.append(single)
         assert single.randomise == EVERYTHING, "the server says what it varies"
         assert np.array_equal(single.reset(seed=3)[0], starts[0][0][0])
+        ours: Any = ()
         for action, (seen, rewards, *_) in zip(actions[:5], rollouts[0], strict=False):
             ours = single.step(action[0])
             assert np.array_equal(ours[0], seen[0])

@@ -10,6 +10,8 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from types import TracebackType
 from typing import NoReturn, Self, TypeVar
 
+from msgspec import structs
+
 from urlab_client.aio.address import transport_to
 from urlab_client.aio.arguments import integer
 from urlab_client.aio.client_state import ClientState
@@ -562,7 +564,8 @@ class URLabClient(ClientState):
 
         Takes at most a few seconds, does not raise for problems that it finds, and changes nothing on the server.
         """
-        return await diagnose(self._config, self._session, self._state)
+        config = structs.replace(self._config, state_port=self._state_port())
+        return await diagnose(config, self._session, self._state)
 
     async def meta(self, *, timeout: Timeout = DEFAULT) -> list[OpInfo]:
         """List the ops that the server offers; needs no session."""

@@ -40,6 +40,7 @@ _COMMANDS = (
     "convert",
     "plot",
     "run-policy",
+    "evaluate",
     "view",
 )
 
