@@ -433,3 +433,20 @@ def test_the_controls_are_lost_by_not_using_them() -> None:
     assert lease.holder is None
     lease.use(bob)
     assert lease.holder is bob
+
+
+def test_a_paused_beta_is_seen_and_driven() -> None:
+    with (
+        SimulatedServer("arm", play=True, camera_size=(64, 48), dialect="beta") as beta,
+        TestClient(site := mounted(beta, "/"), base_url="http://localhost") as http,
+    ):
+        key = http.post("/api/session", json={"token": site.state.access.invite()}).json()["key"]
+        http.headers["authorization"] = f"Bearer {key}"
+        with http.websocket_connect("ws://localhost/api/live") as live:
+            heard(live, "world", lambda message: bool(message["world"]["articulations"]))
+            with http.websocket_connect("ws://localhost/api/cameras/arm/wrist/live") as camera:
+                frame = camera.receive_bytes()  # though its stream is silent
+            assert Image.open(io.BytesIO(frame[4 + int.from_bytes(frame[:4], "little") :])).size == (64, 48)
+            assert http.post("/api/ctrl", json={"arm": {"elbow": 0.5}}).status_code == 200
+            http.post("/api/run", json={"running": True})
+            heard(live, "state", lambda state: abs(state["articulations"]["arm"]["qpos"][2]) > 0.01)
