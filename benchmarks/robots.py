@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import functools
 import importlib.util
+import os
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from benchmarks.canned import Requester
 from urlab_client.protocol.base import Request
@@ -16,7 +19,10 @@ from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.protocol.messages.session import Hello, HelloOk, Meta, Step
 from urlab_client.server import SimulatedServer
 
-__all__ = ["humanoid", "recorded", "recorded_of", "robot_mjcf"]
+__all__ = ["DIALECT", "dialect", "humanoid", "recorded", "recorded_of", "robot_mjcf"]
+
+DIALECT = "URLAB_BENCHMARK_DIALECT"
+"""Environment variable that names the dialect of all servers, for child processes, too."""
 
 _SENSORS = """
     <gyro name="imu_gyro" site="imu"/>
@@ -56,6 +62,11 @@ def robot_mjcf(joints: int, *, terrain: int = 0, standing: bool = False) -> str:
     </mujoco>"""
 
 
+def dialect() -> str:
+    """Return the dialect of all servers."""
+    return os.environ.get(DIALECT, "alpha")
+
+
 @functools.cache
 def recorded(joints: int, count: int = 1, *, mode: str = "direct", terrain: int = 0) -> Mapping[str, bytes]:
     """Return what the simulated server answers to `hello`, `meta`, `set_mode` and `step`, by op.
@@ -75,13 +86,31 @@ def recorded(joints: int, count: int = 1, *, mode: str = "direct", terrain: int 
 def recorded_of(path: Path, count: int = 1, *, mode: str = "direct") -> dict[str, bytes]:
     """Return what `recorded` does of the robots in an MJCF file."""
     answers: dict[str, bytes] = {}
-    with SimulatedServer(*[path] * count, play=True) as server, Requester(server.step_port) as floor:
+    # Older packages know one dialect only, and no option.
+    options: dict[str, Any] = {} if dialect() == "alpha" else {"dialect": dialect()}
+    with SimulatedServer(*[path] * count, play=True, **options) as server, Requester(server.step_port) as floor:
         answers["hello"] = floor.ask(encode_request(Hello(), ""))
         hello = decode_reply(op_of(Hello), HelloOk, answers["hello"])
         others: list[Request[Any]] = [Meta(), SetMode(mode=mode), Step()]
         for request in others:
             answers[op_of(request).name] = floor.ask(encode_request(request, hello.session_id))
+        if options:
+            answers |= _of_owned_robots(floor, hello)
     return answers
+
+
+def _of_owned_robots(floor: Requester, hello: HelloOk) -> dict[str, bytes]:
+    """Return what else a server answers to whoever drives its robots, and a handshake that names no other ports."""
+    from urlab_client.protocol.messages.control import ClaimControl  # noqa: PLC0415  # older packages lack it
+
+    claim = ClaimControl(articulation=hello.articulations[0].prefix)
+    plain = msgspec.msgpack.decode(floor.ask(encode_request(Hello(), "")))
+    for elsewhere in ("instance", "shm_rpc"):
+        plain.pop(elsewhere, None)
+    return {
+        "claim_control": floor.ask(encode_request(claim, plain["session_id"])),
+        "hello": msgspec.msgpack.encode(plain),
+    }
 
 
 def humanoid() -> Path:

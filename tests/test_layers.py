@@ -42,8 +42,10 @@ ALLOWED: dict[str, frozenset[str]] = {
             "_windows",
             "keys",
             "protocol",
+            "randomise",
         }
     ),
+    "randomise": frozenset({"protocol"}),
     "enums": frozenset({"protocol"}),
     "_children": frozenset(),
     "_confined": frozenset(),
@@ -57,10 +59,11 @@ ALLOWED: dict[str, frozenset[str]] = {
     "_windows": frozenset(),
     "": frozenset({"_installation", "sync", "enums", "protocol"}),
     "integrations": frozenset(
-        {"", "_extras", "_installation", "_mujoco", "aio", "enums", "keys", "protocol", "server", "sync"}
+        {"", "_extras", "_installation", "_mujoco", "aio", "enums", "keys", "protocol", "randomise", "server", "sync"}
     ),
     "cluster": frozenset({"_installation", "integrations", "protocol", "sync"}),
-    "web": frozenset({"_installation", "aio", "protocol"}),
+    "web": frozenset({"_extras", "_installation", "aio", "integrations", "protocol"}),
+    "mcp": frozenset({"_extras", "aio", "protocol", "web"}),
     "cli": frozenset(
         {
             "",
@@ -72,7 +75,9 @@ ALLOWED: dict[str, frozenset[str]] = {
             "enums",
             "integrations",
             "keys",
+            "mcp",
             "protocol",
+            "randomise",
             "server",
             "sync",
             "web",
@@ -221,7 +226,7 @@ def test_imports_inside_the_large_layers_point_one_way() -> None:
 
 
 # What stands on the client uses its public API alone.
-ON_THE_CLIENT = ("integrations", "cluster", "web", "cli")
+ON_THE_CLIENT = ("integrations", "cluster", "web", "mcp", "cli")
 # Public by the reference all the same.
 PUBLIC_ALL_THE_SAME = frozenset({"_data_lock"})
 

@@ -343,8 +343,10 @@ def around() -> list[str]:
         *integrations[:at],
         "urlab_client.integrations.record.export",
         *integrations[at:],
+        "urlab_client.randomise",
         "urlab_client.cluster",
         "urlab_client.web",
+        "urlab_client.mcp",
         "urlab_client.keys",
         "pytest_urlab",
     ]

@@ -27,9 +27,10 @@ from urlab_client import (
     URLabTimeoutError,
     URLabVersionMismatch,
 )
-from urlab_client.aio import URLabClient
+from urlab_client.aio import Stream, URLabClient
 from urlab_client.aio.control import process_owner
 from urlab_client.protocol.messages.control import ReleaseControl
+from urlab_client.protocol.messages.streams import CameraSample
 from urlab_client.protocol.types import JobStatus
 from urlab_client.server import SimulatedServer
 
@@ -478,6 +479,25 @@ async def test_another_mujoco_is_worked_with(mode: str) -> None:
         beta.close()
 
 
+async def test_another_mujoco_without_xml_leaves_no_model_and_says_so() -> None:
+    beta = ScriptedBeta(skew=True)
+    whole = beta.answers["hello"]
+    beta.on(
+        "hello", lambda request: {k: v for k, v in whole(request).items() if k not in ("mjcf_compiled", "vfs_assets")}
+    )
+    try:
+        async with client_of(beta, step_mode="direct", mujoco_version_check=False) as client:
+            with pytest.warns(UserWarning, match=r"MuJoCo 3\.11\.1.*There is no local model") as said:
+                await client.discover()
+            assert len(said) == 1
+            assert (client.model, client.model_is_approximate) == (None, False)
+            client.articulations["arm_a"].ctrl_array[:] = 0.5
+            await client.step(2)
+            assert beta.ctrl["arm_C_0"] == [0.5]
+    finally:
+        beta.close()
+
+
 async def test_a_version_string_decides_nothing(client: URLabClient, beta: ScriptedBeta) -> None:
     """Beta statement 80."""
     await client.sim.start()
@@ -667,15 +687,22 @@ async def test_a_camera_streams_while_somebody_looks(served: SimulatedServer) ->
         await client.discover()
         await client.step()
         camera = client.articulations["arm_1"].cameras["wrist"]
+
+        async def next_picture(frames: Stream[CameraSample]) -> CameraSample:
+            coming = asyncio.ensure_future(anext(frames))
+            while not coming.done():  # a camera sees what moves
+                await client.step()
+            return await coming
+
         async with camera.frames(timeout=DEADLINE_S) as frames:
-            picture = await anext(frames)
+            picture = await next_picture(frames)
             assert picture.pixels.shape == (12, 16, 4)
-            assert (picture.frame_id, picture.sim_time) == (1, client.sim_time)
+            assert picture.sim_time == pytest.approx(0.002 * (picture.frame_id or 0))
             await client.sim.stop()
             await client.sim.start()
             # Play began with the camera off, and it was switched on again for whoever still looks.
-            while picture.gap is None and picture.frame_id != 0:
-                picture = await anext(frames)
+            while picture.gap is None:
+                picture = await next_picture(frames)
 
 
 async def test_the_state_stream_goes_on_outside_live_mode(served: SimulatedServer) -> None:

@@ -15,7 +15,9 @@ from plugin_memory import PluginMemory
 from shm_clients import shared, shm_clients
 from waiting import DEADLINE_S, until
 
+from urlab_client._windows import NamedEvent
 from urlab_client.aio import URLabClient
+from urlab_client.aio.transport import region_channel
 from urlab_client.aio.transport import shm as shm_transport
 from urlab_client.protocol import shm
 from urlab_client.protocol.errors import (
@@ -175,6 +177,28 @@ async def test_regions_are_where_the_handshake_says(
         scripted.on("hello", hello | {"shm_rpc": shm_rpc(directory) | {"req_path": strange}})
         with pytest.raises(ProtocolError, match="shm_rpc"):
             await client.discover()
+
+
+async def test_events_are_called_as_the_handshake_says(
+    connect: Any, plugin: PluginMemory, scripted: Any, directory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[str] = []
+
+    class Recorded(NamedEvent):
+        def __init__(self, name: str, *, create: bool = False) -> None:
+            opened.append(name)
+            super().__init__(name, create=create)
+
+    monkeypatch.setattr(region_channel, "NamedEvent", Recorded)
+    hello = scripted.answers["hello"]({})
+    events = {"req_event": "Local\\lab_asked", "rep_event": "Local\\lab_answered"}
+    for told in (events, {}):
+        scripted.on("hello", hello | {"shm_rpc": shm_rpc(directory) | told})
+        client = await shared(connect())
+        await client.step()
+        await client.close()
+    derived = [f"Local\\URLab_{directory.name}_{end}_ready" for end in ("req", "rep")]
+    assert opened == [*events.values(), *derived]
 
 
 async def test_a_late_reply_is_not_taken_for_the_next_one(connect: Any, plugin: PluginMemory, scripted: Any) -> None:

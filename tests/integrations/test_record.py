@@ -397,10 +397,10 @@ def test_a_cut_file_is_read_up_to_the_cut(client: urlab_client.URLabClient, tmp_
     assert steps[-1] == 50
     for size in (0, 7):
         cut.write_bytes(whole[:size])
-        with pytest.raises(RecordingError, match="no MCAP file"):
+        with pytest.raises(RecordingError, match="neither an MCAP file"):
             read_run(cut)
     cut.write_bytes(b"PK" + whole)
-    with pytest.raises(RecordingError, match="no MCAP file"):
+    with pytest.raises(RecordingError, match="neither an MCAP file"):
         read_run(cut)
 
 

@@ -240,7 +240,7 @@ def test_info_tells_what_is_there(recorded: Run, tmp_path: Path, capsys: pytest.
     assert "not finished" in capsys.readouterr().out
     cut.write_bytes(b"nonsense" * 10)
     assert run("info", cut) == 2
-    assert "no MCAP file" in capsys.readouterr().err
+    assert "neither an MCAP file" in capsys.readouterr().err
     assert run("info", tmp_path / "none.mcap") == 2
     assert "No such file" in capsys.readouterr().err
 

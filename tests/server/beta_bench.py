@@ -77,6 +77,8 @@ class Bench:
         return self.wire.ask("claim_control", articulation=robot, control_owner=owner, **fields)
 
     def step(self, **fields: Any) -> dict[str, Any]:
+        if fields.keys() & {"render", "wait_cameras"}:
+            fields.setdefault("camera_timeout_ms", 20_000)
         return self.wire.ask("step", **fields)
 
     @property

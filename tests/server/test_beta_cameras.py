@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +17,8 @@ from waiting import eventually
 from wire import Wire
 
 from urlab_client.server import SimulatedServer
+from urlab_client.server.render.camera_renderer import GIVEN_UP
+from urlab_client.server.render.drawing import Stage
 
 
 def test_pictures_in_steps(playing: Bench) -> None:
@@ -99,7 +102,8 @@ def test_cameras_are_off_until_they_are_switched_on(playing: Bench) -> None:
             playing.step(include_cameras=True, render="sync")
         before = playing.step()["frame_id"]
         playing.wire.ask("set_camera_streaming", cameras={"arm_a/cam": True})
-        assert number_of(socket.recv_multipart()) >= before, "nothing came before it was switched on"
+        playing.step()
+        assert number_of(socket.recv_multipart()) > before, "nothing came before it was switched on"
     eventually(lambda: regions(playing) == {"cam_arm_a_cam.shm"})
     playing.play()
     assert regions(playing) == set()
@@ -113,6 +117,7 @@ def test_a_region_has_room_for_the_header(playing: Bench) -> None:
     region = RawRegion(playing.server.shm_dir / "cam_arm_a_cam.shm")
     try:
         assert region.header[2] == 64 * 48 * 4 + 44
+        playing.step()
         eventually(lambda: region.sequence > 0)
         assert len(region.read()[1]) == 64 * 48 * 4 + 40
         before = region.sequence
@@ -126,6 +131,69 @@ def test_a_region_has_room_for_the_header(playing: Bench) -> None:
         reply = playing.step()
         message = next(m for m in iter(socket.recv_multipart, None) if number_of(m) >= reply["frame_id"])
         assert np.frombuffer(message[1], "<f8", count=1, offset=16)[0] == reply["time"]
+
+
+def test_a_stream_is_silent_while_the_state_stands_still(playing: Bench) -> None:
+    """Beta statement 55."""
+    other = f"{playing.b}/cam"
+    cameras = {"arm_a/cam": True, other: True}
+    told = playing.wire.ask("set_camera_streaming", cameras=cameras)["cameras"]
+    playing.wire.ask("set_camera_delay", cameras={other: {"on_state_change": False}})
+    with (
+        pictures(told["arm_a/cam"]["zmq_endpoint"], b"arm_a/cam ") as socket,
+        pictures(told[other]["zmq_endpoint"], f"{other} ".encode()) as repeating,
+    ):
+        first = playing.step()["frame_id"]
+        assert number_of(socket.recv_multipart()) == first
+        playing.wire.ask("set_camera_streaming", cameras={"arm_a/cam": False})
+        playing.wire.ask("set_camera_streaming", cameras={"arm_a/cam": True})
+        for _ in range(4):
+            repeating.recv_multipart()
+        second = playing.step()["frame_id"]
+        assert number_of(socket.recv_multipart()) == second, "nothing came between, not even when it was switched on"
+
+
+@pytest.fixture
+def drawing(playing: Bench, monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
+    """Whether pictures get drawn: they wait while it is cleared."""
+    playing.step(include_cameras=True, render="sync")
+    may = threading.Event()
+    may.set()
+    draw = Stage.draw
+
+    def waits(stage: Stage, *args: Any) -> Any:
+        may.wait()
+        return draw(stage, *args)
+
+    monkeypatch.setattr(Stage, "draw", waits)
+    yield may
+    may.set()
+
+
+@pytest.mark.parametrize("wait", [{"render": "sync"}, {"wait_cameras": True}])
+def test_a_step_waits_for_pictures_only_as_long_as_it_says(
+    playing: Bench, drawing: threading.Event, wait: dict[str, Any]
+) -> None:
+    """Beta statement 51."""
+    other = f"{playing.b}/cam"
+    first = playing.step(include_cameras=True, **wait)
+    drawing.clear()
+    cameras = {"arm_a/cam": "sync", other: {"frame_id": first["frame_id"] + 1}}
+    for _ in range(2 * GIVEN_UP):
+        reply = playing.step(include_cameras=cameras, camera_timeout_ms=1, **wait)
+        assert {key: frame["frame_id"] for key, frame in reply["cameras"].items()} == {"arm_a/cam": first["frame_id"]}
+        assert reply["frame_id"] > first["frame_id"]
+    drawing.set()
+    eventually(lambda: not playing.core.play.current.cameras._pending)
+    reply = playing.step(include_cameras=cameras, **wait)
+    assert {frame["frame_id"] for frame in reply["cameras"].values()} == {reply["frame_id"]}
+
+
+@pytest.mark.parametrize("limit", [0, -5, float("nan")])
+def test_a_limit_that_is_no_time_is_not_waited_for(playing: Bench, drawing: threading.Event, limit: float) -> None:
+    drawing.clear()
+    reply = playing.step(include_cameras={"arm_a/cam": {"frame_id": 1e9}}, render="sync", camera_timeout_ms=limit)
+    assert "cameras" not in reply
 
 
 WIDE = """
@@ -146,7 +214,9 @@ def test_the_field_of_view_is_the_vertical_one(tmp_path: Path) -> None:
             Wire(server) as wire,
         ):
             wire.hello()
-            (frame,) = wire.ask("step", include_cameras=True, render="sync")["cameras"].values()
+            (frame,) = wire.ask("step", include_cameras=True, render="sync", camera_timeout_ms=20_000)[
+                "cameras"
+            ].values()
             pixels = np.frombuffer(frame["data"], np.uint8).reshape(480, 640, 4)[:, :, :3]
             background = np.median(pixels.reshape(-1, 3), axis=0)
             seen.append(bool((np.abs(pixels - background).max(axis=2) > 20).any()))
@@ -186,8 +256,7 @@ def test_a_delayed_camera(playing: Bench) -> None:
         pictures(streams[other]["zmq_endpoint"], f"{other} ".encode()) as others,
     ):
         first = socket.recv_multipart()
-        for _ in range(3):
-            others.recv_multipart()  # not delayed by anything, it is sent over and over
+        assert number_of(others.recv_multipart()) == reply["frame_id"], "the other camera is not delayed"
         assert sim_time_of(first) == pytest.approx(reply["time"] - 0.5)
         later = playing.step(n_steps=20)
         second = socket.recv_multipart()

@@ -6,13 +6,47 @@ import re
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+import numpy as np
 import pytest
+import zmq
 from beta_bench import ME, OTHER, Bench, Clock
 from wire import Wire
 
+from urlab_client.protocol.control_messages import ControlPayload
 from urlab_client.server.lease import DriverLease
 
 # Claims.
+
+
+def test_streamed_controls_of_a_robot_with_an_owner_are_dropped(bench: Bench) -> None:
+    """Beta statement 25."""
+    bench.play("live")
+    bench.claim()
+    with zmq.Context() as context, context.socket(zmq.XPUB) as publisher:
+        publisher.linger = 0
+        publisher.rcvtimeo = 20_000
+        publisher.connect(f"{bench.server.address}:{bench.server.ctrl_port}")
+        wanted = f"{bench.b}/control ".encode()
+        while publisher.recv() != b"\x01" + wanted:
+            pass
+        for actuator in (0, 1):  # the owned robot's first
+            payload = ControlPayload(np.array([actuator]), np.array([0.5], np.float32)).encode()
+            publisher.send_multipart([wanted, payload])
+        for reply in bench.wire.until("step"):
+            if reply["arts"][bench.b]["ctrl"] == [0.5]:
+                break
+    assert reply["arts"]["arm_a"]["ctrl"] == [0.0]
+
+
+def test_raw_controls_of_a_live_step_last_for_an_iteration(bench: Bench) -> None:
+    """Beta statement 91."""
+    bench.play("live")
+    bench.claim()
+    raw = {"ctrl": [0.5], "control_mode": "raw"}
+    assert bench.step(per_articulation={"arm_a": raw}, control_owner=ME)["arts"]["arm_a"]["ctrl"] == [0.5]
+    for reply in bench.wire.until("step"):
+        if reply["arts"]["arm_a"]["ctrl"] == [0.0]:
+            break
 
 
 def test_nothing_is_claimed_at_first(playing: Bench) -> None:

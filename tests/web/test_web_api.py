@@ -6,6 +6,7 @@ import contextlib
 import io
 import json
 from collections.abc import AsyncGenerator, Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,9 @@ from starlette.applications import Starlette
 from starlette.routing import Mount
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
-from waiting import eventually
 
 from urlab_client.aio import URLabClient
+from urlab_client.integrations.record import read_run
 from urlab_client.protocol.registry import OPS
 from urlab_client.server import SimulatedServer
 from urlab_client.web import Access, app
@@ -30,10 +31,12 @@ def server() -> Iterator[SimulatedServer]:
         yield running
 
 
-def mounted(server: SimulatedServer, at: str, access: Access | None = None) -> Starlette:
+def mounted(
+    server: SimulatedServer, at: str, access: Access | None = None, recordings: str | Path = "recordings"
+) -> Starlette:
     """Mount the console in an application of one's own, which owns the client."""
     client = URLabClient(**server.client_options())
-    inner = app(client, access=access, lease_seconds=600.0)
+    inner = app(client, access=access, lease_seconds=600.0, recordings=recordings)
 
     @contextlib.asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncGenerator[None]:
@@ -46,8 +49,8 @@ def mounted(server: SimulatedServer, at: str, access: Access | None = None) -> S
 
 
 @pytest.fixture
-def site(server: SimulatedServer) -> Starlette:
-    return mounted(server, "/")
+def site(server: SimulatedServer, tmp_path: Path) -> Starlette:
+    return mounted(server, "/", recordings=tmp_path / "recordings")
 
 
 @pytest.fixture
@@ -115,6 +118,20 @@ def test_openapi_describes_every_op_that_is_served(http: TestClient) -> None:
     assert set(document["components"]["schemas"]["BeginPieOk"]["properties"]) == {"op", "state", "compile_error"}
     named = json.dumps(document).split('"#/components/schemas/')[1:]
     assert {part.partition('"')[0] for part in named} <= set(document["components"]["schemas"])
+
+
+def test_openapi_says_where_it_is_mounted(server: SimulatedServer) -> None:
+    for proxy in ("", "/behind/proxy"):
+        outer = mounted(server, "/lab", Access(hosts=["robots.example"], tokens=False))
+        with TestClient(outer, base_url="http://robots.example", root_path=proxy) as client:
+            told = client.get(f"{proxy}/lab/api/openapi.json").json()
+        assert told["servers"] == [{"url": f"{proxy}/lab"}]
+
+
+def test_it_says_why_a_robot_does_not_move(http: TestClient) -> None:
+    http.post("/api/run", json={"running": False})
+    findings = http.get("/api/explain").json()["findings"]
+    assert any(finding["verdict"] == "problem" and "paused" in finding["text"] for finding in findings)
 
 
 def test_an_op_is_done_and_a_refusal_is_said(http: TestClient) -> None:
@@ -221,36 +238,102 @@ def test_direct_mode_steps_and_shows_what_cameras_see(http: TestClient) -> None:
     assert "direct" in refused.json()["error"]["message"]
 
 
-def test_a_replay_goes_to_any_frame_of_it(http: TestClient) -> None:
+def test_a_recording_is_made_converted_replayed_in_seconds_and_removed(
+    server: SimulatedServer, http: TestClient, tmp_path: Path
+) -> None:
+    def elbow(state: dict[str, Any]) -> float:
+        return float(state["articulations"]["arm"]["qpos"][place])
+
+    art = http.get("/api/world").json()["articulations"][0]
+    place = next(joint["index"] for joint in art["joints"] if joint["name"] == "elbow")
+    http.post("/api/run", json={"running": False})
+    http.post("/api/ops/set_mode", json={"mode": "direct"})
+    http.post("/api/ops/reset", json={})
     try:
-        http.post("/api/run", json={"running": False})
-        http.post("/api/ops/set_mode", json={"mode": "direct"})
-        assert "no replay runs" in http.post("/api/replay", json={"frame": 3}).json()["error"]["message"]
-        http.post("/api/ops/recording_start", json={})
+        assert http.post("/api/replay", json={"time": 0.1}).status_code == 400
+        assert http.delete("/api/recording").status_code == 400
+        name = http.post("/api/recording", json={"cameras": True}).json()["name"]
+        assert http.post("/api/recording", json={}).status_code == 400, "one at a time"
+        assert http.get("/api/status").json()["recording"]["name"] == name
         http.post("/api/ctrl", json={"arm": {"elbow": -0.4}})
-        http.post("/api/step", json={"n_steps": 500})
-        http.post("/api/ops/recording_stop", json={})
-        total = http.post("/api/ops/replay_start", json={}).json()["total_frames"]
-        assert total >= 500
-        for wanted, reached in ((400, 400), (20, 20), (10**6, total - 1), (-5, 0)):
-            assert http.post("/api/replay", json={"frame": wanted}).json() == {"frame": reached, "total": total}
-            assert http.get("/api/status").json()["replay"] == [reached, total]
-        http.post("/api/ops/replay_stop", json={})
-        assert http.post("/api/replay", json={"frame": 3}).status_code == 400
+        for _ in range(10):
+            http.post("/api/step", json={"n_steps": 100})
+        made = http.delete("/api/recording").json()
+        assert made["seconds"] == pytest.approx(1.8, abs=0.01), "ten steps of 0.2 s, of which each is one state"
+        assert (made["robots"], made["damage"], made["lost"]) == (["arm"], "", 0)
+        assert http.get("/api/recordings").json()["recordings"][0]["name"] == name
+
+        file = tmp_path / name
+        file.write_bytes(http.get(f"/api/recordings/{name}").content)
+        table = read_run(file).table()
+        rows = http.get(f"/api/recordings/{name}?as=csv").text.splitlines()
+        assert rows[0].startswith("time,sim_time")
+        assert len(rows) == len(table)  # a header, and a row for each state but the last, which no action follows
+        camera = made["cameras"][0]
+        assert b"ftyp" in http.get(f"/api/recordings/{name}?as=mp4&camera={camera}").content[:16]
+        assert http.get(f"/api/recordings/{name}?as=mp4&camera=none").status_code == 400
+        for wrong in ("none.mcap", "..%2F..%2Fetc%2Fpasswd", "a.txt"):
+            assert http.get(f"/api/recordings/{wrong}").status_code in {400, 404}
+
+        column = table.columns["arm/qpos"]
+        recorded = column.values[:, column.names.index("elbow")]
+        live = elbow(http.get("/api/state").json())
+        http.post("/api/replay", json={"name": name, "playing": False})
+        for wanted, row in ((0.0, 0), (1.0, 5), (99.0, -1), (0.39, 1)):
+            view = http.post("/api/replay", json={"time": wanted}).json()
+            assert view["time"] == pytest.approx(min(wanted, view["seconds"]))
+            state = http.get("/api/state").json()
+            assert elbow(state) == pytest.approx(recorded[row], abs=1e-4)
+            assert state["time"] == pytest.approx(table.time[row] - table.time[0])
+        assert abs(recorded[0] - live) > 0.03
+        http.post("/api/replay", json={"time": 0.0, "playing": True, "rate": 4})
+        with http.websocket_connect("ws://localhost/api/live") as viewer:
+            heard(viewer, "status", lambda status: status["replay"]["playing"] and status["rate"] == 4)
+            ended = heard(viewer, "status", lambda status: not status["replay"]["playing"])
+            assert ended["replay"]["time"] == pytest.approx(1.8, abs=0.01)
+            http.delete("/api/replay")
+            http.post("/api/step", json={"n_steps": 1})
+            heard(viewer, "state", lambda state: elbow(state) == pytest.approx(live, abs=0.01))
+
+        http.post("/api/replay", json={"name": name, "placing": True, "playing": False})
+        assert http.get("/api/status").json()["mode"] == "puppet"
+        http.post("/api/replay", json={"time": 0.0})
+        http.delete("/api/replay")
+        assert http.get("/api/status").json()["mode"] == "direct"
+        reached = http.post("/api/ops/forward", json={}).json()["per_articulation"]["arm"]["qpos"][place]
+        assert reached == pytest.approx(live, abs=0.01), "the simulation is where it was before the replay"
+
+        taken = http.put("/api/recordings/other.mcap", content=file.read_bytes())
+        assert taken.json()["seconds"] == made["seconds"]
+        assert http.put("/api/recordings/other.mcap", content=b"").status_code == 400, "the name is taken"
+        assert http.put("/api/recordings/broken.mcap", content=b"nonsense").status_code == 502
+        assert {one["name"] for one in http.get("/api/recordings").json()["recordings"]} == {name, "other.mcap"}
+        for one in (name, "other.mcap"):
+            assert http.delete(f"/api/recordings/{one}").status_code == 200
+        assert http.get("/api/recordings").json()["recordings"] == []
     finally:
         http.post("/api/ops/set_mode", json={"mode": "live"})
 
 
-def test_live_pictures_come_as_files_too(http: TestClient) -> None:
-    http.post("/api/run", json={"running": True})
+def test_pictures_come_as_files_too_while_running_paused_and_stepped(http: TestClient) -> None:
+    def shown(kind: str) -> tuple[int, int]:
+        answer = http.get(f"/api/cameras/arm/overview.{kind}")
+        assert answer.status_code == 200, answer.text
+        assert answer.headers["content-type"] == {"jpg": "image/jpeg", "png": "image/png"}[kind]
+        return Image.open(io.BytesIO(answer.content)).size
 
-    def shown() -> bytes | None:  # the answer does not wait long for a first picture
-        answer = http.get("/api/cameras/arm/overview.jpg")
-        return answer.content if answer.status_code == 200 else None
-
-    picture = eventually(shown)
-    assert Image.open(io.BytesIO(picture)).size == (64, 48)
-    assert http.get("/api/cameras/arm/nothing.jpg").status_code == 404
+    try:
+        for prepare in (
+            lambda: http.post("/api/run", json={"running": True}),
+            lambda: http.post("/api/run", json={"running": False}),
+            lambda: http.post("/api/ops/set_mode", json={"mode": "direct"}),
+        ):
+            prepare()
+            assert shown("jpg") == shown("png") == (64, 48)
+    finally:
+        http.post("/api/ops/set_mode", json={"mode": "live"})
+    for kind in ("jpg", "png"):
+        assert http.get(f"/api/cameras/arm/nothing.{kind}").status_code == 404
 
 
 def test_the_viewer_gets_the_model_and_the_state_that_is_shown(http: TestClient) -> None:
@@ -350,3 +433,20 @@ def test_the_controls_are_lost_by_not_using_them() -> None:
     assert lease.holder is None
     lease.use(bob)
     assert lease.holder is bob
+
+
+def test_a_paused_beta_is_seen_and_driven() -> None:
+    with (
+        SimulatedServer("arm", play=True, camera_size=(64, 48), dialect="beta") as beta,
+        TestClient(site := mounted(beta, "/"), base_url="http://localhost") as http,
+    ):
+        key = http.post("/api/session", json={"token": site.state.access.invite()}).json()["key"]
+        http.headers["authorization"] = f"Bearer {key}"
+        with http.websocket_connect("ws://localhost/api/live") as live:
+            heard(live, "world", lambda message: bool(message["world"]["articulations"]))
+            with http.websocket_connect("ws://localhost/api/cameras/arm/wrist/live") as camera:
+                frame = camera.receive_bytes()  # though its stream is silent
+            assert Image.open(io.BytesIO(frame[4 + int.from_bytes(frame[:4], "little") :])).size == (64, 48)
+            assert http.post("/api/ctrl", json={"arm": {"elbow": 0.5}}).status_code == 200
+            http.post("/api/run", json={"running": True})
+            heard(live, "state", lambda state: abs(state["articulations"]["arm"]["qpos"][2]) > 0.01)

@@ -26,14 +26,16 @@ TOO_WIDE = """[...document.querySelectorAll('main *, header *')]
 
 
 @pytest.fixture(scope="module")
-def console() -> Iterator[tuple[dict[str, Any], str, contextlib.ExitStack]]:
+def console(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[tuple[dict[str, Any], str, contextlib.ExitStack]]:
     """A server, the link to a console before it, and what holds the server."""
     with contextlib.ExitStack() as stack:
         _, line = stack.enter_context(serve(*(f"--{n}-port=0" for n in ("step", "state", "ctrl", "info", "camera"))))
         ready = json.loads(line)
         with command(
             "console", ready["address"], f"--step-port={ready['step_port']}", f"--state-port={ready['state_port']}",
-            "--port=0",
+            "--port=0", f"--recordings={tmp_path_factory.mktemp('recordings')}",
         ) as (_, said):  # fmt: skip
             yield ready, link_in(said), stack
 
@@ -168,7 +170,7 @@ def test_actors_are_spawned_moved_and_removed_and_nobody_loses_what_they_type(pa
         assert where(actor) is None
 
 
-def test_a_recording_is_made_and_replayed_and_one_can_go_to_any_place_in_it(page: Page) -> None:
+def test_a_recording_is_made_offered_for_download_and_replayed_in_seconds(page: Page) -> None:
     page.until(RUNNING)
     page.slide(0.0)
     page.until(page.elbow_is(0.0))
@@ -176,29 +178,43 @@ def test_a_recording_is_made_and_replayed_and_one_can_go_to_any_place_in_it(page
     page.until("document.querySelector('#record').textContent.includes('Stop')")
     page.slide(0.9)
     page.until(page.elbow_is(0.9))
-    page.ask("api/ops/configure_controller", {"articulation": "quadruped", "params": {"kp": {"RR_hip": 41}}})
-    assert page.ask("api/status")["recording"], "tuning a controller is not a reason to think that it ended"
+    page.asked("api/status", lambda status: status["recording"]["pictures"] >= 4)
     page.click("#record")
-    page.until("document.querySelector('#toasts').innerText.includes('frames')")
-    page.click("#replay")
-    page.until("document.querySelector('#replay').textContent.includes('Stop')")
-    page.until("document.querySelector('#mode').value === 'direct' && +document.querySelector('#timeline').value > 5")
-    page.click("#stop")
-    page.until(f"!({RUNNING})")
-    seek = (
-        "const t = document.querySelector('#timeline'); t.value = Math.round(arguments[0] * t.max);"
-        "t.dispatchEvent(new Event('input', {bubbles: true})); return +t.value"
+    page.until("document.querySelectorAll('[data-recording]').length === 1")
+    page.driver.execute_script("document.querySelector('[data-recording] .menu').open = true")
+    page.until("document.querySelector('[data-recording] .kinds').innerText.includes('MP4, arm/overview')")
+    kinds = page.look(
+        "[...document.querySelectorAll('[data-recording] .kind')].map(one => one.textContent.split(',')[0])"
+    )
+    assert {"MCAP", "CSV", "MP4"} <= set(kinds)
+    for at in (0, 1):
+        size = "fetch(arguments[0]).then(one => one.blob()).then(one => arguments[1](one.size))"
+        link = page.look(f"document.querySelectorAll('[data-recording] .kind')[{at}].href")
+        assert page.driver.execute_async_script(size, link) > 1000
+    page.click("[data-recording] .replay")
+    page.until("!document.querySelector('#replay').hidden && +document.querySelector('#timeline').value > 0.1")
+    page.until("document.querySelector('#time').textContent !== '0.00 s'")
+    seconds = page.look("+document.querySelector('#timeline').max")
+    page.click("#stop")  # whatever moves, physics as well
+    page.until("document.querySelector('#replay-play').textContent === '▶'")
+    go = (
+        "const t = document.querySelector('#timeline'); t.value = arguments[0] * t.max;"
+        "t.dispatchEvent(new Event('input', {bubbles: true}))"
     )
     for share, elbow in ((1.0, 0.9), (0.0, 0.0), (1.0, 0.9)):
-        frame = page.driver.execute_script(seek, share)
-        page.asked("api/status", lambda status, frame=frame: status["replay"][0] == frame)
+        page.driver.execute_script(go, share)
         page.until(page.elbow_is(elbow))
-    page.click("#replay")
-    page.until("document.querySelector('#mode').value === 'live'")
-    page.driver.execute_script(
-        "document.querySelector('#play').textContent.includes('Play') && document.querySelector('#play').click()"
-    )
+        page.until(f"Math.abs(parseFloat(document.querySelector('#time').textContent) - {share * seconds}) < 0.1")
+    page.find("body").send_keys(" ")
+    page.until("document.querySelector('#replay-play').textContent === '❚❚'")
+    page.click("#replay-end")
+    page.until("document.querySelector('#replay').hidden")
+    page.click("#play")
     page.until(RUNNING)
+    remove = page.find("[data-recording] button[aria-label^=Delete]")
+    remove.click()
+    remove.click()
+    page.until("document.querySelectorAll('[data-recording]').length === 0")
 
 
 def test_keys_work_and_not_while_somebody_types(page: Page) -> None:

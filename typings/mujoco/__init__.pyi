@@ -146,6 +146,8 @@ class mjtObj:
     mjOBJ_ACTUATOR: ClassVar[int]
     mjOBJ_SENSOR: ClassVar[int]
     mjOBJ_KEY: ClassVar[int]
+    mjOBJ_LIGHT: ClassVar[int]
+    mjOBJ_TEXT: ClassVar[int]
 
 def mj_version() -> int: ...
 def mj_versionString() -> str: ...

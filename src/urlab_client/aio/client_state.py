@@ -139,6 +139,11 @@ class ClientState:
         return self._state.step_count
 
     @property
+    def reset_seed(self) -> int | None:
+        """The seed that the last `reset()` gave, which decides what a server varies; None without one."""
+        return self._state.reset_seed
+
+    @property
     def sim_time(self) -> float:
         """Simulation time of the last reply, seconds."""
         return self._state.sim_time

@@ -20,7 +20,7 @@ import threading
 import warnings
 from collections.abc import Callable, Sequence
 from typing import IO
-from urllib.parse import parse_qsl
+from urllib.parse import parse_qsl, urlencode
 
 import msgspec
 from msgspec import Struct
@@ -39,6 +39,7 @@ __all__ = [
     "serve_arguments",
     "start_seconds",
     "with_model_options",
+    "with_option",
     "with_start_timeout",
 ]
 
@@ -104,6 +105,11 @@ def with_start_timeout(address: str, seconds: float) -> str:
     if not address.startswith(SCHEME) or _START_TIMEOUT in dict(parse_qsl(query, keep_blank_values=True)):
         return address
     return f"{address}{'&' if query else '?'}{_START_TIMEOUT}={seconds:g}"
+
+
+def with_option(address: str, name: str, value: str) -> str:
+    """Return a `sim://` address whose server gets a further option."""
+    return f"{address}{'&' if '?' in address else '?'}{urlencode({name: value})}"
 
 
 def with_model_options(address: str) -> str:
@@ -274,6 +280,7 @@ class LaunchedTransport:
         transport.stats = self.stats
         transport.on_event = self.on_event
         transport.lost_at = self._lost_at
+        transport.refused = True
         self._watch = asyncio.create_task(self._tell_end(process, transport), name="urlab-server-end")
         self._state_port = ready.state_port
         self.scene_warnings = ready.scene_warnings

@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Coroutine
+from collections.abc import AsyncGenerator, Callable, Coroutine
+from contextlib import asynccontextmanager
+from contextvars import ContextVar
 from typing import Any, TypeVar
 
 from urlab_client.aio.call_records import CallRecords, Observe
@@ -16,7 +18,7 @@ from urlab_client.aio.jobs import OnProgress, finish
 from urlab_client.aio.mutex import Mutex
 from urlab_client.aio.transport.base import RequestTransport
 from urlab_client.aio.turn import Limits, Turn, at_once
-from urlab_client.protocol.base import ControlRequest, Needs, Op, Reply, Request
+from urlab_client.protocol.base import ControlRequest, Effect, Needs, Op, Reply, Request
 from urlab_client.protocol.codec import (
     check_finite,
     check_request,
@@ -45,6 +47,8 @@ log = logging.getLogger("urlab_client.session")
 
 R = TypeVar("R", bound=Reply)
 _HELLO = op_of(Hello)
+_COMPOSING: ContextVar[Session | None] = ContextVar("_COMPOSING", default=None)
+"""Whose scene the running task changes by several ops."""
 _UNLISTED = frozenset({"hello", "meta"})  # every server has them, none lists them
 
 
@@ -67,6 +71,7 @@ class Session:
         line: Held while a request is under way, from encoding it to its reply.
         turns: Held by the `Turn` under way.
         editing: Held while the editor has a job.
+        scene: Held by whoever changes the scene, for one op or for several that belong together.
     """
 
     def __init__(
@@ -92,6 +97,7 @@ class Session:
         self.line = Mutex()
         self.turns = Mutex()
         self.editing = Mutex()
+        self.scene = Mutex()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._queued = 0
         self._aside: asyncio.Task[Reply] | None = None
@@ -126,6 +132,31 @@ class Session:
             raise TypeError(f"{op.name}: on_progress takes a function, got {on_progress!r:.80}.")
         self.check_offered(op)
         limits = self.limits(op, timeout, self.bound_loop().time())
+        if op.ns != "scene" or op.effect is Effect.READ or _COMPOSING.get() is self:
+            return await self._call(request, op, limits, on_progress)
+        await self.acquire(self.scene, op, limits[0])
+        try:
+            return await self._call(request, op, limits, on_progress)
+        finally:
+            self.scene.release()
+
+    @asynccontextmanager
+    async def composing(self, request: type[Request[Any]], timeout: Timeout) -> AsyncGenerator[None]:
+        """Let no other task change the scene while this one does by several ops, the first of which is `request`.
+
+        Raises:
+            URLabTimeoutError: Others changed it until the deadline of that op; nothing was sent.
+        """
+        op = op_of(request)
+        await self.acquire(self.scene, op, self.limits(op, timeout, self.bound_loop().time())[0])
+        outer = _COMPOSING.set(self)
+        try:
+            yield
+        finally:
+            _COMPOSING.reset(outer)
+            self.scene.release()
+
+    async def _call(self, request: Request[R], op: Op, limits: Limits, on_progress: OnProgress | None) -> R:
         if op.needs is not Needs.EDITOR:
             return await self._on_line(request, op, limits)
         # One job at a time: the next op of the editor would wait for it anyway, and block the server meanwhile.
@@ -359,7 +390,7 @@ class Session:
                 raise lost from unreachable
 
     async def acquire(self, lock: Mutex, op: Op, deadline: float | None) -> None:
-        """Wait for `line`, `turns` or `editing`.
+        """Wait for `line`, `turns`, `editing` or `scene`.
 
         Raises:
             URLabTimeoutError: Another call held it until the deadline; nothing was sent.

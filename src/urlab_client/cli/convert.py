@@ -42,7 +42,7 @@ def add_parser(commands: Commands) -> None:
     parser = commands.add_parser(
         "convert",
         help="turn a recording into CSV, NumPy, Parquet, MP4 or a LeRobot dataset",
-        description="Convert a recording made by `urlab record` or record(). CSV, Parquet and LeRobot hold states with "
+        description="Convert a recording. CSV, Parquet and LeRobot hold states with "
         "the actions taken at them; NumPy all states; MP4 the pictures of one camera. Needs the extra "
         "'urlab-client[mcap]'; Parquet 'dataset', MP4 'video', besides.",
         examples=(
@@ -51,7 +51,12 @@ def add_parser(commands: Commands) -> None:
             ("urlab convert run.mcap run.npz --camera arm/wrist", "states and pictures as NumPy arrays"),
         ),
     )
-    parser.add_argument("recording", type=Path, metavar="FILE", help="the recording, a .mcap file")
+    parser.add_argument(
+        "recording",
+        type=Path,
+        metavar="FILE",
+        help="a .mcap file, or a .json file of the server",
+    )
     parser.add_argument("output", type=Path, metavar="OUTPUT", help="the file to write; its ending says the format")
     parser.add_argument("--format", choices=_FORMATS, help="the format, where the ending does not say it")
     parser.add_argument(

@@ -39,7 +39,12 @@ def add_parser(commands: Commands) -> None:
             ("urlab info run.mcap --json", "the same for programs"),
         ),
     )
-    parser.add_argument("recording", type=Path, metavar="FILE", help="the recording, a .mcap file")
+    parser.add_argument(
+        "recording",
+        type=Path,
+        metavar="FILE",
+        help="a .mcap file, or a .json file of the server",
+    )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=run)
 
@@ -80,6 +85,7 @@ def _print(summary: Summary) -> None:
             f"dropped: {counted(summary.dropped_states, 'state')}, {counted(summary.dropped_frames, 'picture')}, "
             "which came faster than the file could be written"
         )
+    _print_varied(summary)
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
     table.add_column("topic", overflow="fold")
     table.add_column("schema", overflow="fold")
@@ -95,3 +101,17 @@ def _print(summary: Summary) -> None:
             f"{topic.longest_gap_s:.3f}" if topic.longest_gap_s else "",
         )
     output().print(table)
+
+
+def _print_varied(summary: Summary) -> None:
+    """Say what varied from episode to episode, and how far."""
+    spans: dict[tuple[str, str], list[float]] = {}
+    elements: dict[tuple[str, str], set[str]] = {}
+    for episode in summary.varied:
+        for quantity in episode.varied:
+            key = quantity.what, quantity.by
+            spans.setdefault(key, []).extend(value for row in quantity.drawn.values() for value in row)
+            elements.setdefault(key, set()).update(quantity.drawn)
+    for (what, by), values in spans.items():
+        where = counted(len(elements[what, by]), "element")
+        print(f"varied: {what}, {by} {min(values):.4g} to {max(values):.4g} on {where}")

@@ -46,7 +46,12 @@ def add_parser(commands: Commands) -> None:
             ("urlab plot run.mcap --field sensors --joints 'imu*'", "readings of some sensors"),
         ),
     )
-    parser.add_argument("recording", type=Path, metavar="FILE", help="the recording, a .mcap file")
+    parser.add_argument(
+        "recording",
+        type=Path,
+        metavar="FILE",
+        help="a .mcap file, or a .json file of the server",
+    )
     parser.add_argument(
         "--joints",
         nargs="+",

@@ -10,11 +10,14 @@ import queue
 import signal
 import sys
 import threading
+from collections.abc import Generator
 from enum import Enum
+from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, cast
 
+from urlab_client._installation import install_command
 from urlab_client._windows import read_aside
 from urlab_client.cli._arguments import Commands, count, image_size, index, port
 from urlab_client.cli._failure import CommandError
@@ -75,11 +78,13 @@ class ServeArguments(argparse.Namespace):
     camera_size: tuple[int, int] | None
     render_quality: Literal["auto", "fast", "high"]
     mjcf_options: bool
+    randomise: str | None
     scene_mib: int | None
     actor_names: Literal["model", "plugin"]
     dialect: Literal["alpha", "beta"]
     instance_id: str
     instance_index: int | None
+    metrics_port: int | None
     json: bool
     until_eof: bool
 
@@ -156,6 +161,12 @@ def add_parser(commands: Commands) -> None:
         help="number of this server among several: ports 5559 + 10 N and the two after it, for those not given",
     )
     network.add_argument("--instance-id", default="", metavar="NAME", help="name of this server among several")
+    network.add_argument(
+        "--metrics-port",
+        type=port,
+        metavar="PORT",
+        help="also serve metrics for Prometheus at http://127.0.0.1:PORT/metrics; 0: any free one",
+    )
     memory = network.add_mutually_exclusive_group()
     memory.add_argument(
         "--shm-dir",
@@ -215,6 +226,11 @@ def add_parser(commands: Commands) -> None:
         default=False,
         help="honour the <option> of the first model; else the alpha ignores all, the beta merges them",
     )
+    physics.add_argument(
+        "--randomise",
+        metavar="FILE",
+        help="vary the model from reset to reset, by the seed of the reset, as a TOML file (or JSON text) declares",
+    )
     cameras = parser.add_argument_group("cameras")
     cameras.add_argument(
         "--camera-mode",
@@ -255,6 +271,8 @@ def run(arguments: ServeArguments) -> int:
     """
     _settle_ports(arguments)
     _check_ports(arguments)
+    if arguments.metrics_port is not None and find_spec("prometheus_client") is None:
+        raise CommandError(f"prometheus_client is not installed; run: {install_command('prometheus')}")
     events: _Events = queue.SimpleQueue()
     _stop_on_signals(events, ignore_interrupt=arguments.until_eof and not os.isatty(0))
     if arguments.until_eof:
@@ -273,9 +291,9 @@ def run(arguments: ServeArguments) -> int:
         if _next(events) is _Event.STARTED:
             if starter.error is not None:
                 raise starter.error
-            with server:
+            with server, _metrics(server, arguments) as metrics_port:
                 server.add_failure_callback(lambda _: events.put(_Event.FAILED))
-                _announce(server, arguments)
+                _announce(server, arguments, metrics_port)
                 while (event := _next(events)) is _Event.STARTED:
                     pass
                 if event is _Event.FAILED:
@@ -375,6 +393,7 @@ def _server(arguments: ServeArguments, saved_dir: Path) -> SimulatedServer:
             camera_size=arguments.camera_size,
             render_quality=arguments.render_quality,
             mjcf_options=arguments.mjcf_options,
+            randomise=arguments.randomise,
             limits=Limits() if arguments.scene_mib is None else Limits(scene_bytes=arguments.scene_mib * 2**20),
             actor_names=arguments.actor_names,
             shm_dir=arguments.shm_dir,
@@ -384,6 +403,8 @@ def _server(arguments: ServeArguments, saved_dir: Path) -> SimulatedServer:
         )
     except ValueError as error:
         raise CommandError(str(error)) from None
+    except OSError as error:  # nothing else is read before the start
+        raise CommandError(f"--randomise: {error}") from None
 
 
 def _curve(arguments: ServeArguments) -> CurveServer | None:
@@ -400,7 +421,30 @@ def _curve(arguments: ServeArguments) -> CurveServer | None:
     )
 
 
-def _announce(server: SimulatedServer, arguments: ServeArguments) -> None:
+@contextlib.contextmanager
+def _metrics(server: SimulatedServer, arguments: ServeArguments) -> Generator[int | None]:
+    """Serve metrics while the body runs; yields their port, None without."""
+    if arguments.metrics_port is None:
+        yield None
+        return
+    from prometheus_client import start_http_server  # noqa: PLC0415
+
+    from urlab_client.integrations.telemetry import PrometheusServerMetrics  # noqa: PLC0415
+
+    PrometheusServerMetrics(server)
+    try:
+        http, thread = start_http_server(arguments.metrics_port, addr="127.0.0.1")
+    except OSError as error:
+        raise CommandError(f"--metrics-port {arguments.metrics_port} cannot be used: {error.strerror}") from None
+    try:
+        yield http.server_port
+    finally:
+        http.shutdown()
+        http.server_close()
+        thread.join()
+
+
+def _announce(server: SimulatedServer, arguments: ServeArguments, metrics_port: int | None) -> None:
     ports = {name: int(getattr(server, f"{name}_port")) for name in _PORTS}
     if arguments.json:
         ready: dict[str, Any] = {"event": "ready", "address": server.address}
@@ -409,9 +453,13 @@ def _announce(server: SimulatedServer, arguments: ServeArguments) -> None:
         ready |= {"shm_dir": shm_dir, "saved_dir": str(server.saved_dir), "pid": os.getpid()}
         ready |= {"scene_warnings": server.scene_warnings}
         ready |= {"open_to": server.open_to, "server_key": server.client_options().get("server_key")}
+        if metrics_port is not None:
+            ready["metrics_port"] = metrics_port
         print(json.dumps(ready), flush=True)
         return
     others = ", ".join(f"{name} {number}" for name, number in ports.items() if name != "step")
+    if metrics_port is not None:
+        others += f", metrics {metrics_port}"
     models = ", ".join(Path(model).name for model in arguments.models)
     end = "Ctrl-C or the end of standard input" if arguments.until_eof else "Ctrl-C"
     print(

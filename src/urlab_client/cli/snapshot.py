@@ -159,7 +159,7 @@ def _of_models(arguments: SnapshotArguments) -> NDArray[np.uint8]:
     with SimulatedServer(
         *arguments.sources,
         play=play,
-        camera_modes={camera: CameraMode(arguments.mode or CameraMode.REAL)} if camera else {},
+        camera_modes={camera: CameraMode(arguments.mode)} if camera and arguments.mode else {},
         camera_size=arguments.size,
         mjcf_options=arguments.mjcf_options,
     ) as server:
@@ -205,8 +205,10 @@ def _of_running_server(arguments: SnapshotArguments) -> NDArray[np.uint8]:
         if arguments.mode not in (None, view.mode):
             raise CommandError(f"--mode {arguments.mode}: {arguments.camera} is a camera of mode {view.mode}")
         try:
-            with view.frames() if arguments.timeout is None else view.frames(timeout=arguments.timeout) as frames:
-                next(frames)
+            if arguments.timeout is None:
+                view.capture()
+            else:
+                view.capture(timeout=arguments.timeout)
         except URLabTimeoutError as error:
             raise CommandError(f"{address}: no picture of {arguments.camera}: {error}") from None
         return _pixels(view)

@@ -114,7 +114,7 @@ class Effect(StrEnum):
     """May have been executed: never sent again by itself."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)  # there is one of each
 class Op:
     """One op, declared once. Everything that knows an op derives from this.
 

@@ -89,6 +89,7 @@ class Dialect:
         jobs: Ops that take long answer `op_started`.
         claims: Writes to a robot are refused unless the writer owns it.
         cameras_on: Cameras stream from the start of play.
+        cameras_repeat: Cameras stream the same state over and over, else each state once.
         camera_headers: Streamed pictures begin with number, time and size.
         camera_forms: Pictures carry `frame_id` and `sim_time` in replies, live steps bring them, and steps can wait.
         draws_for_steps: Steps draw the pictures that they bring; else they bring what was drawn before them.
@@ -116,6 +117,7 @@ class Dialect:
     jobs: bool
     claims: bool
     cameras_on: bool
+    cameras_repeat: bool
     camera_headers: bool
     camera_forms: bool
     draws_for_steps: bool
@@ -170,6 +172,7 @@ ALPHA: Final = Dialect(
     jobs=False,
     claims=False,
     cameras_on=True,
+    cameras_repeat=True,
     camera_headers=False,
     camera_forms=False,
     draws_for_steps=True,
@@ -198,6 +201,7 @@ BETA: Final = Dialect(
     jobs=True,
     claims=True,
     cameras_on=False,
+    cameras_repeat=False,
     camera_headers=True,
     camera_forms=True,
     draws_for_steps=True,

@@ -185,21 +185,18 @@ class Region:
     Attributes:
         stride: Bytes per slot, the size prefix included.
         n_buffers: Number of slots.
+        max_payload: Largest payload that fits, bytes.
     """
 
     def __init__(self, buffer: bytearray | memoryview, stride: int, n_buffers: int, fence: Fence) -> None:
         self.stride = stride
         self.n_buffers = n_buffers
+        self.max_payload = stride - SIZE_PREFIX
         self._fence = fence
         self._bytes = memoryview(buffer)
         # Single aligned moves; putting a number together from bytes could mix an old half with a new one.
         self._sequence = self._bytes[16:24].cast("Q")
         self._latest = self._bytes[24:28].cast("I")
-
-    @property
-    def max_payload(self) -> int:
-        """Largest payload that fits, bytes."""
-        return self.stride - SIZE_PREFIX
 
     @property
     def sequence(self) -> int:

@@ -228,7 +228,7 @@ class MocapPose(Serializable, Struct, frozen=True):
     """Stored pose of a mocap body.
 
     Attributes:
-        body: Compiled body name.
+        body: Name of the body, as it was asked for.
         pos: Position, metres, world frame.
         quat: Unit quaternion (w, x, y, z), world frame.
     """

@@ -20,8 +20,10 @@ from urlab_client.protocol.codec import encode_reply
 from urlab_client.protocol.dialects import ALPHA, Dialect
 from urlab_client.protocol.enums import CameraMode, PIEState, StepMode
 from urlab_client.protocol.messages.session import ErrorReply, Hello, InstanceInfo, Step
+from urlab_client.randomise.declaration import MODEL_TEXT, Randomisation
 from urlab_client.server.assets.actors import Actor
 from urlab_client.server.assets.uploads import UPLOADS, Uploads
+from urlab_client.server.compile.failure import CompileFailed
 from urlab_client.server.compile.mjcf_options import OptionPolicy
 from urlab_client.server.compile.scene import CompiledScene, compile_scene
 from urlab_client.server.compile.scene_index import ArticulationIndex
@@ -43,7 +45,7 @@ from urlab_client.server.session import ServerSession
 from urlab_client.server.system.allocator import trim
 from urlab_client.server.system.health import Health
 
-__all__ = ["PhysicsConfig", "ServerCore", "unmatched_names"]
+__all__ = ["PhysicsConfig", "ServerCore"]
 
 logger = logging.getLogger("urlab_client.server")
 
@@ -62,6 +64,7 @@ class PhysicsConfig:
         mjcf_options: Honour the `<option>` of the first model.
         render_quality: How well cameras and the viewport are drawn.
         user_channels: First value of the user channels that the level declares, by `ROBOT/CHANNEL` or `scene/CHANNEL`.
+        randomise: What varies from reset to reset.
     """
 
     step_mode: StepMode = StepMode.AUTO
@@ -72,6 +75,7 @@ class PhysicsConfig:
     mjcf_options: bool = False
     render_quality: RenderQuality = "auto"
     user_channels: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    randomise: Randomisation | None = None
 
     def controller(self, index: ArticulationIndex) -> ControllerConfig | None:
         """Return the controller an articulation is to get: configured here, or else by the level or its MJCF."""
@@ -156,8 +160,12 @@ class ServerCore:
             return running.cameras.frame_bytes(request.include_cameras)
         return 0
 
-    def begin_play(self) -> None:
-        """Start play with the level as it is now; `play.wait` says how it ends."""
+    def begin_play(self, *, names_fit: bool = False) -> None:
+        """Start play with the level as it is now; `play.wait` says how it ends.
+
+        Args:
+            names_fit: Whether it fails if a configured controller or camera mode is for something that is not there.
+        """
         actors = self.world.freeze()
         physics = self.physics
 
@@ -166,10 +174,11 @@ class ServerCore:
                 actors,
                 options=self._options,
                 camera_size=physics.camera_size,
+                texts={} if physics.randomise is None else {MODEL_TEXT: physics.randomise.to_json()},
                 limits=self.limits,
             )
             self.compiled = _Compiled(actors, scene, copy.copy(scene.model.opt))
-            return self._run(scene, actors)
+            return self._run(scene, actors, names_fit=names_fit)
 
         self.play.begin(build)
         self.world.pie_running = True
@@ -201,20 +210,27 @@ class ServerCore:
         self.world.pie_running = True
         return self.play.wait(timeout) is PIEState.READY
 
-    def _run(self, scene: CompiledScene, actors: Sequence[Actor]) -> Running:
+    def _run(self, scene: CompiledScene, actors: Sequence[Actor], *, names_fit: bool = False) -> Running:
         physics = self.physics
         files = recordings(replay_folder(self.world.content.root))
         controllers = {index.key: config for index in scene.articulations if (config := physics.controller(index))}
-        for problem in unmatched_names(scene, physics):
+        for problem in _unmatched_names(scene, physics):
+            if names_fit:
+                raise CompileFailed(problem)
             logger.warning("%s", problem)
-        engine = Engine(
-            scene,
-            pinned_mode=physics.step_mode,
-            paused=not physics.unpaused,
-            controllers=controllers,
-            health=self.health,
-            dialect=self.dialect,
-        )
+        try:
+            engine = Engine(
+                scene,
+                pinned_mode=physics.step_mode,
+                paused=not physics.unpaused,
+                controllers=controllers,
+                health=self.health,
+                dialect=self.dialect,
+                randomise=physics.randomise,
+            )
+        except ValueError as error:
+            raise CompileFailed(f"what is to vary: {error}") from None
+        varied = () if engine.variation is None else engine.variation.visible_fields
         channels = UserChannels(physics.user_channels)
         modes = {
             (index.key, camera.name): physics.camera_mode(index, camera.name)
@@ -225,7 +241,7 @@ class ServerCore:
             scene,
             engine.start(),
             Observer(scene, engine.articulations.controls, channels),
-            self._camera_renderer(scene, actors, modes, engine.articulations.names),
+            self._camera_renderer(scene, actors, modes, engine.articulations.names, varied),
             files,
             self.limits,
             channels,
@@ -253,10 +269,18 @@ class ServerCore:
         actors: Sequence[Actor],
         modes: Mapping[tuple[str, str], CameraMode],
         names: Mapping[str, str],
+        varied: Sequence[str] = (),
     ) -> CameraRenderer:
         classes = {actor.name: _kind(actor) for actor in actors}
         return CameraRenderer(
-            scene, modes, classes, self.physics.render_quality, self.health, names=names, dialect=self.dialect
+            scene,
+            modes,
+            classes,
+            self.physics.render_quality,
+            self.health,
+            names=names,
+            varied=varied,
+            dialect=self.dialect,
         )
 
     def stop_play(self) -> None:
@@ -282,7 +306,7 @@ def _kind(actor: Actor) -> str:
     return actor.class_name if mesh is None else Path(mesh.file).stem or mesh.shape
 
 
-def unmatched_names(scene: CompiledScene, physics: PhysicsConfig) -> list[str]:
+def _unmatched_names(scene: CompiledScene, physics: PhysicsConfig) -> list[str]:
     """Return what is wrong with configured names that fit nothing in a scene: most likely they are misspelt."""
     actors = {name for index in scene.articulations for name in (index.actor_id, index.key) if name}
     cameras = {

@@ -6,6 +6,7 @@ import logging
 import os
 import socket
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,7 +22,7 @@ from urlab_client.protocol.enums import PIEState, Transport
 from urlab_client.protocol.instances import registry_directory
 from urlab_client.protocol.messages.session import InstanceInfo
 from urlab_client.server.assets.content import ContentRoot
-from urlab_client.server.core import PhysicsConfig, ServerCore, unmatched_names
+from urlab_client.server.core import PhysicsConfig, ServerCore
 from urlab_client.server.editor.markers import Drawings
 from urlab_client.server.editor.viewport import Viewport
 from urlab_client.server.editor.world import EditorWorld
@@ -32,6 +33,7 @@ from urlab_client.server.lease import DriverLease
 from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.dispatch import Dispatcher
+from urlab_client.server.rpc.served_request import ServedRequest
 from urlab_client.server.rpc.watchdog import Watchdog
 from urlab_client.server.session import ServerSession
 from urlab_client.server.snapshot import take_snapshot
@@ -102,6 +104,7 @@ class OpenServer:
                 "or say --insecure-no-auth (insecure_no_auth=True).",
             )
         self.health = Health()
+        self.request_callbacks: list[Callable[[ServedRequest], None]] = []
         self._cameras: CameraStreams | None = None
         self._streams: StreamServer | None = None
         self._temporary_folder: TemporaryFolder | None = None
@@ -213,6 +216,7 @@ class OpenServer:
         self._streams.start()
         # Bound before the models are read, which takes longer, and answering after: requests wait in the socket.
         self._dispatcher = Dispatcher(core, HANDLERS)
+        self._dispatcher.callbacks = self.request_callbacks
         answer = self._dispatcher.answer
         where: dict[str, Any] = {"host": self.host, "port": ports.step, "curve_keys": self.curve_keys}
         where |= {"refuse": core.refuse, "health": self.health}
@@ -225,12 +229,10 @@ class OpenServer:
         except Refusal as refusal:
             raise ModelError(refusal.message) from None
         if config.play:
-            core.begin_play()
+            # Whoever starts play with the server means what is there; actors to come are for a later begin_pie.
+            core.begin_play(names_fit=True)
             if core.play.wait(_NO_LIMIT) is not PIEState.READY:
                 raise ModelError(f"play cannot start: {core.play.compile_error}")
-            # Whoever starts play with the server means what is there; actors to come are for a later begin_pie.
-            for problem in unmatched_names(core.play.running().scene, config.physics):
-                raise ModelError(problem)
         self._authored = self._mark(core)
         self._dispatcher.served = [served.serving for served in (self._endpoint, memory) if served is not None]
         self._watchdog = Watchdog(core, self._dispatcher, self.health)
@@ -278,6 +280,12 @@ class OpenServer:
             files = [Path(model).resolve() for model in config.models if Path(model).is_file()]
             roots = tuple(dict.fromkeys(file.parent for file in files)) or (Path.cwd(),)
         return ContentRoot(folder, model_roots=roots, limits=config.limits)
+
+    @property
+    def sim_time(self) -> float | None:
+        """See `SimulatedServer.sim_time`."""
+        running = None if self._core is None else self._core.play.current
+        return None if running is None else running.engine.time
 
     def restore(self) -> bool:
         """Return to the state after the start, or return False if that takes another start."""

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from urlab_client.protocol.base import DialectName
 from urlab_client.protocol.dialects import DIALECTS
 from urlab_client.protocol.enums import CameraMode, StepMode
+from urlab_client.randomise.declaration import Randomisation
 from urlab_client.server.core import PhysicsConfig
 from urlab_client.server.faults import Faults
 from urlab_client.server.initial_level import is_level
@@ -29,6 +30,7 @@ from urlab_client.server.physics.channels import channel_problem
 from urlab_client.server.physics.controllers import ControllerConfig
 from urlab_client.server.render.drawing import RenderQuality
 from urlab_client.server.render.opengl import find_backend
+from urlab_client.server.rpc.served_request import ServedRequest
 from urlab_client.server.snapshot import LARGEST_PIXELS
 from urlab_client.server.transport.curve_authentication import CurveServer, is_loopback
 from urlab_client.server.transport.endpoint import connect_host, tcp
@@ -87,6 +89,7 @@ class SimulatedServer:
         shm_dir: str | os.PathLike[str] | None = None,
         dialect: DialectName = "alpha",
         user_channels: Mapping[str, Any] = MappingProxyType({}),
+        randomise: Randomisation | str | os.PathLike[str] | None = None,
         instance_id: str = "",
         instance_index: int | None = None,
     ) -> None:
@@ -128,13 +131,15 @@ class SimulatedServer:
             dialect: Generation of the plugin to speak for: `alpha` (June 2026) or `beta` (August 2026).
             user_channels: First value of the level's user channels by `ROBOT/CHANNEL` or `scene/CHANNEL`; its kind is
                 the channel's. For the beta.
+            randomise: What varies from reset to reset, by the seed of the reset: a `Randomisation`, or a TOML file.
             instance_id: What this server is called among several; by default `live`, or after its index.
             instance_index: Number of this server among several, which gives it ports of its own where none are asked
                 for: 5559 + 10 times the index for requests, then state, then cameras.
 
         Raises:
-            ValueError: An invalid port, mode, size, dialect, channel or index, two levels, or both `curve` and
-                `insecure_no_auth`.
+            ValueError: An invalid port, mode, size, dialect, channel, index or randomisation, two levels, or both
+                `curve` and `insecure_no_auth`.
+            OSError: The file of a randomisation cannot be read.
         """
         names = tuple(os.fspath(model) for model in models)
         if sum(map(is_level, names)) > 1:
@@ -183,6 +188,7 @@ class SimulatedServer:
                 mjcf_options=mjcf_options,
                 render_quality=render_quality,
                 user_channels=dict(user_channels),
+                randomise=None if randomise is None else Randomisation.of(randomise),
             ),
             faults=faults,
             shm_dir=None if shm_dir is None else Path(shm_dir),
@@ -294,6 +300,22 @@ class SimulatedServer:
             RuntimeError: The server is closed.
         """
         self._running.health.add_callback(callback)
+
+    def add_request_callback(self, callback: Callable[[ServedRequest], None]) -> None:
+        """Call `callback` with each request that was answered, on the thread that answers, until the server is closed.
+
+        It must be quick: the next request waits for it. What it raises is logged and changes nothing.
+
+        Raises:
+            RuntimeError: The server is closed.
+        """
+        self._running.request_callbacks.append(callback)
+
+    @property
+    def sim_time(self) -> float | None:
+        """Simulation time of the play session, seconds; None without one."""
+        opened = self._opened
+        return None if opened is None else opened.sim_time
 
     @property
     def can_render(self) -> bool:

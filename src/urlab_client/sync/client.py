@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from types import TracebackType
 from typing import Self, TypeVar
 
@@ -68,6 +68,9 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
             server and network those that nobody looks at; `frames()` is received all the same.
         claim_control: Take control of a robot with the first write to it, where robots have one owner. False is for
             those who look on, and for those who say `articulation.claim()`.
+        keep_session: After the first `discover()`, discover again by itself when the server has been restarted or play
+            has been started by somebody else; `events()` tells of it. A session that another client has taken over is
+            never taken back, and while a step or reset is in doubt, `resync()` comes first.
         observe: Called with a `CallRecord` when a request is over, whatever became of it: op, bytes, time in the queue,
             round trip, outcome. It runs on the client's event loop, so it must be quick and must not call the client;
             what it raises is logged and changes nothing.
@@ -102,6 +105,7 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
         trust_server: bool = False,
         live_pictures: bool = True,
         claim_control: bool = True,
+        keep_session: bool = False,
         observe: Callable[[CallRecord], object] | None = None,
     ) -> None:
         super().__init__(
@@ -124,6 +128,7 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
                 trust_server=trust_server,
                 live_pictures=live_pictures,
                 claim_control=claim_control,
+                keep_session=keep_session,
                 observe=observe,
             )
         )
@@ -241,7 +246,8 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
 
         Args:
             keyframe_name: Keyframe to reset to. The short name is enough where one articulation has it.
-            seed: Remembered by the server; no effect on MuJoCo.
+            seed: Remembered by the server. On a simulated server that varies its scene it decides on the episode's
+                numbers; else it has no effect on MuJoCo.
             per_articulation_qpos: Articulation key to joint name to the first component of its position.
             timeout: Seconds to wait; None waits without limit.
 
@@ -309,7 +315,7 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
         """
         return self._portal.call(self._aio.wait_until, predicate, timeout=timeout)
 
-    def capture(self, cameras: Collection[str] | None = None, *, timeout: Timeout = DEFAULT) -> dict[str, CameraSample]:
+    def capture(self, cameras: Iterable[str] | None = None, *, timeout: Timeout = DEFAULT) -> dict[str, CameraSample]:
         """Take pictures of several cameras now, in any step mode, without a step; see `URLabCameraView.capture`.
 
         In `direct` and `puppet` mode, and while paused, all of them show the same moment.

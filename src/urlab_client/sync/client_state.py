@@ -132,6 +132,11 @@ class ClientState(Facade, twin=aio.ClientState):
         return self._aio.step_count
 
     @property
+    def reset_seed(self) -> int | None:
+        """The seed that the last `reset()` gave, which decides what a server varies; None without one."""
+        return self._aio.reset_seed
+
+    @property
     def sim_time(self) -> float:
         """Simulation time of the last reply, seconds."""
         return self._aio.sim_time

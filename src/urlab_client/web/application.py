@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import secrets
 import time
 from collections.abc import AsyncGenerator, Awaitable, Callable
@@ -31,23 +32,34 @@ from urlab_client.web import mujoco_viewer
 from urlab_client.web.access import Access, Guarded
 from urlab_client.web.console_session import Audience, ConsoleSession
 from urlab_client.web.driving_lease import DrivingLease, NotDriving, Viewer
+from urlab_client.web.metrics import showing
 from urlab_client.web.ops import encode, openapi, parse, served
+from urlab_client.web.reading_routes import ReadingRoutes
+from urlab_client.web.recording_routes import RecordingRoutes
 
 if TYPE_CHECKING:
+    from prometheus_client import CollectorRegistry
+
     from urlab_client.aio import URLabClient
 
-__all__ = ["app"]
+__all__ = ["app", "entrance"]
 
 _STATIC = Path(__file__).parent / "static"
 _LARGEST_BODY = 1024 * 1024
-_PICTURE_S = 5.0
 _AHEAD = 2  # states or pictures on their way to a browser that has not said that they came
 _VIEWER = "x-urlab-viewer"
 
 _Handler: TypeAlias = Callable[[Request], Awaitable[Response]]
 
 
-def app(client: URLabClient, *, access: Access | None = None, lease_seconds: float = 20.0) -> Starlette:
+def app(
+    client: URLabClient,
+    *,
+    access: Access | None = None,
+    lease_seconds: float = 20.0,
+    metrics: CollectorRegistry | None = None,
+    recordings: str | os.PathLike[str] = "recordings",
+) -> Starlette:
     """Make the application. It opens the client's session while its lifespan runs, and closes nothing at its end.
 
     To mount it in another application, enter `site.router.lifespan_context(site)` in that one's lifespan.
@@ -57,19 +69,37 @@ def app(client: URLabClient, *, access: Access | None = None, lease_seconds: flo
             other part of a program may.
         access: Who may come in; default: whoever brings a token of `site.state.access.invite()`, on this machine.
         lease_seconds: How long a viewer keeps the controls without using them.
+        metrics: What `/metrics` shows to Prometheus, behind the same access; None leaves the path out. The client's
+            requests are in it if the client was made with `observe=PrometheusObserver(metrics)`.
+        recordings: Folder of the recordings that viewers make, download and replay; made with the first one.
     """
     access = access or Access()
-    site = _Site(ConsoleSession(client, DrivingLease(lease_seconds)), access)
+    site = _Site(ConsoleSession(client, DrivingLease(lease_seconds), Path(recordings)), access)
 
     @contextlib.asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncGenerator[None]:
         async with site.console.open():
             yield
 
-    application = Starlette(routes=site.routes(), middleware=[Middleware(Guarded, access=access)], lifespan=lifespan)
+    routes = site.routes()
+    if metrics is not None:
+        routes.append(Route("/metrics", showing(metrics)))
+    application = Starlette(routes=routes, middleware=[Middleware(Guarded, access=access)], lifespan=lifespan)
     application.state.access = access
     application.state.console = site.console
     return application
+
+
+def entrance(access: Access) -> _Handler:
+    """Return what answers `POST /api/session`: it spends a token for a key."""
+
+    async def enter(request: Request) -> Response:
+        key = access.admit(msgspec.json.decode(await _body(request), type=_LoginRequest).token)
+        if key is None:
+            return _error(401, "bad_token", "This token is unknown, or was used before.")
+        return _json(encode({"key": key}))
+
+    return _answering(enter)
 
 
 class _RunRequest(Struct):
@@ -78,10 +108,6 @@ class _RunRequest(Struct):
 
 class _StepRequest(Struct):
     n_steps: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] = 1
-
-
-class _SeekRequest(Struct):
-    frame: int
 
 
 class _LoginRequest(Struct):
@@ -103,6 +129,8 @@ class _Site:
         self.console = console
         self._access = access
         self._viewers: dict[str, Viewer] = {}
+        self._reading = ReadingRoutes(console, self._viewer)
+        self._recordings = RecordingRoutes(console, self._viewer)
 
     def routes(self) -> list[Route | WebSocketRoute | Mount]:
         def route(path: str, handler: _Handler, *methods: str) -> Route:
@@ -115,16 +143,16 @@ class _Site:
             route("/api/status", self._status),
             route("/api/state", self._state),
             route("/api/log", self._log),
+            *(route(path, handler, *methods) for path, handler, methods in self._reading.routes()),
             route("/api/ops/{op}", self._op, "POST"),
             route("/api/ctrl", self._ctrl, "POST"),
             route("/api/run", self._run, "POST"),
             route("/api/step", self._step, "POST"),
-            route("/api/replay", self._seek, "POST"),
+            *(route(path, handler, *methods) for path, handler, methods in self._recordings.routes()),
             route("/api/lease", self._lease, "POST", "DELETE"),
             route("/api/connection", self._connection, "POST"),
             route("/api/invitations", self._invite, "POST"),
-            route("/api/session", self._enter, "POST"),
-            route("/api/cameras/{path:path}.jpg", self._picture),
+            Route("/api/session", entrance(self._access), methods=["POST"]),
             WebSocketRoute("/api/live", self._live),
             WebSocketRoute("/api/cameras/{path:path}/live", self._pictures),
             Mount("/static", StaticFiles(directory=_STATIC)),
@@ -152,7 +180,7 @@ class _Site:
         return FileResponse(_STATIC / "index.html")
 
     async def _openapi(self, request: Request) -> Response:
-        return _json(openapi())
+        return _json(openapi(request.scope.get("root_path", "")))
 
     async def _world(self, request: Request) -> Response:
         return _json(encode(self.console.world))
@@ -190,11 +218,6 @@ class _Site:
         steps = msgspec.json.decode(await _body(request) or b"{}", type=_StepRequest)
         return _json(encode(await self.console.controls.step(self._viewer(request), steps.n_steps)))
 
-    async def _seek(self, request: Request) -> Response:
-        wanted = msgspec.json.decode(await _body(request), type=_SeekRequest).frame
-        frame, total = await self.console.controls.seek(self._viewer(request), wanted)
-        return _json(encode({"frame": frame, "total": total}))
-
     async def _lease(self, request: Request) -> Response:
         viewer = self._viewer(request)
         if request.method == "POST":
@@ -212,22 +235,6 @@ class _Site:
     async def _invite(self, request: Request) -> Response:
         token = self._access.invite()
         return _json(encode({"token": token, "path": f"{request.scope.get('root_path', '')}/?token={token}"}))
-
-    async def _enter(self, request: Request) -> Response:
-        key = self._access.admit(msgspec.json.decode(await _body(request), type=_LoginRequest).token)
-        if key is None:
-            return _error(401, "bad_token", "This token is unknown, or was used before.")
-        return _json(encode({"key": key}))
-
-    async def _picture(self, request: Request) -> Response:
-        feed = self.console.feed(request.path_params["path"])
-        if feed is None:
-            return _error(404, "unknown_camera", f"There is no camera {request.path_params['path']!r}.")
-        async with feed.watch():
-            with anyio.move_on_after(_PICTURE_S):
-                picture = await feed.after(0)
-                return Response(picture.jpeg, media_type="image/jpeg")
-        return _error(503, "no_picture", "The camera has sent no picture yet.", "Cameras send while physics runs live.")
 
     # WebSockets
 
@@ -434,7 +441,7 @@ def _answering(handler: _Handler) -> _Handler:
     async def answer(request: Request) -> Response:
         try:
             return await handler(request)
-        except (NotDriving, URLabError, ValueError, TypeError, KeyError, RecursionError) as error:
+        except (NotDriving, URLabError, OSError, ValueError, TypeError, KeyError, RecursionError) as error:
             status, said = _explain(error)
             return _json(encode({"error": said}), status)
 
@@ -459,6 +466,8 @@ def _explain(error: Exception) -> tuple[int, dict[str, Any]]:
             status, code = 503, "unreachable"
         case URLabError():
             status, code = 502, "failed"
+        case OSError():
+            status, code = 500, "io_failed"
         case _:
             status, code = 400, "bad_request"
     return status, {"code": code, "message": str(text), "hint": hint}

@@ -10,7 +10,8 @@ import contextlib
 import logging
 import time
 from collections import deque
-from collections.abc import AsyncGenerator, Generator
+from collections.abc import AsyncGenerator, Generator, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import anyio
@@ -37,6 +38,8 @@ from urlab_client.web.driving_lease import DrivingLease, Viewer
 from urlab_client.web.mujoco_viewer import MujocoViewer
 from urlab_client.web.ops import encode
 from urlab_client.web.pictures import Feed
+from urlab_client.web.recordings import Recordings
+from urlab_client.web.replay import Replay
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabCameraView, URLabClient
@@ -93,9 +96,10 @@ class ConsoleSession:
     Args:
         client: The client; the console opens its session and keeps it.
         lease: The controls.
+        recordings: Folder for recordings.
     """
 
-    def __init__(self, client: URLabClient, lease: DrivingLease) -> None:
+    def __init__(self, client: URLabClient, lease: DrivingLease, recordings: Path) -> None:
         self.client = client
         self.lease = lease
         self.link = Link("connecting", since=time.time())
@@ -108,6 +112,8 @@ class ConsoleSession:
         self.snapshot: StateSnapshot | None = None
         self.mujoco_viewer = MujocoViewer(client)
         self.controls = Controls(self)
+        self.recordings = Recordings(client, recordings)
+        self.replay = Replay(self)
         self._bells: set[asyncio.Event] = set()
         self._n = 0
         self._want: str | None = "discover"
@@ -125,12 +131,15 @@ class ConsoleSession:
         """Keep the session and receive state while the body runs."""
         async with anyio.create_task_group() as tasks:
             controls = self.controls
-            for job in (self._keep, self._receive, controls.send_set_points, controls.keep_stepping, self._pulse):
+            jobs = (controls.send_set_points, controls.keep_stepping, self.replay.keep_playing)
+            for job in (self._keep, self._receive, self._pulse, *jobs):
                 tasks.start_soon(job)
             try:
                 yield
             finally:
                 tasks.cancel_scope.cancel()
+                with anyio.CancelScope(shield=True):
+                    await self.recordings.end()
 
     async def _keep(self) -> None:
         """Open the session, and again whenever it is needed."""
@@ -233,7 +242,9 @@ class ConsoleSession:
                 async with self.client.state_stream("latest", timeout=None) as states:
                     due = time.monotonic()
                     while True:
-                        self._publish(await states.receive(timeout=None))
+                        snapshot = await states.receive(timeout=None)
+                        if not self.replay.open:
+                            self._publish(snapshot, {key: self._targets(key) for key in snapshot.per_articulation})
                         # By the clock and not by when it woke up, else each late awakening makes the rate lower.
                         due = max(due + _PERIOD_S, time.monotonic() - _PERIOD_S)
                         await anyio.sleep(max(0.0, due - time.monotonic()))
@@ -243,7 +254,11 @@ class ConsoleSession:
                 self.note("error", "console", "state", str(error))
                 await anyio.sleep(_RETRY_S)
 
-    def _publish(self, snapshot: StateSnapshot) -> None:
+    def show(self, snapshot: StateSnapshot, targets: Mapping[str, list[float]]) -> None:
+        """Show a state to everybody in place of the server's."""
+        self._publish(snapshot, targets)
+
+    def _publish(self, snapshot: StateSnapshot, targets: Mapping[str, list[float] | None]) -> None:
         now = time.monotonic()
         if self.snapshot is None or snapshot.time != self.snapshot.time:
             self._moved_at = now
@@ -271,7 +286,7 @@ class ConsoleSession:
                         "qvel": _rounded(state.qvel),
                         "ctrl": _rounded(state.ctrl),
                         "sensors": {name: _rounded(value) for name, value in (state.sensors or {}).items()},
-                        "targets": self._targets(key),
+                        "targets": targets.get(key),
                     }
                     for key, state in snapshot.per_articulation.items()
                 },
@@ -297,15 +312,14 @@ class ConsoleSession:
             "link": self.link,
             "address": self.client.address,
             "playing": self.client.manager_present,
-            "moving": self.moving,
+            "moving": self.replay.rate > 0 if self.replay.open else self.moving,
             "running": self.controls.running if self.client.step_mode is not StepMode.LIVE else self.moving,
-            "rate": round(self._rate, 3) if self.moving else 0.0,
+            "rate": self.replay.rate if self.replay.open else round(self._rate, 3) if self.moving else 0.0,
             "mode": self.client.step_mode,
             "speed": self.controls.speed,
             "source": self.controls.source,
-            "recording": self.controls.recording,
-            "replaying": self.controls.replaying,
-            "replay": self.controls.replay,
+            "recording": self.recordings.running,
+            "replay": self.replay.view,
             "twists": self.controls.twists,
             "viewers": len(self.audience),
             "driver": None if holder is None else holder.name,
@@ -351,14 +365,15 @@ class ConsoleSession:
 
     def feed(self, path: str) -> Feed | None:
         """Return the pictures of the camera `ARTICULATION/CAMERA` (`-` for those of the scene), None without it."""
-        view = self._camera(path)
+        view = self.camera(path)
         if view is None:
             return None
         if path not in self._feeds or self._feeds[path].view is not view:
             self._feeds[path] = Feed(self.client, view)
         return self._feeds[path]
 
-    def _camera(self, path: str) -> URLabCameraView | None:
+    def camera(self, path: str) -> URLabCameraView | None:
+        """Return the camera at `ARTICULATION/CAMERA` (`-` for those of the scene), None without it."""
         owner, _, name = path.partition("/")
         if owner == "-":
             return self.client.global_cameras.get(name)

@@ -1,4 +1,4 @@
-"""What viewers do to the simulation: ops, set-points, steps, replays. Those who change something need the lease."""
+"""What viewers do to the simulation: ops, set-points, steps. Those who change something need the lease."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from urlab_client.protocol.base import Effect, Request
 from urlab_client.protocol.codec import op_of
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import URLabError
-from urlab_client.protocol.messages.recording import RecordingStart, RecordingStop, ReplayStart, ReplayStop
 from urlab_client.protocol.messages.runtime import SetControlSource, SetPaused, SetSimSpeed, SetTwist
 from urlab_client.protocol.messages.session import ArticulationCommand, Step
 from urlab_client.protocol.messages.streams import (
@@ -31,7 +30,6 @@ if TYPE_CHECKING:
 __all__ = ["Console", "Controls"]
 
 _PERIOD_S = 1 / 60
-_SEEK_STEPS = 8  # recordings have about one frame a timestep
 
 
 class Console(Protocol):
@@ -66,9 +64,6 @@ class Controls:
         running: Whether direct mode is stepped along with the clock.
         speed: Pacing of live mode that somebody set, percent.
         source: Who drives the actuators, if somebody chose.
-        recording: Whether the server records.
-        replaying: Whether it plays a recording.
-        replay: Frame of the replay, and how many there are.
         twists: Velocities that were asked for, by articulation: x, y, yaw.
     """
 
@@ -76,8 +71,6 @@ class Controls:
         self.running = False
         self.speed: float | None = None
         self.source: str | None = None
-        self.recording = self.replaying = False
-        self.replay: tuple[int, int] | None = None
         self.twists: dict[str, tuple[float, float, float]] = {}
         self._console = console
         self._client = console.client
@@ -91,8 +84,6 @@ class Controls:
         """Forget what belonged to the play before."""
         self._seeded.clear()
         self.twists.clear()
-        self.recording = self.replaying = False
-        self.replay = None
 
     def commands(self, key: str) -> bool:
         """Return whether somebody has commanded this articulation since play began."""
@@ -106,7 +97,9 @@ class Controls:
             URLabError: As the client raises.
         """
         op = op_of(request)
-        if op.effect is not Effect.READ and not (isinstance(request, SetPaused) and request.paused):
+        if isinstance(request, SetPaused) and request.paused:
+            self._lease.interrupt(viewer)  # everybody may stop
+        elif op.effect is not Effect.READ:
             self._lease.use(viewer)
         began = time.perf_counter()
         try:
@@ -129,15 +122,6 @@ class Controls:
                 self.source = reply.source
             case SetTwist():
                 self.twists[request.articulation] = (reply.linear[0], reply.linear[1], reply.angular[2])
-            case RecordingStart():
-                self.recording, self.replaying = True, False  # the server ends the one for the other
-            case RecordingStop():
-                self.recording = False
-            case ReplayStart():
-                self.recording = False
-                self.replaying, self.replay = reply.total_frames > 0, (0, reply.total_frames)
-            case ReplayStop():
-                self.replaying = False
             case _:
                 pass
         if op_of(request).name == "configure_controller":
@@ -214,41 +198,7 @@ class Controls:
             self._seed(key, art)
         watched = dict.fromkeys(self._console.watched_cameras(), "latest")
         reply = await self._client.step(n_steps, include_cameras=watched or False)
-        if reply.replay is not None:
-            self.replay = (reply.replay.current_frame, reply.replay.total_frames)
-            if self.replaying and reply.replay.current_frame >= reply.replay.total_frames - 1:
-                self.running = False
         return {"time": reply.time, "step": reply.step}
-
-    async def seek(self, viewer: Viewer, frame: int) -> tuple[int, int]:
-        """Go to a frame of the replay, and return the one reached and how many there are.
-
-        No op does that. A replay goes on by what is stepped, though, and begins where it is started: to go back it is
-        started again. The plugin's replay plays by itself and does not report its position.
-
-        Raises:
-            NotDriving: Somebody else has the controls.
-            ValueError: No replay runs, or the server does not say where it is.
-            URLabError: As the client raises.
-        """
-        if not self.replaying or self.replay is None or self._client.step_mode is not StepMode.DIRECT:
-            raise ValueError("no replay runs in mode direct")
-        self._lease.use(viewer)
-        at, total = self.replay
-        frame = min(max(frame, 0), total - 1)
-        if frame < at:
-            self._follow(ReplayStart(), await self._client.call(ReplayStart()))
-            at = 0
-        for _ in range(_SEEK_STEPS):
-            if at >= frame:
-                break
-            reply = await self._client.step(frame - at)
-            if reply.replay is None:
-                raise ValueError("this server does not say where its replay is")
-            at = reply.replay.current_frame
-            self.replay = at, total
-        self._console.tell()
-        return self.replay
 
     async def run(self, viewer: Viewer, running: bool) -> None:
         """Let physics run, or stop it, in whatever mode; everybody may stop it.
@@ -258,6 +208,8 @@ class Controls:
         """
         if running:
             self._lease.use(viewer)
+        else:
+            self._lease.interrupt(viewer)
         if self._client.step_mode is StepMode.LIVE:
             await self.do(viewer, SetPaused(paused=not running))
         else:

@@ -2,34 +2,44 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any
 
 from msgspec import Struct, field
 
 if TYPE_CHECKING:
-    from urlab_client.aio import URLabArticulation, URLabCameraView, URLabClient
+    import mujoco
+
+    from urlab_client.aio import Actuator, URLabArticulation, URLabCameraView, URLabClient
 
 __all__ = ["WorldDescription", "describe"]
 
-_JOINTS = ("free", "ball", "slide", "hinge")
-
 
 class ActuatorView(Struct):
-    """One actuator; `index` is its place in `ctrl`."""
+    """One actuator; `index` is its place in `ctrl`.
+
+    `takes` is what a set-point means, `force`, `position` or `velocity`, in `unit`, and `range` its limits; with a PD
+    controller in force a position. `home` is the set-point of the keyframe `home`, or of the model's start.
+    """
 
     name: str
     index: int
     kind: str | None
     joint: str | None
+    takes: str
+    unit: str
     range: tuple[float, float] | None
+    home: float
 
 
 class JointView(Struct):
-    """One joint; `index` is its place in `qpos`. Radians, or metres for `slide`."""
+    """One joint; `index` is its place in `qpos`, `dof` that in `qvel`. Radians, or metres for `slide`."""
 
     name: str
     index: int
+    dof: int
     kind: str
+    unit: str
     range: tuple[float, float] | None
 
 
@@ -39,6 +49,7 @@ class SensorView(Struct):
     name: str
     dim: int
     kind: str
+    unit: str
 
 
 class CameraDescription(Struct):
@@ -108,21 +119,17 @@ def _articulation(client: URLabClient, art: URLabArticulation) -> ArticulationVi
     return ArticulationView(
         key=art.prefix,
         actor_id=art.actor_id,
-        actuators=[
-            ActuatorView(name, act.ctrl_local.start, None if act.type is None else str(act.type), act.joint,
-                         act.ctrlrange)
-            for name, act in art.actuators.items()
-        ],
+        actuators=[_actuator(client, art, act) for act in art.actuators.values()],
         joints=[
-            JointView(name, joint.qpos_local_offset, _JOINTS[joint.jnt_type], joint.range)
+            JointView(name, joint.qpos_local_offset, joint.qvel_local_offset, str(joint.kind), joint.unit, joint.limits)
             for name, joint in art.joints.items()
         ],
-        sensors=[SensorView(name, sensor.dim, _sensor_kind(client, sensor.id)) for name, sensor in art.sensors.items()],
+        sensors=[SensorView(name, sensor.dim, sensor.kind, sensor.unit) for name, sensor in art.sensors.items()],
         cameras=[_camera(view, f"{art.prefix}/{name}") for name, view in art.cameras.items()],
         controller=None
         if controller is None
         else ControllerView(str(controller.kind), dict(controller.params), dict(controller.schema)),
-    )  # fmt: skip
+    )
 
 
 def _camera(view: URLabCameraView, path: str) -> CameraDescription:
@@ -130,9 +137,23 @@ def _camera(view: URLabCameraView, path: str) -> CameraDescription:
     return CameraDescription(view.name, path, str(view.mode), width, height)
 
 
-def _sensor_kind(client: URLabClient, sensor: int) -> str:
-    if client.model is None or sensor < 0:
-        return ""
-    import mujoco  # noqa: PLC0415
+def _actuator(client: URLabClient, art: URLabArticulation, actuator: Actuator) -> ActuatorView:
+    said = actuator.describe()
+    joint = None if actuator.joint is None else art.joints[actuator.joint]
+    limits = said.limits
+    if limits is None and said.takes == "position" and joint is not None:
+        limits = joint.limits
+    home, model = 0.0, client.model
+    if model is not None and said.takes == "position" and joint is not None:
+        at = int(model.jnt_qposadr[joint.id])
+        home = float(_home(model)[at])
+    place = actuator.ctrl_local.start
+    return ActuatorView(said.name, place, said.kind, said.joint, said.takes, said.unit, limits, home)
 
-    return mujoco.mjtSensor(client.model.sensor_type[sensor]).name.removeprefix("mjSENS_").lower()
+
+def _home(model: mujoco.MjModel) -> Any:
+    """Return the positions of the keyframe `home`, under whatever prefix it was compiled, or where the model starts."""
+    for key in range(model.nkey):
+        if re.search(r"(^|[_/])home$", model.key(key).name):
+            return model.key_qpos[key]
+    return model.qpos0

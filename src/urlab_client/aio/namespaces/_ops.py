@@ -79,7 +79,7 @@ class RuntimeOps(Namespace):
 
         Args:
             source: `zmq` or `ui`.
-            articulation: Articulation key; None for all.
+            articulation: Articulation key, actor id or engine's object name; None for all.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
@@ -102,7 +102,7 @@ class RuntimeOps(Namespace):
         """Store a commanded base velocity for policies to read; it does not drive the simulation.
 
         Args:
-            articulation: Articulation key.
+            articulation: Articulation key, actor id or engine's object name.
             linear: (vx, vy, ignored), m/s, base frame.
             angular: (ignored, ignored, yaw rate), rad/s, base frame.
             timeout: Seconds to wait; None waits without limit.
@@ -125,7 +125,7 @@ class RuntimeOps(Namespace):
         """Place a mocap body; body poses follow at the next step or `forward()`.
 
         Args:
-            body: Compiled body name, prefix included.
+            body: Compiled name, or with the articulation's key, actor id or nothing in front.
             pos: Position, metres, world frame; None keeps it.
             quat: Unit quaternion (w, x, y, z), world frame; None keeps it.
             timeout: Seconds to wait; None waits without limit.
@@ -145,7 +145,7 @@ class RuntimeOps(Namespace):
         """Read the pose of a mocap body.
 
         Args:
-            body: Compiled body name, prefix included.
+            body: Compiled name, or with the articulation's key, actor id or nothing in front.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:

@@ -14,6 +14,7 @@ from urlab_client.protocol.messages.recording import (
     RecordingSave,
     RecordingStart,
     RecordingStop,
+    ReplayListSessions,
     ReplayLoad,
     ReplaySetActive,
     ReplayStart,
@@ -161,9 +162,11 @@ class ReplayNamespace(ReplayOps):
             ReplayRequiresStepped: The step mode is live.
         """
         name = str(path_or_name)
-        if name in await self.list_sessions(timeout=timeout):
-            await self.set_active(name, timeout=timeout)
-        else:
-            name = (await self.load(name, timeout=timeout)).name
-        await self.start(timeout=timeout)
+        # In one turn, or another task could make another session the active one before it starts.
+        async with self._session.turn(ReplayListSessions, timeout=timeout, each=True) as turn:
+            if name in (await turn.call(ReplayListSessions())).sessions:
+                await turn.call(ReplaySetActive(name=name))
+            else:
+                name = (await turn.call(ReplayLoad(path=name))).name
+            self._session_name = (await turn.call(ReplayStart())).active_session
         return ReplaySession(name=name)

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import msgspec
 import numpy as np
 
 from urlab_client.aio.arguments import mapping
 from urlab_client.aio.deadline import DEFAULT, Timeout
+from urlab_client.aio.jobs import OnProgress
 from urlab_client.aio.model.numbers import finite, is_array
 from urlab_client.aio.namespaces._base import Vector, fill, target_by
 from urlab_client.aio.namespaces._ops import RuntimeOps
 from urlab_client.aio.session import Session
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_mode import ask_mode
-from urlab_client.protocol.base import Floats
+from urlab_client.aio.state.wire_names import as_written, for_the_server
+from urlab_client.protocol.base import Floats, Reply, Request
 from urlab_client.protocol.codec import building
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import UnknownOp
@@ -42,6 +44,8 @@ from urlab_client.protocol.types import ContactsResult, SimOptions
 
 __all__ = ["RuntimeNamespace"]
 
+R = TypeVar("R", bound=Reply)
+
 _NUMPY = (np.ndarray, np.generic)
 
 
@@ -51,6 +55,10 @@ class RuntimeNamespace(RuntimeOps):
     def __init__(self, session: Session, state: SimState) -> None:
         super().__init__(session)
         self._state = state
+
+    async def _call(self, request: Request[R], timeout: Timeout, on_progress: OnProgress | None = None) -> R:
+        sent = for_the_server(request, self._state.objects, self._state.mirror.model)
+        return as_written(await super()._call(sent, timeout, on_progress), request)
 
     async def set_paused(self, paused: bool, *, timeout: Timeout = DEFAULT) -> bool:
         """Pause or resume physics and return the state in force.
@@ -69,7 +77,7 @@ class RuntimeNamespace(RuntimeOps):
         Velocities and time stay.
 
         Args:
-            target: Actor id, or the articulation key with `by_name`.
+            target: Actor id, or the articulation key with `by_name`; any other of its names means it, too.
             qpos: All joint positions in joint order, or 7 values for a free base alone: xyz, quaternion (w, x, y, z).
             by_name: Look `target` up by the articulation key.
             timeout: Seconds to wait; None waits without limit.
@@ -82,6 +90,9 @@ class RuntimeNamespace(RuntimeOps):
         """
         async with self._session.turn(SetQpos, timeout=timeout) as turn:
             self._state.require_handshake("set_qpos")
+            known = self._state.objects.articulations if by_name else self._state.objects.articulations_by_id
+            if target not in [*known] and target in self._state.objects.articulations:
+                target, by_name = self._state.objects.articulations[target].prefix, True
             values = self._positions(target, qpos, by_name=by_name)
             reply = await turn.call(SetQpos(target=target, qpos=values, target_by=target_by(by_name)))
             self._state.mirror_qpos(reply.actor_name, reply.qpos)
@@ -110,8 +121,10 @@ class RuntimeNamespace(RuntimeOps):
     ) -> ContactsResult:
         """Snapshot the active contacts.
 
-        Filters are exact compiled names, combined with AND. The server compares `body1` and `geom1` with the first
-        geom of a contact and `body2` and `geom2` with the second; a swapped pair does not match.
+        Filters are combined with AND. Each is a compiled name, or one with the articulation's key, actor id or nothing
+        in front; what was filtered by comes back as it was written, all other names as they were compiled. The server
+        compares `body1` and `geom1` with the first geom of a contact and `body2` and `geom2` with the second; a swapped
+        pair does not match.
 
         Args:
             body1: Body of the first geom.
@@ -120,6 +133,9 @@ class RuntimeNamespace(RuntimeOps):
             geom2: Second geom.
             max_contacts: Return at most so many.
             timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            KeyError: Several articulations have a body or geom of that name; nothing was sent.
         """
         names = ContactFilter(body1=body1, body2=body2, geom1=geom1, geom2=geom2)
         reply = await self._call(

@@ -14,10 +14,15 @@ from urlab_client.aio.model.numbers import finite
 from urlab_client.aio.model.upload import flatten, upload
 from urlab_client.aio.namespaces._base import Vector, as_quat, as_vec3, target_by
 from urlab_client.aio.namespaces._ops import SceneOps
+from urlab_client.aio.namespaces.lasting import SceneEdit
+from urlab_client.aio.namespaces.sim import SimNamespace
+from urlab_client.aio.session import Session
 from urlab_client.protocol.base import Reply, Request
+from urlab_client.protocol.enums import PIEState
 from urlab_client.protocol.errors import CreateLevelFailed, ImportFailed, UnknownOp
 from urlab_client.protocol.messages.outliner import ListActors
 from urlab_client.protocol.messages.scene import (
+    CreateLevel,
     DestroyActor,
     DuplicateActor,
     ImportXml,
@@ -49,6 +54,43 @@ R = TypeVar("R", bound=Reply)
 
 class SceneNamespace(SceneOps):
     """Editor-time authoring. Edits during play show after the next start of play."""
+
+    def __init__(self, session: Session, sim: SimNamespace) -> None:
+        super().__init__(session)
+        self._sim = sim
+        self._edits = 0  # blocks of `edit()` that are open
+
+    def edit(self, *, timeout_s: float = 30.0) -> SceneEdit:
+        """Edit the level in a `with` block, and restart play once at its end, so that the simulation has the edits.
+
+        Where no play runs at the end, nothing is started. Of nested blocks the outermost one restarts. After the
+        restart the client's own step mode is in force again; in live mode physics starts paused.
+
+        If the block raises, play is not restarted: it goes on in the world as it was, and what was edited before stays
+        in the level, as the editor has no op to undo it. The exception carries a note that says so.
+
+        Args:
+            timeout_s: Seconds to wait for the compile.
+
+        Raises:
+            URLabPIEError: On leaving: the level does not compile as it is now. The edits stay, and play is off.
+
+        Example:
+            async with client.scene.edit():
+                await client.scene.spawn_actor(robot, "left", location=(0, 1, 0))
+                await client.scene.spawn_actor(robot, "right", location=(0, -1, 0))
+        """
+        return SceneEdit(self._begin_edit, lambda well: self._end_edit(well=well, timeout_s=timeout_s))
+
+    def _begin_edit(self) -> None:
+        self._edits += 1
+
+    async def _end_edit(self, *, well: bool, timeout_s: float) -> None:
+        self._edits -= 1
+        if not well or self._edits or (await self._sim.status()).state is PIEState.OFF:
+            return
+        await self._sim.stop()
+        await self._sim.start(timeout_s=timeout_s)
 
     async def import_xml(
         self,
@@ -353,8 +395,9 @@ class SceneNamespace(SceneOps):
     ) -> dict[str, URLabSpawnHandle]:
         """Bring a level into a described state: load or create it, import each MJCF once, place each asset, save.
 
-        Safe to repeat: an actor whose id exists is moved, not spawned again. An MJCF that is on this machine only is
-        uploaded to servers that take models over the wire, one at most.
+        Safe to repeat: an actor whose id exists is moved, not spawned again. Other tasks' changes to the scene wait
+        until it is done. An MJCF that is on this machine only is uploaded to servers that take models over the wire,
+        one at most.
 
         Args:
             level_name: Short name or `/Game/` path.
@@ -376,27 +419,28 @@ class SceneNamespace(SceneOps):
         twice = sorted({i for i in ids if ids.count(i) > 1})
         if twice:
             raise ValueError(f"actor ids must differ, these are used twice: {', '.join(twice)}")
-        try:
-            await self.create_level(level_name, timeout=timeout)
-        except CreateLevelFailed:
-            await self.load_level(level_name, timeout=timeout)
-        await self.ensure_manager(timeout=timeout)
-        blueprints = await self._imported(list(dict.fromkeys(asset.xml for asset in wanted)), timeout)
-        handles = {
-            asset.actor_id: await self.spawn_actor(
-                blueprints[asset.xml],
-                asset.actor_id,
-                location=asset.location,
-                rotation_quat=asset.rotation_quat,
-                rotation_euler=asset.rotation_euler,
-                scale=asset.scale,
-                timeout=timeout,
-            )
-            for asset in wanted
-        }
-        if save:
-            await self.save_level(timeout=timeout)
-        return handles
+        async with self._session.composing(CreateLevel, timeout):
+            try:
+                await self.create_level(level_name, timeout=timeout)
+            except CreateLevelFailed:
+                await self.load_level(level_name, timeout=timeout)
+            await self.ensure_manager(timeout=timeout)
+            blueprints = await self._imported(list(dict.fromkeys(asset.xml for asset in wanted)), timeout)
+            handles = {
+                asset.actor_id: await self.spawn_actor(
+                    blueprints[asset.xml],
+                    asset.actor_id,
+                    location=asset.location,
+                    rotation_quat=asset.rotation_quat,
+                    rotation_euler=asset.rotation_euler,
+                    scale=asset.scale,
+                    timeout=timeout,
+                )
+                for asset in wanted
+            }
+            if save:
+                await self.save_level(timeout=timeout)
+            return handles
 
     async def _imported(self, files: list[str], timeout: Timeout) -> dict[str, URLabBlueprint]:
         """Import models from the server's disk, or else from this machine's where the server takes them so."""

@@ -40,6 +40,7 @@ async def take_reset(
     )
     try:
         reply = await turn.call(request)
+        state.reset_seed = seed
         state.absorb_reset(reply, request.keyframe_name)
     except BaseException as error:
         if turn.sent and leaves_open(error):

@@ -80,10 +80,11 @@ class SimState:
         sent_level: Observation level the server has, which an earlier step may have changed.
         hello: The last handshake, without the model's bytes.
         step_count: Steps since the last handshake or reset.
+        reset_seed: Seed of the last reset, None without one.
         sim_time: Simulation time of the last reply, seconds.
         on_adopted: Told of each handshake taken over, and of the end of play.
         pending: Requests whose replies were lost.
-        stopping: Whether this client is ending play, so that its end is not news.
+        switching_play: Whether this client is starting or ending play, so that neither is news.
         observers: Who looks on, such as recorders.
         step_streams: Where the pictures of steps are looked for if replies bring older ones.
     """
@@ -113,6 +114,7 @@ class SimState:
         self.sent_level = "standard"
         self.hello: HelloOk | None = None
         self.step_count = 0
+        self.reset_seed: int | None = None
         self.sim_time = 0.0
         self.sim_time_sec = self.sim_time_nsec = 0
         self.wall_time_sec = self.wall_time_nsec = 0
@@ -124,7 +126,7 @@ class SimState:
         self._live_pictures = live_pictures
         self.pending = PendingOutcomes()
         self.on_adopted: Callable[[], None] | None = None
-        self.stopping = False
+        self.switching_play = False
         self.observers: tuple[ClientObserver, ...] = ()  # replaced, never changed: from any thread
 
     @property

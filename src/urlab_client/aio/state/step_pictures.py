@@ -23,7 +23,7 @@ __all__ = ["StepPictures"]
 log = logging.getLogger("urlab_client.client")
 
 _BLOCKING_S: Final = 3.0  # an alpha waits up to 2 s + 1 s for each picture
-_RENDER_S: Final = 2.0
+_RENDER_S: Final = 5.0
 
 
 class StepPictures:

@@ -51,28 +51,31 @@ def opening_of(op: Op) -> bytes:
 
 
 class RegionChannel:
-    """The pair of request and reply region, for the one client that holds the lock."""
+    """The pair of request and reply region, for the one client that holds the lock.
 
-    def __init__(self, requests: Path, replies: Path) -> None:
+    Args:
+        requests: File of the requests.
+        replies: File of the replies.
+        events: What their events are called on Windows.
+
+    Attributes:
+        limit: Largest payload that fits in both directions.
+    """
+
+    def __init__(self, requests: Path, replies: Path, events: tuple[str, str]) -> None:
         self.requests = MappedRegion(requests, writable=True, exclusive=True)
         try:
             self.replies = MappedRegion(replies)
         except BaseException:
             self.requests.close()
             raise
-        session = requests.parent.name
-        self._request_event = NamedEvent(f"Local\\URLab_{session}_req_ready")
-        self.reply_event = NamedEvent(f"Local\\URLab_{session}_rep_ready")
+        self.limit = min(self.requests.region.max_payload, self.replies.region.max_payload)
+        self._request_event, self.reply_event = map(NamedEvent, events)
         # A client that died here may have left a request behind whose reply is still to come.
         self.dirty = True
         self.seen = 0
         self._token = ""
         self._asked_at = 0.0
-
-    @property
-    def limit(self) -> int:
-        """Largest payload that fits in both directions."""
-        return min(self.requests.region.max_payload, self.replies.region.max_payload)
 
     def intact(self) -> bool:
         """Whether both regions are mapped in full still."""

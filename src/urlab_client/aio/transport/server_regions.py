@@ -32,8 +32,10 @@ class SharedMemoryRegions:
 
     def __init__(self, directory: str | os.PathLike[str] | None) -> None:
         self.directory: Path | None = None
+        # Replies last: whoever waits for one goes on within the call.
         self.rung: dict[bytes, list[Callable[[], None]]] = {doorbell.STATE: [], doorbell.CAMERA: [], doorbell.REPLY: []}
         self._told: dict[str, Path] = {}  # regions whose files the server names, whatever those are called
+        self._events = "", ""
         self._given = None if directory is None else Path(directory).absolute()
         self._waiter: Poller | None = None
         self._bell: Doorbell | None = None
@@ -62,6 +64,7 @@ class SharedMemoryRegions:
         told = hello.shm_rpc
         paths = {} if told is None else {REQUEST_FILE: told.req_path, REPLY_FILE: told.rep_path}
         self._told = {file: _checked(path) for file, path in paths.items()}
+        self._events = ("", "") if told is None else (told.req_event, told.rep_event)
         if self._given is not None:
             self.directory = self._given
         elif hello.shm_session_dir is not None:
@@ -86,6 +89,16 @@ class SharedMemoryRegions:
         if file in self._told:
             return [self._told[file]]
         return [Path(directory) / file for directory in region_directories(self.directory, file)]
+
+    def events(self, requests: Path) -> tuple[str, str]:
+        """Return what the events of requests and replies are called on Windows.
+
+        Args:
+            requests: The region of the requests, after whose directory they are called where the server does not say.
+        """
+        asked, answered = self._events
+        session = requests.parent.name
+        return asked or f"Local\\URLab_{session}_req_ready", answered or f"Local\\URLab_{session}_rep_ready"
 
     def find(self, file: str) -> Path | None:
         """Return where a region's file is; None when it is nowhere."""

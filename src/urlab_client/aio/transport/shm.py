@@ -15,6 +15,7 @@ from pathlib import Path
 
 from urlab_client.aio.transport.base import LateReply, RequestTransport
 from urlab_client.aio.transport.busy_poll import BusyPoll
+from urlab_client.aio.transport.delivery import deliver
 from urlab_client.aio.transport.mapped_region import RegionInUse
 from urlab_client.aio.transport.poller import ReplyPoll
 from urlab_client.aio.transport.region_channel import SYNC_PREFIX, RegionChannel, envelope_of, opening_of
@@ -60,11 +61,14 @@ _LONGEST_SPIN_S = 2e-3
 class _Pending:
     """The request under way."""
 
-    def __init__(self, op: Op, future: asyncio.Future[bytes]) -> None:
+    __slots__ = ("at", "deadline", "future", "op", "watch")
+
+    def __init__(self, op: Op, future: asyncio.Future[bytes], at: float, deadline: float | None) -> None:
         self.op = op
         self.future = future
+        self.at = at
+        self.deadline = deadline
         self.watch: ReplyPoll | None = None
-        self.glance: asyncio.TimerHandle | None = None
 
 
 class ShmTransport:
@@ -87,6 +91,11 @@ class ShmTransport:
         self._retry_at = 0.0
         self._used_at = 0.0
         self._pending: _Pending | None = None
+        # One of each for all requests: most are answered long before, and making and cancelling a timer takes a tenth
+        # of what a step takes.
+        self._timer: asyncio.TimerHandle | None = None
+        self._due = 0.0
+        self._glances: asyncio.TimerHandle | None = None
         self._closed = False
         self._refused: dict[str, str] = {}
         self._largest_state = 0
@@ -179,6 +188,9 @@ class ShmTransport:
         closed = ClientClosed(f"The client of {self.endpoint} was closed.", hint="Make a new client.")
         self._fail(lambda _: closed)
         self._drop("closed")
+        for timer in (self._timer, self._glances):
+            if timer is not None:
+                timer.cancel()
         self._memory.close()
         await self._inner.aclose()
 
@@ -248,7 +260,7 @@ class ShmTransport:
                 looked = ", ".join(map(str, self._memory.candidates(file)))
                 raise FileNotFoundError(f"there is no {looked}")
             paths.append(path)
-        self._channel = RegionChannel(*paths)
+        self._channel = RegionChannel(paths[0], paths[1], self._memory.events(paths[0]))
         self._memory.connect_bell()
         self._used_at = asyncio.get_running_loop().time()
         log.info(
@@ -282,9 +294,7 @@ class ShmTransport:
 
     async def _over_shm(self, channel: RegionChannel, frame: bytes, op: Op, deadline: float | None) -> bytes:
         loop = asyncio.get_running_loop()
-        pending = self._pending = _Pending(op, loop.create_future())
-        timer: asyncio.TimerHandle | None = None
-        started = loop.time()
+        pending = self._pending = _Pending(op, loop.create_future(), loop.time(), deadline)
         # Until the reply is here, whatever ends the wait leaves one that is still to come.
         channel.dirty = True
         try:
@@ -293,23 +303,20 @@ class ShmTransport:
             self.stats.sent += 1
             self.stats.over_shm += 1
             self._ring()
-            if deadline is not None:
-                timer = loop.call_at(deadline, self._expire, pending, deadline - started)
+            if deadline is not None and (self._timer is None or deadline < self._due):
+                self._expire_at(loop, deadline)
             awake = self._busy_poll.pays(op.name)
             if awake:
                 await self._busy_poll.look(op.name, pending.future, lambda: self._look_at(channel))
             if not pending.future.done():
                 if self._memory.bell is None:
                     self._watch()
-                pending.glance = loop.call_later(_GLANCE_S, self._glance, pending)
+                if self._glances is None:
+                    self._glances = loop.call_later(_GLANCE_S, self._glance, loop)
             answer = await pending.future
         finally:
             self._unwatch()
-            if pending.glance is not None:
-                pending.glance.cancel()
             self._pending = None
-            if timer is not None:
-                timer.cancel()
             self._used_at = loop.time()
         channel.dirty = False
         self.stats.received += 1
@@ -326,12 +333,15 @@ class ShmTransport:
         if not channel.replies.intact() or channel.replies.region.sequence != channel.seen:
             self._look()
 
-    def _glance(self, pending: _Pending) -> None:
+    def _glance(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._glances = None
+        pending = self._pending
+        if pending is None:
+            return
         self._look()
         if not pending.future.done() and self._channel is not None and self._channel.replaced():
             self._drop("the regions were replaced")
-        if not pending.future.done():
-            pending.glance = asyncio.get_running_loop().call_later(_GLANCE_S, self._glance, pending)
+        self._glances = loop.call_later(_GLANCE_S, self._glance, loop)
 
     def _watch(self) -> None:
         """Let the thread look for the reply from now on."""
@@ -343,7 +353,7 @@ class ShmTransport:
         def news() -> bool:
             return not replies.intact() or replies.region.sequence != channel.seen
 
-        pending.watch = ReplyPoll(news, self._look, event.wait if event.exists else None)
+        pending.watch = ReplyPoll(news, self._take, event.wait if event.exists else None)
         self._memory.waiter.add(pending.watch)
 
     def _unwatch(self) -> None:
@@ -352,18 +362,34 @@ class ShmTransport:
             self._pending.watch = None
 
     def _on_ring(self) -> None:
-        self._look()
         if self._memory.bell is None:
+            self._look()
             self._watch()
+        else:
+            self._take()
+
+    def _take(self) -> None:
+        """Take up the reply if it is there; whoever waits for it goes on here. A callback of the loop."""
+        pending = self._pending
+        answer = self._found()
+        if answer is not None and pending is not None:
+            deliver(pending.future, answer)
 
     def _look(self) -> None:
-        """Take up the reply if it is there."""
+        """Take up the reply if it is there; whoever waits for it goes on in the loop's next turn."""
+        pending = self._pending
+        answer = self._found()
+        if answer is not None and pending is not None:
+            pending.future.set_result(answer)
+
+    def _found(self) -> bytes | None:
+        """Return the reply to the request under way, if that waits for one still and it is there."""
         pending, channel = self._pending, self._channel
         if pending is None or pending.future.done() or channel is None:
-            return
+            return None
         if not channel.replies.intact():
             self._drop("the reply region was cut off")
-            return
+            return None
         try:
             found = channel.replies.region.read_latest(channel.seen)
         except ProtocolError as error:
@@ -371,7 +397,7 @@ class ShmTransport:
                 ProtocolError(f"{pending.op.name}: {channel.replies.path}: {error.args[0]}", op=pending.op.name)
             )
             self._drop("the reply region is damaged")
-            return
+            return None
         if found is None:
             sequence = channel.replies.region.sequence
             if sequence == 0:  # begun anew: it counts from one again
@@ -380,15 +406,15 @@ class ShmTransport:
                 asyncio.get_running_loop().call_soon(self._look)
             elif pending.watch is not None:
                 pending.watch.resume()
-            return
+            return None
         channel.seen = found.sequence
         if self._answers(found.payload, pending.op):
-            pending.future.set_result(found.payload)
-        else:
-            self.stats.late += 1
-            if pending.watch is not None:
-                pending.watch.resume()
-            log.debug("%s: dropped a reply to another request", channel.replies.path)
+            return found.payload
+        self.stats.late += 1
+        if pending.watch is not None:
+            pending.watch.resume()
+        log.debug("%s: dropped a reply to another request", channel.replies.path)
+        return None
 
     @staticmethod
     def _answers(reply: bytes, op: Op) -> bool:
@@ -399,14 +425,28 @@ class ShmTransport:
             return not (found.code == "session_expired" and SYNC_PREFIX in found.message)
         return found.op == op.reply_name
 
-    def _expire(self, pending: _Pending, seconds: float) -> None:
+    def _expire_at(self, loop: asyncio.AbstractEventLoop, deadline: float) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        self._due = deadline
+        self._timer = loop.call_at(deadline, self._expire, loop)
+
+    def _expire(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._timer = None
+        pending = self._pending
+        if pending is None or pending.deadline is None:
+            return
+        if pending.deadline > self._due:  # and not the time: the loop may be early by its resolution
+            self._expire_at(loop, pending.deadline)
+            return
         self._look()
         if pending.future.done():
             return
+        waited_ms = 1000 * (pending.deadline - pending.at)
         executed = "" if pending.op.effect is Effect.READ else " The request was sent and may still be executed."
         pending.future.set_exception(
             URLabTimeoutError(
-                f"{pending.op.name}: no reply in shared memory within {seconds * 1000:.0f} ms.{executed}",
+                f"{pending.op.name}: no reply in shared memory within {waited_ms:.0f} ms.{executed}",
                 op=pending.op.name,
                 hint="The server is busy or blocked; allow more time with timeout=…",
             )

@@ -216,7 +216,9 @@ class Follower(ClientObserver):
         nanoseconds = round(reply.time * _NS) if clock is None else clock.sec * _NS + clock.nsec
         wall_ns = client.recv_wall_time_ns if wall is None else wall.sec * _NS + wall.nsec
         set_points = {key: art.ctrl_array.tolist() for key, art in client.articulations.items()}
-        put(State(scene, reply, set_points, nanoseconds, isinstance(reply, ResetOk), wall_ns, not self._live))
+        restarts = isinstance(reply, ResetOk)
+        seed = client.reset_seed if restarts else None
+        put(State(scene, reply, set_points, nanoseconds, restarts, wall_ns, not self._live, seed))
         if isinstance(reply, StepOk) and self._due_at is not None:
             self._pictures.done(self._due_at)
             self._due_at = None

@@ -203,6 +203,23 @@ class ContactsMessage(Struct, frozen=True):
     contacts: list[ContactMessage]
 
 
+class VariedQuantity(Struct, frozen=True):
+    """What was drawn for a quantity, by element: factors, offsets or values, as `by` (`scale`, `add`, `set`) says."""
+
+    what: str
+    by: str
+    drawn: dict[str, list[float]]
+
+
+class EpisodeMessage(Struct, frozen=True):
+    """What the server varies in the episode that begins, and the seed that decided on it."""
+
+    timestamp: Time
+    episode: int
+    seed: int
+    varied: list[VariedQuantity]
+
+
 class GapMessage(Struct, frozen=True):
     """What was dropped since the previous message of this kind, because the file could not be written fast enough."""
 
@@ -216,6 +233,7 @@ _URLAB: dict[type[Struct], str] = {
     ArticulationMessage: "urlab.ArticulationState",
     EntityMessage: "urlab.EntityState",
     ContactsMessage: "urlab.Contacts",
+    EpisodeMessage: "urlab.Episode",
     GapMessage: "urlab.Gap",
 }
 

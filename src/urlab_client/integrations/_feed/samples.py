@@ -23,7 +23,8 @@ _FALLBACK_NS = 1_000_000
 class State:
     """One state on its way to whoever keeps or shows it.
 
-    `waits` says that it is the reply to a step of ours, so that the next one can wait until there is room.
+    `waits` says that it is the reply to a step of ours, so that the next one can wait until there is room, and `seed`
+    is that of the reset which the state is the reply to.
     """
 
     scene: SceneMessages
@@ -33,6 +34,7 @@ class State:
     restarts: bool
     wall_ns: int
     waits: bool
+    seed: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

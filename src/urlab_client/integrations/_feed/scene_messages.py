@@ -25,12 +25,15 @@ from urlab_client.integrations._feed.messages import (
     Time,
     Vector3,
 )
+from urlab_client.integrations._varied import variation_of
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.dialects import cleaned_name
 from urlab_client.protocol.messages.session import ArticulationState, EntityState
 
 if TYPE_CHECKING:
     import mujoco
+
+    from urlab_client.randomise.variation import Variation
 
 __all__ = [
     "CameraLayout",
@@ -92,6 +95,7 @@ class SceneMessages:
         entities: Offset of the free joint in `qpos` and in `qvel`, or None, by name of the plain entity.
         mocap: Mocap id of the plain entities that have one.
         cameras: What to record, by the view's identity.
+        variation: How the server varies the scene from reset to reset, or None.
     """
 
     model: mujoco.MjModel | None
@@ -100,6 +104,7 @@ class SceneMessages:
     entities: dict[str, tuple[int, int] | None]
     mocap: dict[str, int]
     cameras: dict[int, CameraLayout]
+    variation: Variation | None
 
     @classmethod
     def of(cls, client: URLabClient, cameras: list[tuple[str, URLabCameraView]]) -> SceneMessages:
@@ -125,6 +130,7 @@ class SceneMessages:
             entities=entities,
             mocap=mocap,
             cameras={id(view): CameraLayout(name, view, _camera_id(model, prefixes, name)) for name, view in cameras},
+            variation=None if model is None else variation_of(client, model, layouts),
         )
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import mujoco
 import numpy as np
@@ -16,6 +17,7 @@ from urlab_client._mujoco import batch_class
 from urlab_client.aio.launch import with_model_options
 from urlab_client.aio.model.layout import ArticulationLayout
 from urlab_client.aio.model.mirror import model_names
+from urlab_client.integrations.gym.batch_variation import BatchVariation
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn
 from urlab_client.integrations.gym.episode import client_defaults, compiled_prefixes, fields_of
 from urlab_client.integrations.gym.pictures import BatchPictures
@@ -36,10 +38,14 @@ from urlab_client.integrations.gym.vectorized import Floats, Found, Indices, Vec
 from urlab_client.protocol.enums import ControllerKind
 from urlab_client.protocol.errors import UnknownKeyframe, URLabError
 from urlab_client.protocol.names import compiled_names
+from urlab_client.randomise.declaration import Randomisation
+from urlab_client.randomise.variation import declared_in
 from urlab_client.server.physics.controllers import Controller, ControllerConfig, PassthroughController, PDController
 from urlab_client.sync.client import URLabClient
 
 __all__ = ["URLabBatchEnv"]
+
+_BOUND: Final = ("qpos", "qvel", "ctrl", "act", "sensordata", "time", "xfrc_applied")
 
 
 class URLabBatchEnv(Vectorized):
@@ -69,6 +75,7 @@ class URLabBatchEnv(Vectorized):
         render_mode: Literal["rgb_array"] | None = None,
         render_camera: str | None = None,
         task: Task | None = None,
+        randomise: Randomisation | str | os.PathLike[str] | None = None,
         autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
         n_threads: int = 0,
         client_options: Mapping[str, Any] = MappingProxyType({}),
@@ -89,6 +96,7 @@ class URLabBatchEnv(Vectorized):
             render_mode: None or `rgb_array`, with which `render` draws; steps cost the same.
             render_camera: Camera that `render` shows, `ARTICULATION/CAMERA`; the first one of the scene by default.
             task: See `URLabEnv`. One object serves all environments.
+            randomise: See `URLabEnv`. Latency of cameras is without effect: a batch observes none.
             autoreset_mode: `NEXT_STEP`, `SAME_STEP` or `DISABLED`.
             n_threads: Threads that step, the caller's included; 0 for one per processor.
             client_options: Further options of the client that fetches the scene.
@@ -111,6 +119,7 @@ class URLabBatchEnv(Vectorized):
         )
         scene = _fetch(with_model_options(address), client_defaults(client_options))
         model, prefixes, controllers, exact = scene
+        declared = declared_in(model) if randomise is None else Randomisation.of(randomise)
         mapping = SpaceMapping(model, prefixes, fields_of(settings.observations), space_mode)
         super().__init__(
             num_envs=num_envs,
@@ -121,6 +130,7 @@ class URLabBatchEnv(Vectorized):
             max_episode_steps=settings.max_episode_steps,
             autoreset_mode=autoreset_mode,
             task=task,
+            randomise=declared,
         )
         self.model = model
         self._goals: list[dict[str, Floats]] = [{} for _ in range(num_envs)]
@@ -134,7 +144,7 @@ class URLabBatchEnv(Vectorized):
         self._pictures: BatchPictures | None = None
         self._batch = (batch_class() or ThreadedBatch)(model, num_envs, n_threads)
         # Bound before the first call: a derived field is computed only where somebody looks at it.
-        self._arrays = {name: self._batch.bind(name) for name in ("qpos", "qvel", "ctrl", "act", "sensordata", "time")}
+        self._arrays = {name: self._batch.bind(name) for name in _BOUND}
         self._prefixes = prefixes
         self._target_type = np.float64 if exact else np.float32
         self._keyframes = {name: i for i, name in enumerate(model_names(model, "key"))}
@@ -146,6 +156,12 @@ class URLabBatchEnv(Vectorized):
         self._controllers = {
             key: _controller(model, mapping.layout(key), kind, params) for key, (kind, params) in controllers.items()
         }
+        self._varied = None
+        if declared is not None and declared.vary:
+            self._varied = BatchVariation(declared, model, self._batch, num_envs, self._controllers)
+        self._bodies = {name: i for i, name in enumerate(model_names(model, "body"))}
+        for push in () if declared is None else declared.push:
+            self._body(push.body)
         self._step_count = np.zeros(num_envs, dtype=np.int64)
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
@@ -161,7 +177,15 @@ class URLabBatchEnv(Vectorized):
             return None
         if self._pictures is None:
             self._pictures = BatchPictures(self.model, self._render_camera)
-        return tuple(self._pictures.draw(qpos) for qpos in self._arrays["qpos"])
+        pictures, varied = self._pictures, self._varied
+        return tuple(
+            pictures.draw(qpos, {} if varied is None else varied.look(i)) for i, qpos in enumerate(self._arrays["qpos"])
+        )
+
+    def draws(self, index: int) -> dict[str, Any] | None:
+        """Return what was drawn for the episode of an environment, as `EpisodeDraws.told` has it; None for nothing."""
+        found = None if self._varied is None else self._varied.draws[index]
+        return None if found is None else found.told()
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free what drew."""
@@ -178,7 +202,14 @@ class URLabBatchEnv(Vectorized):
 
     def _reset_some(self, indices: Indices, keyframe: str | None) -> Found:
         keyframe = self._start_keyframe if keyframe is None else keyframe
-        self._batch.reset(indices, -1 if keyframe is None else self._keyframe_id(keyframe))
+        key = -1 if keyframe is None else self._keyframe_id(keyframe)
+        if self._varied is not None:
+            self._varied.begin(indices, self.episode_seeds())
+        self._batch.reset(indices, key)
+        if self._varied is not None:
+            for i in map(int, indices):
+                self._varied.start(i, self._arrays["qpos"][i])
+            self._batch.forward(indices)
         if self._noise:
             qpos = self._arrays["qpos"]
             for i in map(int, indices):
@@ -206,12 +237,17 @@ class URLabBatchEnv(Vectorized):
                 ctrl[np.ix_(indices, self.mapping.layout(key).ctrl_adr)] = values[indices]
             else:
                 targets[key] = values[indices].astype(self._target_type)
+        forces, pushes = self._forces(indices), self._arrays["xfrc_applied"]
+        for i, pushed in forces.items():
+            for body, force in pushed.items():
+                pushes[i, self._body(body), :3] = force
         if targets:
             for _ in range(self._n_substeps):
                 self._control(indices, targets)
                 self._batch.step(indices, nstep=1)
         else:
             self._batch.step(indices, nstep=self._n_substeps)
+        pushes[list(forces)] = 0.0
         self._step_count[indices] += self._n_substeps
         return self._observe(indices), {}
 
@@ -219,6 +255,8 @@ class URLabBatchEnv(Vectorized):
         """Let the controllers turn their targets into controls, for the state as it is."""
         ctrl, qpos, qvel = (self._arrays[name][indices] for name in ("ctrl", "qpos", "qvel"))
         for key, values in targets.items():
+            if self._varied is not None:
+                self._varied.use_factors(key, indices)
             self._controllers[key].write(values, qpos, qvel, ctrl)
         self._arrays["ctrl"][indices] = ctrl
 
@@ -258,6 +296,12 @@ class URLabBatchEnv(Vectorized):
                 return act
             case "sensors":
                 return self._arrays["sensordata"][:, sensors]
+
+    def _body(self, name: str) -> int:
+        found = self._bodies.get(name, self._bodies.get(name.replace("/", "_", 1)))
+        if found is None:
+            raise ValueError(f"push: no body {name!r}; there are: {', '.join(self._bodies)}")
+        return found
 
     def _keyframe_id(self, name: str) -> int:
         wanted = {name, *compiled_names(name, self._prefixes)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Final, Literal, Self
@@ -10,12 +11,15 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.aio.launch import with_model_options
+from urlab_client.aio.launch import SCHEME, with_model_options, with_option
+from urlab_client.integrations.gym.disturbances import Disturbances
 from urlab_client.integrations.gym.episode import EnvEpisode, client_defaults, first_camera
 from urlab_client.integrations.gym.spaces import Observation, SpaceMapping, SpaceMode
 from urlab_client.integrations.gym.starts import ResetNoise
 from urlab_client.integrations.gym.task import EpisodeSettings, Task, check_alone
+from urlab_client.protocol.base import Floats
 from urlab_client.protocol.names import NameMap
+from urlab_client.randomise.declaration import Randomisation
 from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.articulation import URLabArticulation, URLabEntity
 from urlab_client.sync.client import URLabClient
@@ -50,6 +54,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
     Attributes:
         client: The client.
         task: The task, or None.
+        randomise: What varies from episode to episode, or None.
         reward_fn: The reward function, or None for rewards of 0.
         termination_fn: The termination function, or None for episodes that never end by themselves.
     """
@@ -72,6 +77,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         reset_noise: float | ResetNoise | None = None,
         keyframe: str | None = None,
         task: Task | None = None,
+        randomise: Randomisation | str | os.PathLike[str] | None = None,
         owns_client: bool = False,
     ) -> None:
         """Make an environment.
@@ -93,11 +99,15 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
                 joint stays within its range. No noise for None without a task.
             keyframe: Where episodes start, unless `reset` names another one; the initial state by default.
             task: What the robot is to do: where episodes start, after `keyframe` and `reset_noise`, rewards and ends.
+            randomise: What varies from episode to episode, and what disturbs sensors and actuators: a
+                `Randomisation`, or its TOML file. Quantities of the model need a server that varies them; see
+                `connect`. What the server says that it varies, for None.
             owns_client: Close the client with the environment.
 
         Raises:
-            URLabError: The client has no model, no articulation, or is in live mode.
-            KeyError: An unknown camera.
+            URLabError: The client has no model, no articulation, or is in live mode, or the server does not vary
+                what `randomise` does.
+            KeyError: An unknown camera, or body to push.
             ValueError: An option out of range, or rendering of a scene without a camera.
         """
         if render_mode not in (None, *self.metadata["render_modes"]):
@@ -121,7 +131,11 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
             cameras=cameras,
             rendered=self._rendered,
             task=task,
+            randomise=None if randomise is None else Randomisation.of(randomise),
         )
+        self.randomise = self._episode.randomise
+        n_task = 0 if task is None else task.n_observed
+        self._disturbances = None if self.randomise is None else Disturbances(self.randomise, self.mapping, n_task)
         self.action_space = self.mapping.action_space
         self.observation_space = self._episode.observation_space
         model = client.model
@@ -143,13 +157,16 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
 
         Args:
             address: Where the robots are. A server that is started for a `sim://` address honours the model's
-                `<option>`, unless the address says `?no-mjcf-options`.
+                `<option>`, unless the address says `?no-mjcf-options`, and varies what `randomise` says.
             client_options: Further options of the client.
             options: Arguments of `URLabEnv`.
 
         Raises:
             URLabError: The server cannot be reached, or has no articulation.
         """
+        if address.startswith(SCHEME) and options.get("randomise") is not None:
+            declared = options["randomise"] = Randomisation.of(options["randomise"])
+            address = with_option(address, "randomise", declared.to_json())
         client = URLabClient(with_model_options(address), **client_defaults(client_options))
         try:
             client.discover()
@@ -188,9 +205,11 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         """
         super().reset(seed=seed)
         keyframe = keyframe_option(options)
-        self._observation = portal_of(self.client).call(self._episode.reset, self.np_random, keyframe)
+        disturbances = self._disturbances
+        episode_seed = None if disturbances is None else disturbances.begin(self.np_random)
+        self._observation = portal_of(self.client).call(self._episode.reset, self.np_random, keyframe, episode_seed)
         self._elapsed = 0
-        return self._observation, self._info()
+        return self._seen(), self._info()
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Act for `n_substeps` physics steps.
@@ -202,7 +221,12 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         if self._observation is None:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
         before = self._observation
-        after = self._observation = portal_of(self.client).call(self._episode.step, action)
+        forces: dict[str, Floats] = {}
+        given, disturbances = action, self._disturbances
+        if disturbances is not None:
+            self.mapping.set_points(action)  # refuses before anything is drawn
+            given, forces = disturbances.delayed(action), disturbances.forces()
+        after = self._observation = portal_of(self.client).call(self._episode.step, given, forces)
         self._elapsed += 1
         info = self._info()
         if self.task is not None:
@@ -210,7 +234,14 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         reward = 0.0 if self.reward_fn is None else float(self.reward_fn(before, action, after, info))
         terminated = self.termination_fn is not None and bool(self.termination_fn(after, info))
         truncated = self._max_episode_steps is not None and self._elapsed >= self._max_episode_steps
-        return after, reward, terminated, truncated, info
+        return self._seen(), reward, terminated, truncated, info
+
+    def draws(self) -> dict[str, Any] | None:
+        """Return what was drawn for the episode, as plain data: `seed`, and under `varied` what was drawn for what.
+
+        None where nothing varies, and before the first reset.
+        """
+        return self._episode.draws()
 
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]  # Gymnasium's base names frames of all kinds
         """Return the frame of the last reset or step, shape (H, W, 3), RGB; None without a render mode.
@@ -246,11 +277,17 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
             info["success"] = bool(success[0])
         if terminated or truncated:
             task.ended(info.get("success", False), self._elapsed)
-        return self._observation, reward, terminated, truncated, info
+        return self._seen(), reward, terminated, truncated, info
 
     def _info(self) -> dict[str, Any]:
         client = self.client
-        return {"step_count": client.step_count, "sim_time": client.sim_time}
+        info: dict[str, Any] = {"step_count": client.step_count, "sim_time": client.sim_time}
+        if self._disturbances is not None:
+            info["episode_seed"] = self._disturbances.seed
+        return info
+
+    def _seen(self) -> Observation:
+        return self._observation if self._disturbances is None else self._disturbances.seen(self._observation)
 
 
 def keyframe_option(options: dict[str, Any] | None) -> str | None:

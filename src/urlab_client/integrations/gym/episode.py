@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+import fnmatch
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, cast
 
+import mujoco
 import numpy as np
 from gymnasium import spaces
 
+from urlab_client.aio.articulation import URLabArticulation
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
+from urlab_client.integrations._varied import variation_of
 from urlab_client.integrations.gym.spaces import LEVELS, Field, Observation, Space, SpaceMapping, SpaceMode, dict_space
 from urlab_client.integrations.gym.task import EpisodeSettings, Start, States, Task, TaskScene, add_observed, with_task
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.enums import CameraMode, ObservationLevel, StepMode
 from urlab_client.protocol.errors import URLabError
+from urlab_client.protocol.messages.cameras import CameraDelay
 from urlab_client.protocol.messages.session import StepOk
 from urlab_client.protocol.pixels import Pixels
+from urlab_client.randomise.declaration import Randomisation
+from urlab_client.randomise.variation import EpisodeDraws, declared_in
 from urlab_client.sync.client import URLabClient as BlockingClient
 
 __all__ = ["EnvEpisode", "client_defaults", "compiled_prefixes", "fields_of", "first_camera"]
@@ -53,6 +61,7 @@ class EnvEpisode:
         mapping: Its articulations as spaces.
         observation_space: That of the mapping, with `cameras` added where there are any.
         frames: The last frames by camera, as they were asked for.
+        randomise: What varies from episode to episode, or None.
     """
 
     def __init__(
@@ -64,6 +73,7 @@ class EnvEpisode:
         cameras: Sequence[str],
         rendered: Sequence[str],
         task: Task | None = None,
+        randomise: Randomisation | None = None,
     ) -> None:
         """Describe the episodes of a client.
 
@@ -74,9 +84,10 @@ class EnvEpisode:
             cameras: Cameras whose frames come with each observation, `ARTICULATION/CAMERA` or a scene-level name.
             rendered: Further cameras whose frames are to be in `frames`.
             task: What chooses the start, and adds to observations; set up here if it is not yet.
+            randomise: What varies from episode to episode; what the server says that it varies, for None.
 
         Raises:
-            URLabError: The client has no model, no articulation, or is in live mode.
+            URLabError: The client has no model, no articulation, or is in live mode, or the server cannot vary that.
             KeyError: An unknown camera.
             ValueError: An option out of range.
         """
@@ -107,6 +118,16 @@ class EnvEpisode:
         self._keyframe = settings.keyframe
         self._task = task
         self._goal: dict[str, Floats] = {}
+        self.randomise = _in_force(client, model, randomise)
+        layouts = {key: self.mapping.layout(key) for key in self.mapping.keys}
+        self._variation = variation_of(client, model, layouts)
+        latencies = () if self.randomise is None else self.randomise.camera
+        self._latencies = {
+            name: late for late in latencies for name in self._cameras if fnmatch.fnmatchcase(name, late.camera)
+        }
+        self._draws: EpisodeDraws | None = None
+        for push in () if self.randomise is None else self.randomise.push:
+            self._pushed(push.body)
         if task is not None:
             if not hasattr(task, "scene"):
                 task.setup(TaskScene(model, self.mapping))
@@ -124,32 +145,53 @@ class EnvEpisode:
         qpos, qvel = np.array(data.qpos)[None], np.array(data.qvel)[None]
         return States(self._task.scene, qpos, qvel, np.array([data.time]), [self._goal])
 
-    async def reset(self, rng: np.random.Generator, keyframe: str | None = None) -> Observation:
-        """Reset the simulation and return the first observation; set-points become zero."""
+    def draws(self) -> dict[str, Any] | None:
+        """Return what was drawn for the episode, as `EpisodeDraws.told` has it; None for nothing."""
+        return None if self._draws is None else self._draws.told()
+
+    async def reset(
+        self, rng: np.random.Generator, keyframe: str | None = None, seed: int | None = None
+    ) -> Observation:
+        """Reset the simulation and return the first observation; set-points become zero.
+
+        Args:
+            rng: The environment's generator.
+            keyframe: Where to start, instead of where the settings say.
+            seed: Decides what varies; None where nothing does.
+        """
         client = self.client
         keyframe = self._keyframe if keyframe is None else keyframe
         for articulation in client.articulations.values():
             articulation.ctrl_array[:] = 0.0
-        await client.reset(keyframe)
+        if self._variation is not None and seed is not None:
+            self._draws = self._variation.draw(seed)
+        await client.reset(keyframe, seed)
         overrides = self._noisy_positions(rng) if self._noise else None
         if overrides:
-            await client.reset(keyframe, per_articulation_qpos=overrides)
+            await client.reset(keyframe, seed, overrides)
         placed = await self._start_task(rng)
         if self._cameras:
-            await self._look(keyframe, overrides, placed)
+            await self._delay_cameras(seed)
+            await self._look(keyframe, seed, overrides, placed)
         return self._observe()
 
-    async def step(self, action: Any) -> Observation:
+    async def step(self, action: Any, forces: Mapping[str, Floats] = MappingProxyType({})) -> Observation:
         """Apply an action for `n_substeps` and return the observation after it.
+
+        Args:
+            action: The action.
+            forces: Pushes meanwhile, by body, N, world frame, shape (3,).
 
         Raises:
             ValueError: The action does not fit; nothing was sent.
         """
         for key, values in self.mapping.set_points(action).items():
             self.client.articulations[key].ctrl_array[:] = values
-        reply = await self.client.step(
-            self._n_substeps, include_cameras=dict.fromkeys(self._cameras, "sync") or False, observations=self._level
-        )
+        for body, force in forces.items():
+            articulation, name = self._pushed(body)
+            articulation.apply_xfrc(name, force=force.tolist())
+        cameras = {name: "latest" if name in self._latencies else "sync" for name in self._cameras}
+        reply = await self.client.step(self._n_substeps, include_cameras=cameras or False, observations=self._level)
         self._take_frames()
         return self._observe(reply)
 
@@ -189,9 +231,29 @@ class EnvEpisode:
         if placed:
             await runtime.forward()
 
+    def _pushed(self, body: str) -> tuple[URLabArticulation, str]:
+        """Return whose a body is, and what it is called there.
+
+        Raises:
+            KeyError: There is none of this name.
+        """
+        key, _, name = body.partition("/")
+        articulation = self.client.articulations[key]
+        articulation.bodies[name]
+        return articulation, name
+
+    async def _delay_cameras(self, seed: int | None) -> None:
+        if self._latencies:
+            delays = {
+                name: CameraDelay(delay_s=late.delay_s, jitter_s=late.jitter_s, clock="sim", seed=(seed or 0) + 1)
+                for name, late in self._latencies.items()
+            }
+            await self.client.runtime.set_camera_delay(delays)
+
     async def _look(
         self,
         keyframe: str | None,
+        seed: int | None,
         overrides: Mapping[str, Mapping[str, float]] | None,
         placed: Mapping[str, Floats],
     ) -> None:
@@ -207,12 +269,14 @@ class EnvEpisode:
         self._take_frames()
         if mode is not StepMode.PUPPET:
             await client.runtime.set_mode(mode)
-            await client.reset(keyframe, per_articulation_qpos=overrides)
+            await client.reset(keyframe, seed, overrides)
             await self._place(placed)
 
     def _take_frames(self) -> None:
         for name, view in self._cameras.items():
             frame = view.latest_frame
+            if name in self._latencies and not view.delivered and name in self.frames:
+                continue  # nothing is old enough yet: what was seen last stays
             if frame is None or not view.delivered:
                 raise URLabError(
                     f"The server sent no frame of camera {name!r}.",
@@ -271,6 +335,24 @@ class EnvEpisode:
                 readings = articulation.get_sensors()
                 found = [np.atleast_1d(readings[name]) for name in self._sensors[key]]
                 return np.concatenate(found) if found else np.zeros(0)
+
+
+def _in_force(client: URLabClient, model: mujoco.MjModel, randomise: Randomisation | None) -> Randomisation | None:
+    """Return what varies: as asked for, or as the server says.
+
+    Raises:
+        URLabError: The server does not vary what is asked for.
+    """
+    declared = declared_in(model)
+    if randomise is None:
+        return declared
+    if declared != randomise and (declared is not None or randomise.vary):
+        does = "does not vary its scene" if declared is None else "varies its scene in another way"
+        raise URLabError(
+            f"The server at {client.address} {does}.",
+            hint="Use a sim:// address, or start it with `urlab serve --randomise FILE`.",
+        )
+    return randomise
 
 
 def compiled_prefixes(client: URLabClient | BlockingClient) -> dict[str, str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Mapping
 from typing import Any
 
 import mujoco
@@ -31,7 +33,7 @@ class BatchPictures:
         wanted = names[0] if camera is None and names else (camera or "").replace("/", "_")
         if wanted not in names:
             raise ValueError(f"there is no camera {camera!r} to render; the scene has {', '.join(names) or 'none'}")
-        self._model = model
+        self._model = copy.copy(model)
         self._data = mujoco.MjData(model)
         self._view = mujoco.MjvCamera()
         self._view.type, self._view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, names.index(wanted)
@@ -45,12 +47,15 @@ class BatchPictures:
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         mujoco.mjr_resizeOffscreen(width, height, self._context)
 
-    def draw(self, qpos: Floats) -> NDArray[np.uint8]:
+    def draw(self, qpos: Floats, look: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:
         """Return the picture of a state, shape (H, W, 3), RGB.
 
         Args:
             qpos: Positions of the scene, shape (nq,).
+            look: Fields of the model that differ from the model as given, the same ones each time.
         """
+        for name, values in look.items():
+            getattr(self._model, name)[...] = values
         self._data.qpos[:] = qpos
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_comPos(self._model, self._data)

@@ -90,6 +90,10 @@ class SpaceMapping:
         """Return where an articulation's values live in the compiled model."""
         return self._parts[key].layout
 
+    def width(self, key: str, field: Field) -> int:
+        """Return how many numbers a field of an articulation has."""
+        return self._parts[key].widths[field]
+
     def joint_names(self, key: str, model: mujoco.MjModel) -> list[str]:
         """Return the hinge and slide joints of an articulation: those whose position is one number."""
         return [name for name, i in self._parts[key].layout.joints.items() if model.jnt_type[i] in _HINGE_AND_SLIDE]

@@ -6,6 +6,7 @@ which does not return what warm-starts the next step, so that its results would 
 
 from __future__ import annotations
 
+import copy
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -15,18 +16,20 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client.randomise.variation import field_of
+
 __all__ = ["ThreadedBatch"]
 
 Indices = NDArray[np.intp]
 
-_STATE = ("qpos", "qvel", "act", "ctrl")
+_STATE = ("qpos", "qvel", "act", "ctrl", "xfrc_applied")
 
 
 class ThreadedBatch:
     """Many simulations of one model.
 
     Args:
-        model: The model, shared by all.
+        model: The model, shared by all until `expand`.
         nsim: Number of simulations.
         nthread: Threads that step; 0 for one per processor.
     """
@@ -35,6 +38,8 @@ class ThreadedBatch:
         self._model = model
         self._data = [mujoco.MjData(model) for _ in range(nsim)]
         self._bound: dict[str, NDArray[Any]] = {}
+        self._models = [model] * nsim
+        self._expanded: dict[str, NDArray[Any]] = {}
         self._threads = max(1, min(nsim, nthread or os.cpu_count() or 1))
         self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="urlab-batch") if self._threads > 1 else None
         for data in self._data:
@@ -48,34 +53,55 @@ class ThreadedBatch:
             self._bound[name] = np.array([np.copy(getattr(data, name)) for data in self._data])
         return self._bound[name]
 
+    def expand(self, name: str) -> NDArray[Any]:
+        """Return a field of the model, with a value for each simulation, shape (nsim, …). Writing to it has effect."""
+        if name not in self._expanded:
+            if self._models[0] is self._model:
+                self._models = [copy.copy(self._model) for _ in self._models]
+            self._expanded[name] = np.array([np.copy(field_of(model, name)) for model in self._models])
+        return self._expanded[name]
+
+    def set_const(self, ids: Indices) -> None:
+        """Compute the constants that follow from fields of the model, for some simulations."""
+        for i in map(int, ids):
+            model = self._varied(i)
+            mujoco.mj_setConst(model, mujoco.MjData(model))
+
     def reset(self, ids: Indices, keyframe: int = -1) -> None:
         """Reset some simulations to the model's defaults or a keyframe, and compute what follows from that."""
 
-        def reset(data: mujoco.MjData) -> None:
+        def reset(model: mujoco.MjModel, data: mujoco.MjData) -> None:
             if keyframe < 0:
-                mujoco.mj_resetData(self._model, data)
+                mujoco.mj_resetData(model, data)
             else:
-                mujoco.mj_resetDataKeyframe(self._model, data, keyframe)
-            mujoco.mj_forward(self._model, data)
+                mujoco.mj_resetDataKeyframe(model, data, keyframe)
+            mujoco.mj_forward(model, data)
 
         self._run(ids, reset, write=False)
 
     def forward(self, ids: Indices) -> None:
         """Compute what follows from the state of some simulations."""
-        self._run(ids, lambda data: mujoco.mj_forward(self._model, data))
+        self._run(ids, mujoco.mj_forward)
 
     def step(self, ids: Indices, nstep: int = 1) -> None:
         """Advance some simulations."""
-        self._run(ids, lambda data: mujoco.mj_step(self._model, data, nstep))
+        self._run(ids, lambda model, data: mujoco.mj_step(model, data, nstep))
 
-    def _run(self, ids: Indices, act: Callable[[mujoco.MjData], object], *, write: bool = True) -> None:
+    def _varied(self, i: int) -> mujoco.MjModel:
+        """Return the model of a simulation, brought up to the expanded fields."""
+        model = self._models[i]
+        for name, values in self._expanded.items():
+            field_of(model, name)[...] = values[i]
+        return model
+
+    def _run(self, ids: Indices, act: Callable[[mujoco.MjModel, mujoco.MjData], object], *, write: bool = True) -> None:
         def some(part: Indices) -> None:
             for i in map(int, part):
                 data = self._data[i]
                 if write:
                     for name in _STATE:
                         getattr(data, name)[:] = self._bound[name][i]
-                act(data)
+                act(self._varied(i), data)
                 for name, values in self._bound.items():
                     values[i] = getattr(data, name)
 

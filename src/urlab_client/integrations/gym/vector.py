@@ -17,14 +17,16 @@ from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 from numpy.typing import NDArray
 
 from urlab_client.aio.client import URLabClient
-from urlab_client.aio.launch import SCHEME, with_model_options, with_start_timeout
+from urlab_client.aio.launch import SCHEME, with_model_options, with_option, with_start_timeout
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn
 from urlab_client.integrations.gym.episode import EnvEpisode, client_defaults, first_camera
 from urlab_client.integrations.gym.spaces import Observation, SpaceMode
 from urlab_client.integrations.gym.starts import ResetNoise
 from urlab_client.integrations.gym.task import EpisodeSettings, States, Task, check_alone, joined
 from urlab_client.integrations.gym.vectorized import Found, Indices, Vectorized, check_render_mode
+from urlab_client.protocol.base import Floats
 from urlab_client.protocol.errors import URLabError
+from urlab_client.randomise.declaration import Randomisation
 from urlab_client.sync._portal import Portal
 
 __all__ = ["URLabVectorEnv"]
@@ -65,7 +67,9 @@ class _Session:
         self._rendered = rendered
         self._opening: asyncio.Task[None] | None = None
 
-    async def reset(self, rng: np.random.Generator, keyframe: str | None, timeout: float) -> Observation:
+    async def reset(
+        self, rng: np.random.Generator, keyframe: str | None, seed: int | None, timeout: float
+    ) -> Observation:
         """Start an episode. Where there is no session, one is started, which goes on when the deadline has passed."""
         async with asyncio.timeout(timeout):
             if self.episode is None:
@@ -73,14 +77,14 @@ class _Session:
                 await asyncio.shield(opening)
             if self.episode is None:
                 raise URLabError("The environment was closed.")
-            return await self.episode.reset(rng, keyframe)
+            return await self.episode.reset(rng, keyframe, seed)
 
-    async def step(self, action: Any, timeout: float) -> Observation:
+    async def step(self, action: Any, forces: Mapping[str, Floats], timeout: float) -> Observation:
         """Act."""
         if self.episode is None:
             raise URLabError("The environment failed before.", hint="Reset it, which starts it afresh.")
         async with asyncio.timeout(timeout):
-            return await self.episode.step(action)
+            return await self.episode.step(action, forces)
 
     def reopen(self) -> asyncio.Task[None]:
         """Give up what there is, and begin to start a session in its place; whoever resets waits for that."""
@@ -155,6 +159,7 @@ class URLabVectorEnv(Vectorized):
         render_mode: Literal["rgb_array"] | None = None,
         render_camera: str | None = None,
         task: Task | None = None,
+        randomise: Randomisation | str | os.PathLike[str] | None = None,
         autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
         step_timeout: float = 10.0,
         start_timeout: float = 60.0,
@@ -178,6 +183,7 @@ class URLabVectorEnv(Vectorized):
             render_mode: None or `rgb_array`, with which every step draws a picture of each environment.
             render_camera: Camera that `render` shows; the first one of the scene by default.
             task: See `URLabEnv`. One object serves all environments.
+            randomise: See `URLabEnv`.
             autoreset_mode: `NEXT_STEP`, `SAME_STEP` or `DISABLED`.
             step_timeout: Seconds an environment may take for a step or reset.
             start_timeout: Seconds a server may take to start, each counted from its own start.
@@ -208,11 +214,16 @@ class URLabVectorEnv(Vectorized):
             keyframe=keyframe,
             reset_noise=reset_noise,
         )
+        declared = None if randomise is None else Randomisation.of(randomise)
+        if declared is not None:
+            text = declared.to_json()
+            addresses = [with_option(a, "randomise", text) if a.startswith(SCHEME) else a for a in addresses]
         episode_options = {
             "space_mode": space_mode,
             "settings": settings,
             "cameras": tuple(cameras),
             "task": task,
+            "randomise": declared,
         }
         self._step_timeout = step_timeout
         self._addresses = tuple(addresses)
@@ -238,6 +249,7 @@ class URLabVectorEnv(Vectorized):
             max_episode_steps=settings.max_episode_steps,
             autoreset_mode=autoreset_mode,
             task=task,
+            randomise=first.randomise,
         )
         self.render_mode = render_mode
         self._seen: dict[int, States] = {}
@@ -285,16 +297,31 @@ class URLabVectorEnv(Vectorized):
 
     def _reset_some(self, indices: Indices, keyframe: str | None) -> Found:
         timeout = self._step_timeout
-        calls = {i: partial(self._sessions[i].reset, self._rngs[i], keyframe, timeout) for i in map(int, indices)}
+        calls = {
+            i: partial(self._sessions[i].reset, self._rngs[i], keyframe, self._episode_seed(i), timeout)
+            for i in map(int, indices)
+        }
         return self._found(self._portal.call(self._all, calls))
 
     def _reset_and_step(self, fresh: Indices, acting: Indices, actions: Any) -> tuple[Found, Found]:
         each = list(iterate(self.action_space, actions))
         timeout, sessions = self._step_timeout, self._sessions
-        resets = {i: partial(sessions[i].reset, self._rngs[i], self._keyframe, timeout) for i in map(int, fresh)}
-        steps = {i: partial(sessions[i].step, each[i], timeout) for i in map(int, acting)}
+        resets = {
+            i: partial(sessions[i].reset, self._rngs[i], self._keyframe, self._episode_seed(i), timeout)
+            for i in map(int, fresh)
+        }
+        forces = self._forces(acting)
+        steps = {i: partial(sessions[i].step, each[i], forces.get(i, {}), timeout) for i in map(int, acting)}
         results = self._portal.call(self._all, {**resets, **steps})
         return self._found({i: results[i] for i in resets}), self._found({i: results[i] for i in steps})
+
+    def draws(self, index: int) -> dict[str, Any] | None:
+        """Return what was drawn for the episode of an environment; see `URLabEnv.draws`."""
+        episode = self._sessions[index].episode
+        return None if episode is None else episode.draws()
+
+    def _episode_seed(self, index: int) -> int | None:
+        return self._disturbances[index].seed if self._disturbances else None
 
     def _states(self) -> States:
         for i, session in enumerate(self._sessions):

@@ -12,9 +12,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, create_empty_array
 from numpy.typing import NDArray
 
+from urlab_client.integrations.gym.disturbances import Disturbances
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn, keyframe_option
 from urlab_client.integrations.gym.spaces import Observation, Space, SpaceMapping
 from urlab_client.integrations.gym.task import States, Task
+from urlab_client.randomise.declaration import Randomisation
 
 __all__ = ["Bools", "Floats", "Found", "Indices", "Vectorized", "check_render_mode"]
 
@@ -37,6 +39,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
     Attributes:
         mapping: The articulations as spaces.
         task: The task, or None.
+        randomise: What varies from episode to episode, or None.
         reward_fn: The reward function, or None for rewards of 0.
         termination_fn: The termination function, or None for episodes that never end by themselves.
         autoreset_mode: What happens to environments whose episode ended.
@@ -60,8 +63,14 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         max_episode_steps: int | None,
         autoreset_mode: AutoresetMode,
         task: Task | None,
+        randomise: Randomisation | None,
     ) -> None:
         self.mapping = mapping
+        self.randomise = randomise
+        n_task = 0 if task is None else task.n_observed
+        self._disturbances: list[Disturbances] = []
+        if randomise is not None:
+            self._disturbances = [Disturbances(randomise, mapping, n_task) for _ in range(num_envs)]
         self.task = task
         self.num_envs = num_envs
         self.autoreset_mode = AutoresetMode(autoreset_mode)
@@ -74,6 +83,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         self.termination_fn = termination_fn
         self._max_episode_steps = max_episode_steps
         self._observations: Observation = create_empty_array(observation_space, num_envs)
+        self._sensed: Observation = create_empty_array(observation_space, num_envs) if self._disturbances else None
         self._elapsed = np.zeros(num_envs, dtype=np.int64)
         self._ended = np.ones(num_envs, dtype=bool)
         self._started = False
@@ -125,7 +135,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
                 self._rngs[i] = np.random.default_rng(seeds[i])
         errors = self._start(np.flatnonzero(mask))
         self._started = True
-        return self._copied(), self._infos(errors)
+        return self._told(), self._infos(errors)
 
     def step(self, actions: Any) -> tuple[Observation, Floats, Bools, Bools, dict[str, Any]]:
         """Act in all environments.
@@ -143,11 +153,13 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         fresh = np.flatnonzero(self._ended) if next_step else np.zeros(0, dtype=np.intp)
         acting = np.setdiff1d(np.arange(self.num_envs), fresh)
         before = self._copied()
-        started, moved = self._reset_and_step(fresh, acting, actions)
+        self._begin(fresh)
+        started, moved = self._reset_and_step(fresh, acting, self._delayed(acting, actions))
         if len(fresh):
             self._took(fresh, started)
         if len(acting):
             _put(self._observations, acting, moved[0])
+            self._see(acting)
         errors = {**started[1], **moved[1]}
         self._elapsed[acting] += 1
         infos = self._infos(errors)
@@ -166,9 +178,21 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
                 self.task.ended(bool(successes[i]), int(self._elapsed[i]))
         if self.autoreset_mode is AutoresetMode.SAME_STEP and self._ended.any():
             infos = self._same_step_reset(infos)
-        return self._copied(), rewards, terminated, truncated, infos
+        return self._told(), rewards, terminated, truncated, infos
+
+    @property
+    def max_episode_steps(self) -> int | None:
+        """Actions after which an episode is truncated, or None."""
+        return self._max_episode_steps
+
+    def episode_seeds(self) -> NDArray[np.int64]:
+        """Return the seed of each environment's episode, which decides what varies; -1 where nothing does."""
+        found = np.full(self.num_envs, -1, dtype=np.int64)
+        found[: len(self._disturbances)] = [disturbances.seed for disturbances in self._disturbances]
+        return found
 
     def _start(self, indices: Indices) -> Mapping[int, Exception]:
+        self._begin(indices)
         found = self._reset_some(indices, self._keyframe)
         self._took(indices, found)
         return found[1]
@@ -176,6 +200,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
     def _took(self, indices: Indices, found: Found) -> None:
         observations, errors = found
         _put(self._observations, indices, observations)
+        self._see(indices)
         self._elapsed[indices] = 0
         self._ended[indices] = False
         self._ended[list(errors)] = True
@@ -201,7 +226,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         ended = self._ended.copy()
         final = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(ended):
-            final[i] = _pick(self._observations, int(i))
+            final[i] = _pick(self._sensed if self._disturbances else self._observations, int(i))
         errors = self._start(np.flatnonzero(ended))
         after = self._infos({**_errors_in(infos), **errors})
         return {**after, "final_obs": final, "_final_obs": ended, "final_info": infos, "_final_info": ended}
@@ -209,7 +234,10 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
     def _infos(self, errors: Mapping[int, Exception]) -> dict[str, Any]:
         everywhere = np.ones(self.num_envs, dtype=bool)
         infos: dict[str, Any] = {}
-        for name, values in self._clocks().items():
+        clocks = self._clocks()
+        if self._disturbances:
+            clocks["episode_seed"] = self.episode_seeds()
+        for name, values in clocks.items():
             infos[name], infos[f"_{name}"] = values, everywhere.copy()
         if errors:
             infos["error"] = np.full(self.num_envs, None, dtype=object)
@@ -219,7 +247,38 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         return infos
 
     def _copied(self) -> Observation:
+        """Return the observations as they are, which rewards and ends are judged by."""
         return _map(np.copy, self._observations)
+
+    def _told(self) -> Observation:
+        """Return the observations as they are seen."""
+        return _map(np.copy, self._sensed if self._disturbances else self._observations)
+
+    def _begin(self, indices: Indices) -> None:
+        for i, disturbances in self._disturbed(indices):
+            disturbances.begin(self._rngs[i])
+
+    def _see(self, indices: Indices) -> None:
+        for i, disturbances in self._disturbed(indices):
+            _put(self._sensed, i, disturbances.seen(_pick(self._observations, i)))
+
+    def _delayed(self, indices: Indices, actions: Any) -> Any:
+        """Return the actions that have effect now; those of other environments are left as they are."""
+        if not self._disturbances:
+            return actions
+        delayed = _map(np.array, actions)
+        for i, disturbances in self._disturbed(indices):
+            _put(delayed, i, disturbances.delayed(_pick(delayed, i)))
+        return delayed
+
+    def _forces(self, indices: Indices) -> dict[int, dict[str, Floats]]:
+        """Return the pushes during the next action by environment; those without one are left out."""
+        pushed = {i: disturbances.forces() for i, disturbances in self._disturbed(indices)}
+        return {i: forces for i, forces in pushed.items() if forces}
+
+    def _disturbed(self, indices: Indices) -> list[tuple[int, Disturbances]]:
+        """Return what disturbs some environments."""
+        return [(i, self._disturbances[i]) for i in indices.tolist()] if self._disturbances else []
 
 
 def check_render_mode(render_mode: str | None) -> None:
@@ -243,7 +302,7 @@ def _map(function: Any, observations: Observation) -> Observation:
     return function(observations)
 
 
-def _put(observations: Observation, indices: Indices, found: Observation) -> None:
+def _put(observations: Observation, indices: Indices | int, found: Observation) -> None:
     if isinstance(observations, dict):
         entries = cast("dict[str, Observation]", observations)
         for key, entry in entries.items():

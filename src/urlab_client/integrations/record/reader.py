@@ -23,6 +23,7 @@ from urlab_client.integrations._feed.messages import (
     ArticulationMessage,
     CompressedImage,
     EntityMessage,
+    EpisodeMessage,
     GapMessage,
     RawImage,
     schema_name,
@@ -33,10 +34,11 @@ from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.pixels import Pixels
 
-__all__ = ["Camera", "Column", "Run", "Summary", "Table", "Topic", "read_run"]
+__all__ = ["Camera", "Column", "Run", "Summary", "Table", "Topic", "describe_topic", "read_run"]
 
 _NS = 1e9
 _GAP_FACTOR = 3.0
+_UNKNOWN = "neither an MCAP file nor a recording of the server."
 _Number = float | Literal["NaN", "Infinity", "-Infinity"]
 
 
@@ -67,6 +69,7 @@ class _Entity(msgspec.Struct):
 
 _state = msgspec.json.Decoder(_State).decode
 _entity = msgspec.json.Decoder(_Entity).decode
+_episode = msgspec.json.Decoder(EpisodeMessage).decode
 _gap = msgspec.json.Decoder(GapMessage).decode
 _compressed = msgspec.json.Decoder(CompressedImage).decode
 _raw = msgspec.json.Decoder(RawImage).decode
@@ -109,6 +112,7 @@ class Summary:
         dropped_states: States that could not be written fast enough.
         dropped_frames: Likewise pictures.
         topics: By name.
+        varied: What the server varied, by episode.
     """
 
     path: Path
@@ -121,6 +125,7 @@ class Summary:
     dropped_states: int
     dropped_frames: int
     topics: dict[str, Topic]
+    varied: tuple[EpisodeMessage, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,6 +248,7 @@ class Run:
         schemas: dict[str, str] = {}
         about: dict[str, str] = {}
         walls: list[int] = []
+        varied: list[EpisodeMessage] = []
         dropped = [0, 0]
         episode = -1
         complete = False
@@ -254,6 +260,8 @@ class Run:
                 if entry.schema == schema_name(GapMessage):
                     gap = _gap(record.data)
                     dropped = [dropped[0] + gap.states, dropped[1] + gap.frames]
+                elif entry.schema == schema_name(EpisodeMessage):
+                    varied.append(_episode(record.data))
                 elif entry.schema == schema_name(ArticulationMessage):
                     episode = _state(record.data).episode
             elif isinstance(record, Metadata) and record.name == "urlab":
@@ -271,7 +279,8 @@ class Run:
             episodes=episode + 1,
             dropped_states=dropped[0],
             dropped_frames=dropped[1],
-            topics={name: _topic(name, schemas[name], times[name]) for name in sorted(times)},
+            topics={name: describe_topic(name, schemas[name], times[name]) for name in sorted(times)},
+            varied=tuple(varied),
         )
 
     def table(self, progress: Callable[[int], None] | None = None) -> Table:
@@ -402,12 +411,16 @@ class Run:
                     record = next(records, None)
                 except InvalidMagic as error:
                     if not entries and not schemas and file.tell() <= 8:
-                        raise RecordingError(f"{self.path}: no MCAP file.") from error
+                        raise RecordingError(
+                            f"{self.path}: neither an MCAP file nor a recording of the server."
+                        ) from error
                     self.damage = "the end of the file is missing"
                     return
                 except (McapError, ZstdError, struct.error, ValueError, OverflowError) as error:
                     if file.tell() < 8:
-                        raise RecordingError(f"{self.path}: no MCAP file.") from error
+                        raise RecordingError(
+                            f"{self.path}: neither an MCAP file nor a recording of the server."
+                        ) from error
                     self.damage = f"{type(error).__name__}: {error}" if str(error) else "the end of the file is missing"
                     return
                 if record is None:
@@ -424,13 +437,18 @@ class Run:
 
 
 def read_run(path: str | os.PathLike[str]) -> Run:
-    """Open a recording, finished or not.
+    """Open a recording, finished or not: an MCAP file, or the JSON file of joint states that a server saves.
 
     Raises:
         OSError: The file cannot be read.
-        RecordingError: It is not an MCAP file.
+        RecordingError: It is neither.
     """
-    run = Run(Path(path))
+    from urlab_client.integrations.record.joint_states import JointStatesRun, is_joint_states  # noqa: PLC0415
+
+    file = Path(path)
+    if is_joint_states(file):
+        return JointStatesRun(file)
+    run = Run(file)
     for _ in run._records(None):  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
         break
     return run
@@ -447,7 +465,8 @@ def _drop_half_a_sample(rows: dict[int, tuple[float, float, int, int, int]], bui
                 builder.drop_last()
 
 
-def _topic(name: str, schema: str, times: list[int]) -> Topic:
+def describe_topic(name: str, schema: str, times: list[int]) -> Topic:
+    """Describe a topic by the times of its messages, nanoseconds."""
     distances = np.diff(np.sort(np.array(times, dtype=np.int64)))
     distances = distances[distances > 0]
     if not len(distances):

@@ -17,6 +17,7 @@ from urlab_client.integrations._feed.blocking import BlockingTwin
 from urlab_client.integrations._feed.follower import Follower
 from urlab_client.integrations.record.writer import RecorderStats, WriterOptions, WriterThread
 from urlab_client.protocol.errors import URLabError
+from urlab_client.randomise.variation import declared_in
 from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.client import URLabClient
 
@@ -236,6 +237,7 @@ def record(
                 "step_mode": str(core.step_mode),
                 "urlab_version": core.urlab_version,
                 "mujoco_version": core.mujoco_version,
+                **_varied(core),
                 "timestep": "" if core.model is None else repr(float(core.model.opt.timestep)),
             },
         )
@@ -244,6 +246,12 @@ def record(
     if isinstance(client, URLabClient):
         return Recorder(recorder, portal_of(client))
     return recorder
+
+
+def _varied(client: AsyncClient) -> dict[str, str]:
+    """Return what the server of a client varies, as an entry of a recording's metadata."""
+    declared = None if client.model is None else declared_in(client.model)
+    return {} if declared is None else {"randomise": declared.to_json()}
 
 
 def _check(*, camera_hz: float, pose_hz: float, jpeg_quality: int, buffer_mib: float) -> None:

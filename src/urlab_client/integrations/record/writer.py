@@ -23,10 +23,12 @@ from urlab_client.integrations._feed.messages import (
     ArticulationMessage,
     ContactsMessage,
     EntityMessage,
+    EpisodeMessage,
     FrameTransforms,
     GapMessage,
     JointStates,
     Time,
+    VariedQuantity,
     encode,
     schema_name,
     schema_of,
@@ -302,6 +304,7 @@ class _Sink:
     _simulation: Simulation | None = None
     _reported: tuple[int, int] = (0, 0)
     _dirty_since: float | None = None
+    _varied: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         self._poses = Schedule(self.options.pose_ns)
@@ -344,6 +347,7 @@ class _Sink:
             self._use(item.scene)
         now = self._clock.advance(item.nanoseconds, item.restarts)
         stamp, wall, clock = Time.of(now), Time.of(item.wall_ns), self._clock
+        self._write_episode(item, now)
         for key, state in reply.per_articulation.items():
             names = item.scene.names.get(key)
             message = ArticulationMessage(
@@ -380,6 +384,18 @@ class _Sink:
         if self._simulation is not None and (self._poses.due(now) or item.restarts):
             self._simulation.take(reply.per_articulation, entities, forces=self.options.contacts)
             self._write_derived(self._simulation, now, item.wall_ns)
+
+    def _write_episode(self, item: State, now: int) -> None:
+        """Write what varies in an episode, once: an environment may reset several times at its start."""
+        variation, seed, episode = item.scene.variation, item.seed, self._clock.episode
+        if variation is None or seed is None or self._varied == (episode, seed):
+            return
+        self._varied = (episode, seed)
+        varied = [
+            VariedQuantity(vary.what, vary.by, dict(zip(elements.names, drawn.tolist(), strict=True)))
+            for vary, elements, drawn in variation.draw(seed).varied
+        ]
+        self._add("/recording/episodes", EpisodeMessage(Time.of(now), episode, seed, varied), now, item.wall_ns, {})
 
     def _write_derived(self, simulation: Simulation, now: int, wall_ns: int) -> None:
         stamp = Time.of(now)

@@ -104,7 +104,7 @@ class SetControlSource(ControlRequest[SetControlSourceOk], tag="set_control_sour
     """Choose whose set-points drive the actuators: those of this protocol or those of the editor's panel."""
 
     source: Annotated[str, doc("`zmq` or `ui`.")]
-    articulation: Annotated[str | None, doc("Articulation key; None for all.")] = None
+    articulation: Annotated[str | None, doc("Articulation key, actor id or engine's object name; None for all.")] = None
 
 
 class SetTwistOk(Reply, tag="set_twist_ok", kw_only=True):
@@ -118,7 +118,7 @@ class SetTwistOk(Reply, tag="set_twist_ok", kw_only=True):
 class SetTwist(ControlRequest[SetTwistOk], tag="set_twist", kw_only=True, omit_defaults=True):
     """Store a commanded base velocity for policies to read; it does not drive the simulation."""
 
-    articulation: Annotated[str, doc("Articulation key.")]
+    articulation: Annotated[str, doc("Articulation key, actor id or engine's object name.")]
     linear: Annotated[Vec3, doc("(vx, vy, ignored), m/s, base frame.")] = (0.0, 0.0, 0.0)
     angular: Annotated[Vec3, doc("(ignored, ignored, yaw rate), rad/s, base frame.")] = (0.0, 0.0, 0.0)
 
@@ -156,7 +156,7 @@ class SetMocapPoseOk(MocapReply, tag="set_mocap_pose_ok", kw_only=True):
 class SetMocapPose(ControlRequest[SetMocapPoseOk], tag="set_mocap_pose", kw_only=True, omit_defaults=True):
     """Place a mocap body; body poses follow at the next step or `forward()`."""
 
-    body: Annotated[str, doc("Compiled body name, prefix included.")]
+    body: Annotated[str, doc("Compiled name, or with the articulation's key, actor id or nothing in front.")]
     pos: Annotated[Vec3 | None, doc("Position, metres, world frame; None keeps it.")] = None
     quat: Annotated[QuatWXYZ | None, doc("Unit quaternion (w, x, y, z), world frame; None keeps it.")] = None
 
@@ -168,7 +168,7 @@ class ReadMocapPoseOk(MocapReply, tag="read_mocap_pose_ok", kw_only=True):
 class ReadMocapPose(Request[ReadMocapPoseOk], tag="read_mocap_pose", kw_only=True):
     """Read the pose of a mocap body."""
 
-    body: Annotated[str, doc("Compiled body name, prefix included.")]
+    body: Annotated[str, doc("Compiled name, or with the articulation's key, actor id or nothing in front.")]
 
 
 class GetContactsOk(Reply, tag="get_contacts_ok", kw_only=True):

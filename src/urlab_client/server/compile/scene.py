@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final
 
 import mujoco
@@ -30,7 +31,7 @@ from urlab_client.server.compile.scene_index import ArticulationIndex, EntityInd
 from urlab_client.server.compile.static_meshes import unique_name
 from urlab_client.server.limits import Limits
 
-__all__ = ["CompiledScene", "compile_scene"]
+__all__ = ["CompiledScene", "compile_scene", "saved_model"]
 
 logger = logging.getLogger("urlab_client.server")
 
@@ -61,9 +62,7 @@ class CompiledScene:
 
     def mjb(self) -> bytes:
         """Return the live model in MuJoCo's binary format. The caller holds whatever guards the model."""
-        buffer = np.empty(mujoco.mj_sizeModel(self.model), dtype=np.uint8)
-        mujoco.mj_saveModel(self.model, None, buffer)
-        return buffer.tobytes()
+        return saved_model(self.model)
 
     def export(self, *, attached: bool = False) -> tuple[str, dict[str, bytes]]:
         """Return the scene as MJCF, and the content of every file it names; `file` attributes are bare names.
@@ -94,11 +93,19 @@ class CompiledScene:
         )
 
 
+def saved_model(model: mujoco.MjModel) -> bytes:
+    """Return a model in MuJoCo's binary format."""
+    buffer = np.empty(mujoco.mj_sizeModel(model), dtype=np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer.tobytes()
+
+
 def compile_scene(
     actors: Sequence[Actor],
     *,
     options: OptionPolicy = "ignored",
     camera_size: tuple[int, int] | None = None,
+    texts: Mapping[str, str] = MappingProxyType({}),
     limits: Limits = _DEFAULT_LIMITS,
 ) -> CompiledScene:
     """Compile the actors of a level into one model.
@@ -113,6 +120,7 @@ def compile_scene(
         actors: In spawn order.
         options: Which `<option>` the scene has, integrator included.
         camera_size: Width and height of cameras whose MJCF gives no resolution.
+        texts: Custom texts of the model, by name.
         limits: Memory and sensors of the scene, and the ranges of its options; checked before it is simulated.
 
     Returns:
@@ -126,6 +134,9 @@ def compile_scene(
     warnings: list[str] = []
     try:
         spec, entities = compose(actors, articulations, warnings, options)
+        for name, content in texts.items():
+            text = spec.add_text()
+            text.name, text.data = name, content
         _refuse(options_problem(spec.option, limits))
         model = spec.compile()
         memory = sum(max(blueprint.spec.memory, 0) for _, blueprint in articulations)

@@ -7,6 +7,7 @@ from __future__ import annotations
 import base64
 import logging
 from pathlib import Path
+from typing import Final
 
 import msgspec
 import mujoco
@@ -41,10 +42,13 @@ from urlab_client.server.physics.controllers import ArticulationControl, float32
 from urlab_client.server.physics.observe import sim_clock, wall_clock
 from urlab_client.server.physics.play import Running
 from urlab_client.server.refusal import Refusal
-from urlab_client.server.render.camera_renderer import Film
+from urlab_client.server.render.camera_renderer import FRAMES_DEADLINE_S, Film
 from urlab_client.server.rpc.dispatch import handles
 
 logger = logging.getLogger("urlab_client.server")
+
+_PICTURES_WAIT_S: Final = 0.2
+"""How long a step waits for its pictures where it does not say."""
 
 
 @handles(Hello)
@@ -82,7 +86,7 @@ def handshake(server: ServerCore, session_id: str, *, include_assets: bool = Fal
         return reply
     scene, engine = running.scene, running.engine
     with engine.lock.look():
-        reply.mjb = scene.mjb()
+        reply.mjb = running.mjb()
         reply.articulations = [
             _articulation(server, name, control) for name, control in engine.articulations.controls.items()
         ]
@@ -192,6 +196,7 @@ def step(server: ServerCore, request: Step) -> StepOk | bytes:
         level = server.session.level
     forms = server.dialect.camera_forms
     fresh = forms and (request.wait_cameras or request.render == "sync")
+    wait_s = _pictures_wait_s(request) if fresh else FRAMES_DEADLINE_S
     shots = running.cameras.shots(request.include_cameras, fresh=fresh)
 
     if not shots:
@@ -209,8 +214,13 @@ def step(server: ServerCore, request: Step) -> StepOk | bytes:
 
     reply, film = running.engine.step(request, observe)
     if film is not None:
-        reply.cameras = running.cameras.frames(shots, film)
+        reply.cameras = running.cameras.frames(shots, film, wait_s)
     return reply
+
+
+def _pictures_wait_s(request: Step) -> float:
+    wait_s = _PICTURES_WAIT_S if request.camera_timeout_ms is None else request.camera_timeout_ms / 1e3
+    return min(wait_s, FRAMES_DEADLINE_S) if wait_s > 0 else 0.0  # not a number is no wait, either
 
 
 def _check_owners(server: ServerCore, running: Running, request: Step) -> None:

@@ -52,5 +52,5 @@ def upload_model_commit(server: ServerCore, request: UploadModelCommit) -> Uploa
             model = running.scene.model
             reply.nq, reply.nv, reply.nu = model.nq, model.nv, model.nu
             reply.nbody, reply.ngeom = model.nbody, model.ngeom
-            reply.mjb = running.scene.mjb()
+            reply.mjb = running.mjb()
     return reply

@@ -145,6 +145,24 @@ class Articulations:
                 raw.add(control)
         return raw
 
+    def write_raw(self, commands: Mapping[str, ArticulationCommand]) -> Mapping[str, ArticulationCommand]:
+        """Write the controls of `raw` commands past controllers and set-points; return the other commands.
+
+        What a live loop makes of set-points and controllers takes their place at its next iteration.
+        """
+        others = dict(commands)
+        for key, command in commands.items():
+            control = self.find(key)
+            if control is None or command.control_mode is None or command.control_mode.casefold() != "raw":
+                continue
+            del others[key]
+            staged = control.set_points.network.copy()
+            self.stage_positional({key: command})
+            control.set_points.stage_named(command.ctrl_map or {})
+            control.apply(self._qpos, self._qvel, self._ctrl, raw=True)
+            control.set_points.network[:] = staged
+        return others
+
     def zero_set_points(self) -> None:
         """Set all set-points to 0, whatever their source."""
         for control in self.controls.values():

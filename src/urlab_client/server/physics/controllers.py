@@ -202,6 +202,7 @@ class _Binding:
     """Actuators of an articulation that drive a hinge or slide joint, in actuator order."""
 
     names: tuple[str, ...]
+    ids: NDArray[np.intp]
     places: NDArray[np.intp]  # into the articulation's controls
     ctrl_adr: NDArray[np.intp]
     qpos_adr: NDArray[np.intp]
@@ -225,6 +226,7 @@ def _bind(model: mujoco.MjModel, articulation: Actuated) -> _Binding:
     scalar_joints = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
     joint_transmissions = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
     names: list[str] = []
+    ids: list[int] = []
     places: list[int] = []
     joints: list[int] = []
     starts = _first_controls(model, articulation)
@@ -235,6 +237,7 @@ def _bind(model: mujoco.MjModel, articulation: Actuated) -> _Binding:
         joint = int(model.actuator_trnid[actuator, 0])
         if int(model.jnt_type[joint]) in scalar_joints:
             names.append(name)
+            ids.append(int(actuator))
             places.append(place)
             joints.append(joint)
     where = np.array(places, dtype=np.intp)
@@ -243,6 +246,7 @@ def _bind(model: mujoco.MjModel, articulation: Actuated) -> _Binding:
     ranges = _float32_array(model.jnt_range[which])
     return _Binding(
         names=tuple(names),
+        ids=np.array(ids, dtype=np.intp),
         places=where,
         ctrl_adr=articulation.ctrl_adr[where].astype(np.intp),
         qpos_adr=model.jnt_qposadr[which].astype(np.intp),
@@ -275,6 +279,11 @@ class Controller(ABC):
     def bound(self) -> tuple[str, ...]:
         """Short names of the bound actuators, in actuator order."""
         return self._binding.names
+
+    @property
+    def bound_actuators(self) -> NDArray[np.intp]:
+        """Ids of the bound actuators, in that order."""
+        return self._binding.ids
 
     @property
     def active(self) -> bool:
@@ -324,7 +333,12 @@ class PDController(Controller):
 
     The target is the set-point, clamped to the joint's range where the joint is limited. `default_*` are what the gains
     were filled from; changing a default later changes no actuator.
+
+    Attributes:
+        factors: By what gains are multiplied besides, by name, shape (…, n bound), with the leading axes of `write`.
     """
+
+    factors: Mapping[str, Float32s]
 
     kind = "pd"
 
@@ -334,6 +348,7 @@ class PDController(Controller):
         count = len(self.bound)
         self._gains = {name: np.full(count, self._defaults[name], dtype=np.float32) for name in _GAINS}
         self._rows = {name: row for row, name in enumerate(self.bound)}
+        self.factors = {}
 
     def write(self, set_points: Float32s | Float64s, qpos: Float64s, qvel: Float64s, ctrl: Float64s) -> None:
         """Write the bound actuators' torques or forces."""
@@ -343,12 +358,16 @@ class PDController(Controller):
             np.minimum(target, binding.upper, out=target)
             np.maximum(target, binding.lower, out=target)
             target -= qpos.take(binding.qpos_adr, axis=-1).astype(np.float32)
-            target *= gains["kp"]
-            target -= gains["kv"] * qvel.take(binding.qvel_adr, axis=-1).astype(np.float32)
+            target *= self._in_force("kp")
+            target -= self._in_force("kv") * qvel.take(binding.qvel_adr, axis=-1).astype(np.float32)
             limit = gains["torque_limit"]
             np.minimum(target, limit, out=target)
             np.maximum(target, -limit, out=target)
         ctrl[..., binding.ctrl_adr] = target
+
+    def _in_force(self, name: str) -> Float32s:
+        factor = self.factors.get(name)
+        return self._gains[name] if factor is None else self._gains[name] * factor
 
     def configure(self, params: Mapping[str, object]) -> None:
         """Change gains and defaults and switch on; negative values are taken as they are."""

@@ -20,6 +20,7 @@ import mujoco
 from urlab_client.protocol.dialects import ALPHA, Dialect
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.messages.session import Step
+from urlab_client.randomise.declaration import Randomisation
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.physics.articulations import Articulations
 from urlab_client.server.physics.controllers import ControllerConfig
@@ -30,6 +31,7 @@ from urlab_client.server.physics.pacing import GIVE_WAY_S, IDLE_S, LivePacing
 from urlab_client.server.physics.physics_thread import PhysicsThread
 from urlab_client.server.physics.queued_step import QueuedStep
 from urlab_client.server.physics.replay import Player
+from urlab_client.server.physics.variation import SceneVariation
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.system.health import Health
 
@@ -66,6 +68,7 @@ class Engine:
         on_tick: Called under the lock after each live iteration (also while paused) and each direct request, and about
             ten times a second while a stepped mode idles. A hook of either list that raises is logged and removed.
         seed: The last `reset` seed, or None; MuJoCo has no use for it.
+        variation: What varies from reset to reset, if anything does.
     """
 
     def __init__(
@@ -78,6 +81,7 @@ class Engine:
         step_timeout_s: float = 5.0,
         health: Health | None = None,
         dialect: Dialect = ALPHA,
+        randomise: Randomisation | None = None,
     ) -> None:
         """Prepare a scene for stepping; `start` sets it going.
 
@@ -89,6 +93,7 @@ class Engine:
             step_timeout_s: Seconds a direct step may take before its caller is told `step_timeout`.
             health: Told when the physics thread dies.
             dialect: Decides what articulations are called, and what steps do besides.
+            randomise: What varies from reset to reset; a name that fits nothing is a ValueError.
         """
         self.scene = scene
         self.dialect = dialect
@@ -99,6 +104,7 @@ class Engine:
         self._model = scene.model
         self._data = scene.data
         self.articulations = Articulations(scene, controllers, dialect)
+        self.variation = None if randomise is None else SceneVariation(scene, randomise, self.articulations)
         self._thread = PhysicsThread(
             scene.model,
             self.lock,
@@ -107,7 +113,9 @@ class Engine:
             give_up=self._drop_queue,
             health=Health() if health is None else health,
         )
-        self._integrator = Integrator(scene, self.articulations, self._call, lambda: self._thread.stopping)
+        self._integrator = Integrator(
+            scene, self.articulations, self.variation, self._call, lambda: self._thread.stopping
+        )
         self.on_substep: list[Hook] = self._integrator.on_substep
         self._pacing = LivePacing(scene.model)
         self._pinned = None if pinned_mode is StepMode.AUTO else pinned_mode
@@ -219,7 +227,7 @@ class Engine:
     def step(self, request: Step, observe: Callable[[StepMode], T]) -> T:
         """Do what a `step` means in the active mode and return what `observe` makes of the state after it.
 
-        Live and auto: stage the positional `ctrl` and observe at once. Direct: stage, apply the wrenches and integrate
+        Live and auto: stage commands and observe at once. Direct: stage, apply the wrenches and integrate
         `n_steps` times without anything else coming between. Puppet: write the state and run `mj_forward`.
 
         Args:
@@ -250,10 +258,11 @@ class Engine:
                 raise Refusal("not_ready", self._fault)
             if mode is not StepMode.DIRECT:
                 commands = request.per_articulation or {}
-                self.articulations.stage_positional(commands)
                 if self.dialect.live_commands:
-                    self.articulations.stage_named(commands)
                     self._live_pushed += self.articulations.apply_wrenches(commands)
+                    commands = self.articulations.write_raw(commands)
+                    self.articulations.stage_named(commands)
+                self.articulations.stage_positional(commands)
                 self._kick()
                 return observe(mode)
             n_steps = max(1, request.n_steps)
@@ -287,7 +296,7 @@ class Engine:
 
         Args:
             keyframe_name: Compiled keyframe name; None or empty resets to `qpos0`.
-            seed: Remembered, also when the keyframe turns out to be unknown.
+            seed: Remembered, also when the keyframe turns out to be unknown; decides what varies, if anything does.
             per_articulation_qpos: First coordinate of a joint (m or rad) by articulation key and joint name, with or
                 without prefix; unknown keys and joints are ignored.
 
@@ -304,7 +313,7 @@ class Engine:
                     raise Refusal("unknown_keyframe", keyframe_name)
             self._tick_if_due()
             try:
-                self._integrator.reset(key)
+                self._integrator.reset(key, seed)
                 self.articulations.override_joints(per_articulation_qpos or {})
                 self._integrator.forward()
             except Exception as error:

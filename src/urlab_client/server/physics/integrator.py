@@ -15,6 +15,7 @@ from urlab_client.server.physics.articulations import Articulations
 from urlab_client.server.physics.controllers import ArticulationControl
 from urlab_client.server.physics.data_lock import MujocoCall
 from urlab_client.server.physics.hooks import Hook, call_hooks
+from urlab_client.server.physics.variation import SceneVariation
 from urlab_client.server.refusal import Refusal
 
 __all__ = ["Integrator", "shutting_down"]
@@ -35,19 +36,26 @@ class Integrator:
     """
 
     def __init__(
-        self, scene: CompiledScene, articulations: Articulations, call: MujocoCall, stopping: Callable[[], bool]
+        self,
+        scene: CompiledScene,
+        articulations: Articulations,
+        variation: SceneVariation | None,
+        call: MujocoCall,
+        stopping: Callable[[], bool],
     ) -> None:
         """Prepare to step a scene's data in place.
 
         Args:
             scene: The scene.
             articulations: Their set-points and controllers make the controls.
+            variation: What varies from reset to reset.
             call: Entered while MuJoCo works.
             stopping: Whether a request under way is to be broken off.
         """
         self._model = scene.model
         self._data = scene.data
         self._articulations = articulations
+        self._variation = variation
         self._call = call
         self._stopping = stopping
         self.substep_s = math.inf
@@ -90,12 +98,17 @@ class Integrator:
             mujoco.mj_step(self._model, self._data)
             call_hooks(self.on_substep)
 
-    def reset(self, key: int) -> None:
-        """Reset the data to a keyframe; -1 stands for the reference."""
+    def reset(self, key: int, seed: int | None) -> None:
+        """Reset the data to a keyframe; -1 stands for the reference. The seed decides what varies."""
+        variation = self._variation
+        if variation is not None:
+            variation.begin(seed)
         if key < 0:
             mujoco.mj_resetData(self._model, self._data)
         else:
             mujoco.mj_resetDataKeyframe(self._model, self._data, key)
+        if variation is not None:
+            variation.start()
 
     def push(self, state: Step) -> None:
         """Write the state of a puppet step, but for arrays of a wrong length, and compute what follows."""

@@ -60,6 +60,11 @@ class Running:
     limits: Limits = _DEFAULT_LIMITS
     channels: UserChannels = field(default_factory=lambda: UserChannels({}))
 
+    def mjb(self) -> bytes:
+        """Return the model in MuJoCo's binary format, without what varies. The caller holds the engine's lock."""
+        variation = self.engine.variation
+        return self.scene.mjb() if variation is None else variation.mjb()
+
     @cached_property
     def claims(self) -> ControlClaims:
         """Who owns which robot."""
@@ -99,7 +104,10 @@ class Running:
         """End it within about `timeout` seconds; return False when something was still busy then."""
         deadline = time.monotonic() + timeout
         drawn = self.cameras.close(timeout / 2.0)
-        return self.engine.close(max(0.0, deadline - time.monotonic())) and drawn
+        ended = self.engine.close(max(0.0, deadline - time.monotonic()))
+        if ended and self.engine.variation is not None:
+            self.engine.variation.restore()  # for whoever plays the same scene again
+        return ended and drawn
 
 
 class _Attempt:

@@ -16,7 +16,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Final
+from typing import Any, Final
 
 import mujoco
 import numpy as np
@@ -41,6 +41,8 @@ __all__ = ["CameraRenderer", "Exposure", "Film", "Painting", "Shot"]
 logger = logging.getLogger("urlab_client.server")
 
 Bytes = NDArray[np.uint8]
+Look = Mapping[str, NDArray[Any]]
+"""Fields of a model that pictures depend on, by name."""
 
 LATEST_S: Final = 1.0 / 30.0
 """Age up to which a frame is the latest."""
@@ -54,6 +56,9 @@ _VISIBLE: Final = (
     | mujoco.mjtState.mjSTATE_MOCAP_QUAT.value
 )
 """The parts of a state that pictures depend on."""
+
+GIVEN_UP: Final = 8
+"""States that wait to be drawn though nobody waits for them any more; beyond, older frames have to do."""
 
 MAX_FAILED: Final = 3
 """After so many failures in a row drawing is given up until the next play session."""
@@ -81,6 +86,7 @@ class Shot:
         sync: Draw the state after the step, rather than hand over the latest frame.
         late: What delays the frame.
         least: Number of the first snapshot that is good enough.
+        older: Whether an older frame will do when the state is not drawn in time.
     """
 
     key: str
@@ -88,6 +94,7 @@ class Shot:
     sync: bool
     late: Latency | None = None
     least: float = 0.0
+    older: bool = False
 
 
 @dataclass(eq=False)
@@ -100,6 +107,7 @@ class Exposure:
         taken_at: When it was the state, monotonic seconds.
         frame_id: Number of its snapshot; None in dialects whose pictures do not tell.
         past: What gets the frame instead of the one camera, which saw this some time ago.
+        look: What the model looks like, where that varies.
         done: Set when the cameras have their frames, or never will.
     """
 
@@ -108,6 +116,7 @@ class Exposure:
     taken_at: float
     frame_id: int | None = None
     past: Past | None = None
+    look: Look | None = None
     done: threading.Event = field(default_factory=threading.Event)
 
 
@@ -136,7 +145,8 @@ class Film:
         if frame is None or (frame.frame_id or 0) < shot.least:
             return None
         asked = any(shot.camera in job.cameras for job in self.jobs if job.past is None)
-        return None if shot.sync and asked and shot.camera.drawn_at < self.taken_at else frame
+        in_time = not asked or shot.camera.drawn_at >= self.taken_at
+        return frame if in_time or shot.older or not shot.sync else None
 
     def capture_time(self, shot: Shot) -> float:
         """Return when the camera saw what the frame for a shot shows, Unix seconds."""
@@ -151,12 +161,14 @@ class Painting:
     Attributes:
         picture: What it shows.
         data: The state.
+        look: What the model looks like, where that varies.
         pixels: Red, green, blue and alpha from the top, shape (height, width, 4); None until it is drawn.
         done: Set when it is drawn, or never will be.
     """
 
     picture: ViewportPicture
     data: mujoco.MjData
+    look: Look | None = None
     pixels: Bytes | None = None
     done: threading.Event = field(default_factory=threading.Event)
 
@@ -173,6 +185,7 @@ class CameraRenderer:
         health: Health | None = None,
         *,
         names: Mapping[str, str] = MappingProxyType({}),
+        varied: Sequence[str] = (),
         dialect: Dialect = ALPHA,
     ) -> None:
         """Prepare for a scene; nothing is drawn, and no OpenGL looked for, before a frame is wanted.
@@ -184,6 +197,7 @@ class CameraRenderer:
             quality: How well to draw.
             health: Told when the thread that draws dies.
             names: What articulations are called in requests and replies, by key; that, for those not mentioned.
+            varied: Fields of the model that pictures depend on, and that change from reset to reset.
             dialect: Decides what cameras are called there.
         """
         self._scene = scene
@@ -199,14 +213,17 @@ class CameraRenderer:
                 robot = names.get(index.key, index.key)
                 self._by_name[f"{robot}/{dialect.camera_part(info.name)}"] = camera
                 self._bare[dialect.camera_key(robot, info.name)] = camera  # of several, the last
+        self._varied = tuple(varied)
         self._episode = 0
         self._model: mujoco.MjModel | None = None
         self._spare: list[mujoco.MjData] = []  # making one takes longer than copying a state
         self._queue: queue.SimpleQueue[Exposure | Painting | None] = queue.SimpleQueue()
         self._pending: set[Exposure | Painting] = set()
+        self._given_up: list[Exposure] = []
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
         self._drawing = False
+        self._ready = threading.Event()
         self._broken = False
         self._closed = False
 
@@ -224,7 +241,7 @@ class CameraRenderer:
         """
         if isinstance(include_cameras, bool):
             cameras = self._bare if include_cameras else {}
-            return [Shot(key, camera, sync=fresh, late=_late(camera)) for key, camera in cameras.items()]
+            return [Shot(key, camera, sync=fresh, late=_late(camera), older=fresh) for key, camera in cameras.items()]
         shots: list[Shot] = []
         for key, kind in include_cameras.items():
             camera = self._by_name.get(key) or self._bare.get(key)
@@ -234,7 +251,8 @@ class CameraRenderer:
                 # A picture from some snapshot on is asked for: that of now is one, if there is any.
                 least = 0.0 if isinstance(kind, str) or not self._stamped else kind.get("frame_id", 0.0)
                 later = self._stamped and not isinstance(kind, str)
-                shots.append(Shot(key, camera, sync=fresh or later or now, late=late, least=least))
+                older = fresh and not later
+                shots.append(Shot(key, camera, sync=fresh or later or now, late=late, least=least, older=older))
         return shots
 
     def stream_shots(self, keys: Iterable[str]) -> list[Shot]:
@@ -300,7 +318,9 @@ class CameraRenderer:
         Returns:
             What to hand to `frames`.
         """
-        now, draw = self._now(), draw and not self._broken
+        self._given_up = [job for job in self._given_up if not job.done.is_set()]
+        now, draw = self._now(), draw and not self._broken and len(self._given_up) < GIVEN_UP
+        look = self._copy_look()
         jobs: list[Exposure] = []
         past: dict[Latency, Past] = {}
         cameras: list[_Camera] = []
@@ -311,12 +331,15 @@ class CameraRenderer:
             elif shot.late not in past and (seen := shot.late.revealed(now)) is not None:
                 past[shot.late] = seen
                 if seen.frame is None and draw:
-                    jobs.append(Exposure([shot.camera], self._past_state(seen), now.wall, seen.frame_id, seen))
+                    jobs.append(Exposure([shot.camera], self._past_state(seen), now.wall, seen.frame_id, seen, look))
         if cameras and draw:
-            jobs.append(Exposure(cameras, self._copy_state(), now.wall, frame_id if self._stamped else None))
+            number = frame_id if self._stamped else None
+            jobs.append(Exposure(cameras, self._copy_state(), now.wall, number, look=look))
         return Film(now.wall, time.time(), jobs, past)
 
-    def frames(self, shots: Sequence[Shot], film: Film) -> dict[str, CameraFrame] | None:
+    def frames(
+        self, shots: Sequence[Shot], film: Film, wait_s: float = FRAMES_DEADLINE_S
+    ) -> dict[str, CameraFrame] | None:
         """Draw what has to be drawn and return the frames by the request's keys; None without any.
 
         Without OpenGL, or when drawing fails or takes too long, cameras are left out; the log says why.
@@ -324,16 +347,22 @@ class CameraRenderer:
         Args:
             shots: What is asked for.
             film: What `capture` returned.
+            wait_s: Seconds that drawing may take before frames are left out, or older ones taken; what was begun
+                is drawn all the same. They begin when OpenGL has been found, which no request can hurry.
         """
-        deadline = time.monotonic() + FRAMES_DEADLINE_S
         drawing = [job for job in film.jobs if self._submit(job)]
+        if drawing:
+            self._ready.wait(FRAMES_DEADLINE_S)
+        deadline = time.monotonic() + wait_s
         if not all(job.done.wait(max(0.0, deadline - time.monotonic())) for job in drawing):
-            logger.warning("no camera images within %g s; continuing without them", FRAMES_DEADLINE_S)
+            self._given_up.extend(drawing)
+            if wait_s >= FRAMES_DEADLINE_S:
+                logger.warning("no camera images within %g s; continuing without them", wait_s)
         return {shot.key: frame for shot in shots if (frame := film.frame(shot)) is not None} or None
 
     def capture_viewport(self, picture: ViewportPicture) -> Painting:
         """Copy the state that `paint` draws; the caller holds the engine's lock."""
-        return Painting(picture, self._copy_state())
+        return Painting(picture, self._copy_state(), self._copy_look())
 
     def paint(self, job: Painting) -> Bytes:
         """Draw a picture of the viewport.
@@ -369,6 +398,7 @@ class CameraRenderer:
         """
         with self._lock:
             self._closed = True
+            self._ready.set()
             self._release()
             thread = self._thread
             drawing = self._drawing
@@ -387,6 +417,10 @@ class CameraRenderer:
             data = mujoco.MjData(self._model)
         mujoco.mj_copyData(data, self._model, self._scene.data)
         return data
+
+    def _copy_look(self) -> Look | None:
+        model = self._scene.model
+        return {name: np.array(getattr(model, name)) for name in self._varied} if self._varied else None
 
     def _past_state(self, past: Past) -> mujoco.MjData:
         data = self._copy_state()  # whatever the past does not hold is as it is now
@@ -422,6 +456,7 @@ class CameraRenderer:
             if self._drawing and self._model is not None:
                 with Stage(self._model, backend, self._tints, self._quality) as stage:
                     atexit.register(self.close)  # after the driver's own hook, so before it at the end
+                    self._ready.set()
                     self._draw(stage)
         except Exception:
             logger.exception("camera images are left out from now on: drawing failed")
@@ -430,12 +465,15 @@ class CameraRenderer:
         finally:
             with self._lock:
                 self._broken = True
+                self._ready.set()
                 self._release()
 
     def _draw(self, stage: Stage) -> None:
         failed = 0
         while (job := self._queue.get()) is not None:
             try:
+                for name, values in (job.look or {}).items():
+                    getattr(self._model, name)[...] = values
                 stage.prepare(job.data)
                 self._draw_job(stage, job)
                 failed = 0

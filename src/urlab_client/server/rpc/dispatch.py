@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from typing import Any, Final, TypeVar, get_args, get_type_hints
@@ -22,6 +23,7 @@ from urlab_client.protocol.registry import OPS
 from urlab_client.server.core import ServerCore
 from urlab_client.server.refusal import Refusal
 from urlab_client.server.rpc.requests import Incoming, RequestReader
+from urlab_client.server.rpc.served_request import ServedRequest
 from urlab_client.server.system.serving_thread import ServingThread
 
 __all__ = ["HANDLERS", "Dispatcher", "Handler", "HandlerTable", "handles"]
@@ -99,9 +101,11 @@ class Dispatcher:
 
     Attributes:
         served: The threads that call `answer`.
+        callbacks: Told of each request that was answered, on the thread that answers, before the next one begins.
     """
 
     served: list[ServingThread]
+    callbacks: list[Callable[[ServedRequest], None]]
 
     def __init__(self, core: ServerCore, table: HandlerTable) -> None:
         """Prepare for a server.
@@ -116,6 +120,7 @@ class Dispatcher:
         self._lock = threading.Lock()
         self._name = ""
         self.served = []
+        self.callbacks = []
 
     def answer(
         self, frame: bytes, transport: Transport = Transport.ZMQ, *, max_reply_bytes: int | None = None
@@ -130,15 +135,37 @@ class Dispatcher:
         lock = self._enter()
         try:
             self._name = name = "request"
+            began = time.perf_counter()
+            error = ""
             try:
                 incoming = self._reader.read(frame)
                 self._name = name = incoming.name or name
-                reply = self._serve(incoming, transport, max_reply_bytes)
-                return _fitting(self._encoded(reply), incoming, max_reply_bytes)
+                reply = _fitting(
+                    self._encoded(self._serve(incoming, transport, max_reply_bytes)), incoming, max_reply_bytes
+                )
             except Exception as failure:  # noqa: BLE001 - whatever happens, there is an answer
-                return encode_reply(_error(name, failure), json=self._core.session.json)
+                refused = _error(name, failure)
+                error = refused.code
+                reply = encode_reply(refused, json=self._core.session.json)
+            if self.callbacks:
+                self._tell(name, error, time.perf_counter() - began, frame, reply)
+            return reply
         finally:
             lock.release()
+
+    def _tell(self, name: str, error: str, seconds: float, frame: bytes, reply: bytes) -> None:
+        served = ServedRequest(
+            op=name if name in self._core.dialect.ops else "unknown",
+            error=error,
+            seconds=seconds,
+            request_bytes=len(frame),
+            reply_bytes=len(reply),
+        )
+        for callback in self.callbacks:
+            try:
+                callback(served)
+            except Exception:
+                logger.exception("%r failed on a request of %s", callback, served.op)
 
     def _encoded(self, reply: Reply | bytes) -> bytes:
         core = self._core

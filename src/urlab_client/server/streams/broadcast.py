@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from urlab_client.protocol.codec import encode_reply
 from urlab_client.protocol.control_messages import CameraEndpoint, ControlPayload, JointGains, gains_by_parameter
 from urlab_client.protocol.enums import ObservationLevel, StepMode
+from urlab_client.protocol.messages.control import UNCLAIMED
 from urlab_client.protocol.messages.session import ArticulationState, Clock, EntityState
 from urlab_client.protocol.topics import STATE_FULL, TopicKind
 from urlab_client.server.compile.scene import CompiledScene
@@ -210,12 +211,15 @@ class Broadcast:
                 if engine.mode not in _LIVE:
                     continue
                 if isinstance(command, ControlPayload):
-                    self._actuators.stage(command)
+                    self._actuators.stage(command, self._owned)
                 else:
                     self._set_gains(*command)
         finally:
             engine.lock.inner.release()
         return True
+
+    def _owned(self, control: ArticulationControl) -> bool:
+        return self._dialect.claims and self.running.claims.owner(control.index.key) != UNCLAIMED
 
     def _set_gains(self, key: str, gains: dict[str, JointGains]) -> None:
         try:

@@ -187,6 +187,8 @@ class CameraStreams:
             running = self._running
             if running is None:
                 return
+            if key not in self._zmq_on | self._shm_on and not self._dialect.cameras_repeat:
+                self._sent[key] = running.engine.snapshots.number  # nothing comes before the state has moved
             for on, wanted in ((self._zmq_on, zmq), (self._shm_on, shm)):
                 (on.add if wanted else on.discard)(key)
             if self._memory is not None:
@@ -294,8 +296,9 @@ class CameraStreams:
     def _is_news(self, running: Running, key: str, frame: CameraFrame) -> bool:
         """Whether a picture is to be sent, as far as the camera is to send only what has changed."""
         latency = running.cameras.latency(key)
+        repeats = self._dialect.cameras_repeat if latency is None else not latency.on_state_change
         before, self._sent[key] = self._sent.get(key), frame.frame_id
-        return latency is None or not latency.on_state_change or before != frame.frame_id
+        return repeats or before != frame.frame_id
 
     def _headed(self, frame: CameraFrame, captured: float) -> bytes:
         if not self._dialect.camera_headers:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Final, TypeAlias
 
 import mujoco
@@ -28,23 +28,29 @@ class Actuators:
 
     def __init__(self, model: mujoco.MjModel, controls: Iterable[ArticulationControl]) -> None:
         self._model = model
-        self._set_points = [control.set_points for control in controls]
+        self._controls = list(controls)
         self._owner = np.full(actuator_count(model), -1, dtype=np.intp)
         self._place = np.zeros(actuator_count(model), dtype=np.intp)
-        for number, control in enumerate(controls):
+        for number, control in enumerate(self._controls):
             actuators = control.index.actuators
             widths = control_counts(model)[actuators]
             self._owner[actuators] = number
             self._place[actuators] = np.cumsum(widths) - widths
 
-    def stage(self, command: ControlPayload) -> None:
-        """Store set-points; unknown ids are ignored, an actuator of several inputs gets its first."""
+    def stage(self, command: ControlPayload, owned: Callable[[ArticulationControl], bool]) -> None:
+        """Store set-points; unknown ids are ignored, an actuator of several inputs gets its first.
+
+        Args:
+            command: The set-points.
+            owned: Tells of which articulations they are ignored, too: those that somebody drives by requests.
+        """
         known = (command.actuator_ids >= 0) & (command.actuator_ids < len(self._owner))
         ids, values = command.actuator_ids[known], command.values[known]
         owners = self._owner[ids]
-        for number, set_points in enumerate(self._set_points):
+        for number, control in enumerate(self._controls):
             mine = owners == number
-            set_points.network[self._place[ids[mine]]] = values[mine]
+            if mine.any() and not owned(control):
+                control.set_points.network[self._place[ids[mine]]] = values[mine]
 
     def info(self, control: ArticulationControl, cameras: tuple[CameraEndpoint, ...]) -> ActuatorInfo:
         """Return what the info socket says about an articulation."""

@@ -45,7 +45,7 @@ class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
         Velocities and time stay.
 
         Args:
-            target: Actor id, or the articulation key with `by_name`.
+            target: Actor id, or the articulation key with `by_name`; any other of its names means it, too.
             qpos: All joint positions in joint order, or 7 values for a free base alone: xyz, quaternion (w, x, y, z).
             by_name: Look `target` up by the articulation key.
             timeout: Seconds to wait; None waits without limit.
@@ -70,8 +70,10 @@ class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
     ) -> ContactsResult:
         """Snapshot the active contacts.
 
-        Filters are exact compiled names, combined with AND. The server compares `body1` and `geom1` with the first
-        geom of a contact and `body2` and `geom2` with the second; a swapped pair does not match.
+        Filters are combined with AND. Each is a compiled name, or one with the articulation's key, actor id or nothing
+        in front; what was filtered by comes back as it was written, all other names as they were compiled. The server
+        compares `body1` and `geom1` with the first geom of a contact and `body2` and `geom2` with the second; a swapped
+        pair does not match.
 
         Args:
             body1: Body of the first geom.
@@ -80,6 +82,9 @@ class RuntimeNamespace(RuntimeOps, twin=aio.RuntimeNamespace):
             geom2: Second geom.
             max_contacts: Return at most so many.
             timeout: Seconds to wait; None waits without limit.
+
+        Raises:
+            KeyError: Several articulations have a body or geom of that name; nothing was sent.
         """
         return self._portal.call(
             self._aio.get_contacts,

@@ -2,6 +2,7 @@
 
 import { $, choices, confirmed, duration, h, text, toast } from "./dom.js";
 import { ask, clock, on, op } from "./link.js";
+import { toggleReplay } from "./replay.js";
 
 export const now = { status: null, state: null, socket: false };
 const ui = {};
@@ -22,7 +23,14 @@ export const drive = () =>
   now.status?.mine ? ask("DELETE", "api/lease") : ask("POST", "api/lease");
 
 export function toggleRun() {
-  if (now.status) run(!now.status.running);
+  if (now.status?.replay) toggleReplay();
+  else if (now.status) run(!now.status.running);
+}
+
+/** Stop whatever moves: physics, and a replay. */
+export function stop() {
+  run(false);
+  if (now.status?.replay?.playing) toggleReplay();
 }
 
 async function restartPlay() {
@@ -50,7 +58,7 @@ export function makeBar() {
   ui.time = h("b", { id: "time" }, "–");
   ui.rate = h("b", {}, "–");
   ui.play = h("button", { class: "primary", id: "play", title: "Let physics run or stop it (space)", onclick: toggleRun }, "▶ Play");
-  ui.stop = h("button", { class: "danger", id: "stop", title: "Stop physics; everybody may (escape)", onclick: () => run(false) }, "■ Stop");
+  ui.stop = h("button", { class: "danger", id: "stop", title: "Stop physics; everybody may (escape)", onclick: stop }, "■ Stop");
   ui.steps = h("input", { id: "steps", type: "number", min: 1, max: 10000, value: 10, title: "Steps at a time", "aria-label": "Steps at a time" });
   ui.step = h("button", { id: "step", title: "Step, in mode direct (.)", onclick: () => step(+ui.steps.value || 1) }, "Step");
   ui.keyframe = h("select", { id: "keyframe", "aria-label": "Keyframe" }, h("option", { value: "" }, "start"));
@@ -102,8 +110,9 @@ export function makeBar() {
   setInterval(() => {
     if (now.state) {
       const age = Date.now() + clock.offset - now.state.made;
-      text(ui.age, duration(age));
-      ui.age.classList.toggle("old", age > 1000);
+      const replayed = now.status?.replay != null;
+      text(ui.age, replayed ? "replay" : duration(age));
+      ui.age.classList.toggle("old", !replayed && age > 1000);
       text(ui.time, `${now.state.time.toFixed(2)} s`);
     }
     if (!now.socket || now.status?.link.state !== "connected") banner();
@@ -120,8 +129,8 @@ function show(status) {
   document.body.classList.toggle("watching", !status.mine && status.driver !== null);
   text(ui.address, status.address);
   text(ui.rate, status.moving ? `${status.rate.toFixed(2)}×` : "stopped");
-  text(ui.play, status.running ? "❚❚ Pause" : "▶ Play");
-  ui.play.disabled = !status.playing;
+  text(ui.play, (status.replay ? status.replay.playing : status.running) ? "❚❚ Pause" : "▶ Play");
+  ui.play.disabled = !status.playing && !status.replay;
   ui.step.disabled = ui.steps.disabled = status.mode !== "direct";
   if (document.activeElement !== ui.mode) ui.mode.value = status.mode;
   if (document.activeElement !== ui.source) ui.source.value = status.source ?? "";

@@ -1,11 +1,12 @@
 // The console: puts the page together and listens to the keyboard.
 
-import { drive, makeBar, now, reset, run, step, toggleRun } from "./bar.js";
+import { drive, makeBar, now, reset, step, stop, toggleRun } from "./bar.js";
 import { makeCameras } from "./cameras.js";
 import { $, h } from "./dom.js";
 import { connect } from "./link.js";
 import { makeLog } from "./log.js";
 import { makeRecording } from "./recording.js";
+import { makeReplay } from "./replay.js";
 import { makeRobots } from "./robots.js";
 import { makeContacts, makeScene } from "./scene.js";
 import { makeSensors } from "./sensors.js";
@@ -13,14 +14,14 @@ import { makeView } from "./view.js";
 
 const KEYS = [
   [" ", "space", "play or pause", toggleRun],
-  ["Escape", "esc", "stop", () => run(false)],
+  ["Escape", "esc", "stop", stop],
   [".", ".", "step (mode direct)", () => now.status?.mode === "direct" && step(+$("steps").value || 1)],
   ["r", "r", "reset", () => reset($("keyframe").value)],
   ["d", "d", "take the controls, or give them back", drive],
   ["?", "?", "this", () => $("help").showModal()],
 ];
 
-for (const make of [makeBar, makeView, makeCameras, makeSensors, makeRobots, makeScene, makeRecording, makeContacts, makeLog]) make();
+for (const make of [makeBar, makeView, makeCameras, makeSensors, makeRobots, makeScene, makeRecording, makeReplay, makeContacts, makeLog]) make();
 
 $("help").append(h("h2", {}, "Keys"),
   h("dl", {}, ...KEYS.flatMap(([, shown, what]) => [h("dt", {}, h("kbd", {}, shown)), h("dd", {}, what)]),
@@ -29,7 +30,7 @@ $("help").append(h("h2", {}, "Keys"),
   h("form", { method: "dialog" }, h("button", {}, "Close")));
 
 document.addEventListener("keydown", (event) => {
-  if (event.ctrlKey || event.metaKey || event.altKey || event.repeat || $("help").open) return;
+  if (event.ctrlKey || event.metaKey || event.altKey || event.repeat || document.querySelector("dialog[open]")) return;
   const field = event.target.closest("input:not([type=range], [type=checkbox]), select, textarea");
   const button = event.key === " " && event.target.closest("button, summary, [type=checkbox]");
   if ((field || button) && event.key !== "Escape") return;

@@ -1,90 +1,100 @@
-// Recording joint states, and playing them back.
+// Recordings: making them, and the files: download in several kinds, replay, upload, removal.
 
-import { $, choices, h, text, toast } from "./dom.js";
-import { ask, on, op } from "./link.js";
-import { now, run } from "./bar.js";
+import { $, confirmed, h, number, text, toast } from "./dom.js";
+import { ask, me, on } from "./link.js";
 
 const record = h("button", { id: "record", onclick: toggle }, "● Record");
-const sessions = h("select", { "aria-label": "Recording to play", id: "sessions" });
-const play = h("button", { id: "replay", onclick: replay }, "▶ Replay");
-const save = h("button", { class: "quiet", onclick: saveAs }, "Save");
-const load = h("button", { class: "quiet", onclick: loadFrom }, "Load");
-const file = h("input", { placeholder: "recording.json", "aria-label": "File on the server", size: 12 });
-const line = h("input", { id: "timeline", type: "range", min: 0, max: 1, step: 1, value: 0, disabled: true, oninput: () => seek(+line.value),
-  "aria-label": "Place in the recording", title: "Drag to go to another place while it is replayed" });
-const frame = h("span", { class: "num", id: "frame" });
-let before = null; // the mode to go back to
-let wanted = null;
-let seeking = false;
+const cameras = h("input", { type: "checkbox", id: "record-cameras", checked: true });
+const progress = h("span", { class: "num", id: "record-progress" });
+const list = h("div", { class: "recordings", id: "recordings" });
+const file = h("input", { type: "file", accept: ".mcap,.json", hidden: true, onchange: upload });
+let folder = "";
 
+export function bytes(count) {
+  const units = ["B", "KiB", "MiB", "GiB"];
+  const power = Math.min(units.length - 1, Math.max(0, Math.floor(Math.log2(Math.max(1, count)) / 10)));
+  return `${(count / 1024 ** power).toFixed(power ? 1 : 0)} ${units[power]}`;
+}
+
+export const clockTime = (seconds) =>
+  seconds < 60 ? `${seconds.toFixed(2)} s` : `${Math.floor(seconds / 60)}:${(seconds % 60).toFixed(1).padStart(4, "0")} min`;
+
+let running = false;
 async function toggle() {
-  if (now.status?.recording) {
-    const answer = await op("recording_stop");
-    if (answer) toast(`${answer.frame_count} frames, ${answer.sim_duration_s.toFixed(1)} s of simulation.`, "good");
+  record.disabled = true;
+  if (running) {
+    const made = await ask("DELETE", "api/recording");
+    if (made) toast(`${made.name}: ${clockTime(made.seconds)}, ${bytes(made.bytes)}.`, "good");
     refresh();
-  } else await op("recording_start");
+  } else await ask("POST", "api/recording", { cameras: cameras.checked });
+  record.disabled = false;
 }
 
-async function replay() {
-  if (now.status?.replaying) {
-    await op("replay_stop");
-    if (before && before !== now.status.mode) await op("set_mode", { mode: before });
-    before = null;
-    return;
-  }
-  if (sessions.value && (await op("replay_set_active", { name: sessions.value })) === null) return;
-  before = now.status?.mode ?? null;
-  if (before === "live" && (await op("set_mode", { mode: "direct" })) === null) return;
-  const answer = await op("replay_start");
-  if (answer && !answer.total_frames) toast("This recording is empty.");
-  else if (answer) run(true);
+async function upload() {
+  const [chosen] = file.files;
+  if (!chosen) return;
+  const answer = await fetch(`api/recordings/${encodeURIComponent(chosen.name)}`,
+    { method: "PUT", headers: { "x-urlab-viewer": me.viewer }, body: chosen }).catch(() => null);
+  const said = await answer?.json().catch(() => null);
+  if (answer?.ok) toast(`${chosen.name} is here.`, "good");
+  else toast(said?.error?.message ?? "The console does not answer.");
+  file.value = "";
+  refresh();
 }
 
-/** Go to a place; of those asked for while one is on its way, the newest. */
-async function seek(to) {
-  wanted = to;
-  text(frame, `${to + 1} / ${+line.max + 1}`);
-  if (seeking) return;
-  seeking = true;
-  while (wanted !== null) {
-    const next = wanted;
-    wanted = null;
-    await ask("POST", "api/replay", { frame: next });
-  }
-  seeking = false;
+const at = (name) => `api/recordings/${encodeURIComponent(name)}`;
+
+function row(recording) {
+  const { name } = recording;
+  const when = new Date(recording.at * 1000).toLocaleString([], { dateStyle: "short", timeStyle: "short" });
+  const kinds = h("div", { class: "kinds" });
+  const menu = h("details", { class: "menu" }, h("summary", { "aria-label": `Download ${name}` }, "Download"), kinds);
+  const link = (label, query) => h("a", { href: at(name) + query, download: "", class: "kind" }, label);
+  menu.addEventListener("toggle", async () => {
+    if (!menu.open || kinds.childElementCount) return;
+    const own = name.endsWith(".json") ? "JSON" : "MCAP";
+    kinds.append(link(`${own}, as recorded`, ""), link("CSV, states as a table", "?as=csv"), link("NPZ, NumPy arrays", "?as=npz"));
+    const about = await ask("GET", `${at(name)}?as=about`);
+    for (const camera of about?.cameras ?? []) {
+      kinds.append(link(`MP4, ${camera}`, `?as=mp4&camera=${encodeURIComponent(camera)}`));
+    }
+  });
+  return h("div", { class: "recorded", "data-recording": name },
+    h("span", { class: "name", title: name }, name.replace(/\.mcap$/, "")),
+    h("span", { class: "hint" }, `${when} · ${bytes(recording.bytes)}`),
+    h("span", { class: "line" },
+      h("button", { class: "replay", "aria-label": `Replay ${name}`, onclick: () => ask("POST", "api/replay", { name }) }, "▶ Replay"),
+      menu,
+      confirmed({ class: "quiet", "aria-label": `Delete ${name}` }, "Delete", "Delete?", async () => {
+        if (await ask("DELETE", at(name))) refresh();
+      })));
 }
 
-async function saveAs() {
-  const answer = await op("recording_save", file.value ? { path: file.value } : {});
-  if (answer) toast(`Saved on the server: ${answer.absolute_path}`, "good");
-}
-
-async function loadFrom() {
-  if (await op("replay_load", { path: file.value || "recording.json" })) refresh();
-}
-
+let shown = "";
 async function refresh() {
-  const answer = await op("replay_list_sessions", {}, { quiet: true });
-  choices(sessions, (answer?.sessions ?? []).map((name) => [name, name]));
+  const answer = await ask("GET", "api/recordings", undefined, { quiet: true });
+  if (!answer) return;
+  folder = answer.folder;
+  const now = JSON.stringify(answer.recordings);
+  if (now === shown) return;
+  shown = now;
+  list.replaceChildren(...answer.recordings.map(row));
+  if (!answer.recordings.length) list.append(h("p", { class: "hint" }, `Recordings are kept in the folder “${folder}” of the console’s machine.`));
 }
 
 export function makeRecording() {
-  $("recording").append(h("h2", {}, "Recording"),
-    h("div", { class: "line" }, record, sessions, play),
-    h("div", { class: "line timeline" }, line, frame),
-    h("div", { class: "line" }, file, save, load, h("span", { class: "hint" }, "on the server’s machine")));
-  on("world", ({ world }) => world.playing && refresh());
+  $("recording").append(h("h2", {}, "Recordings"),
+    h("div", { class: "line" }, record, h("label", { class: "check" }, cameras, " with cameras"), progress,
+      h("span", { class: "space" }), h("button", { class: "quiet", id: "upload", onclick: () => file.click() }, "Open a file …"), file),
+    list);
+  on("open", refresh);
+  on("log", ({ entries }) => entries.some((entry) => /recording|record/.test(entry.what)) && refresh());
   on("status", (status) => {
-    text(record, status.recording ? "■ Stop recording" : "● Record");
-    record.classList.toggle("danger", status.recording);
-    text(play, status.replaying ? "■ Stop replay" : "▶ Replay");
-    const [at, total] = status.replay ?? [0, 0];
-    line.max = Math.max(1, total - 1);
-    line.disabled = !status.replaying;
-    if (!seeking && !line.matches(":active")) {
-      line.value = at;
-      text(frame, total ? `${at + 1} / ${total}` : "");
-    }
-    line.parentElement.hidden = !total;
+    running = status.recording !== null;
+    text(record, running ? "■ Stop recording" : "● Record");
+    record.classList.toggle("danger", running);
+    cameras.disabled = running;
+    progress.classList.toggle("old", running && status.recording.failed);
+    text(progress, !running ? "" : status.recording.failed ? "cannot be written" : `${number(status.recording.seconds, 1).trim()} s · ${bytes(status.recording.bytes)}`);
   });
 }

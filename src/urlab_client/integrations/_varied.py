@@ -1,0 +1,41 @@
+"""What a server varies from episode to episode, from the client's side."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from urlab_client.aio.model.layout import ArticulationLayout
+from urlab_client.protocol.enums import ControllerKind
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from urlab_client.aio.client import URLabClient
+    from urlab_client.randomise.variation import Variation
+
+__all__ = ["variation_of"]
+
+
+def variation_of(
+    client: URLabClient, model: mujoco.MjModel, layouts: Mapping[str, ArticulationLayout]
+) -> Variation | None:
+    """Return how the server varies its scene, None if it does not.
+
+    Args:
+        client: The client, after the handshake.
+        model: Its model.
+        layouts: Where the articulations are in the model, by key.
+    """
+    from urlab_client.randomise.variation import Variation, declared_in  # noqa: PLC0415
+
+    declared = declared_in(model)
+    if declared is None:
+        return None
+    controlled: set[int] = set()
+    for key, articulation in client.articulations.items():
+        controller = articulation.controller
+        if controller is not None and controller.kind == ControllerKind.PD:
+            actuators = layouts[key].actuators
+            controlled.update(actuators[name] for name in controller.params["kp"])
+    return Variation(declared, model, frozenset(controlled))

@@ -1,0 +1,89 @@
+"""Another model for each copy of a batch and each of its episodes, as a server's scene has one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from urlab_client.protocol.base import Floats
+from urlab_client.randomise.declaration import Randomisation
+from urlab_client.randomise.variation import EpisodeDraws, Variation
+from urlab_client.server.physics.controllers import Controller, PDController
+
+__all__ = ["BatchVariation"]
+
+Indices = NDArray[np.intp]
+
+
+class BatchVariation:
+    """What varies in the copies of a batch.
+
+    Args:
+        declaration: What was declared.
+        model: The compiled scene, without variation.
+        batch: What steps the copies: a `mujoco.batch.Batch`, or what stands in for it.
+        nsim: Number of copies.
+        controllers: Controllers by articulation.
+
+    Raises:
+        ValueError: A name fits no element.
+    """
+
+    def __init__(
+        self,
+        declaration: Randomisation,
+        model: mujoco.MjModel,
+        batch: Any,
+        nsim: int,
+        controllers: Mapping[str, Controller],
+    ) -> None:
+        self._pd = {key: found for key, found in controllers.items() if isinstance(found, PDController)}
+        controlled = frozenset(int(i) for found in self._pd.values() for i in found.bound_actuators)
+        self._variation = Variation(declaration, model, controlled)
+        self._batch = batch
+        self._fields: dict[str, NDArray[Any]] = {name: batch.expand(name) for name in self._variation.fields}
+        self._factors: dict[str, dict[str, NDArray[np.float32]]] = {}
+        for key, found in self._pd.items():
+            shape = (nsim, len(found.bound_actuators))
+            self._factors[key] = {name: np.ones(shape, dtype=np.float32) for name in self._variation.varied_gains}
+        self.draws: list[EpisodeDraws | None] = [None] * nsim
+
+    def begin(self, indices: Indices, seeds: NDArray[np.int64]) -> None:
+        """Write the models of the next episodes of some copies, which have to be reset after that.
+
+        Args:
+            indices: The copies.
+            seeds: Seeds of the episodes of all copies.
+        """
+        for i in map(int, indices):
+            draws = self.draws[i] = self._variation.draw(int(seeds[i]))
+
+            def field(name: str, i: int = i) -> NDArray[Any]:
+                return self._fields[name][i]
+
+            self._variation.write(draws, field)
+            for key, found in self._pd.items():
+                for name, factors in self._variation.gain_factors(draws, found.bound_actuators).items():
+                    self._factors[key][name][i] = factors
+        if self._variation.derives:
+            self._batch.set_const(indices)
+
+    def start(self, i: int, qpos: Floats) -> None:
+        """Vary where the episode of a copy starts, in place, shape (nq,)."""
+        draws = self.draws[i]
+        if draws is not None:
+            self._variation.start(draws, qpos)
+
+    def use_factors(self, key: str, indices: Indices) -> None:
+        """Have the controller of an articulation use the gains of some copies."""
+        found = self._pd.get(key)
+        if found is not None:
+            found.factors = {name: factors[indices] for name, factors in self._factors[key].items()}
+
+    def look(self, i: int) -> dict[str, NDArray[Any]]:
+        """Return the fields of a copy's model that vary, by name, without options."""
+        return {name: values[i] for name, values in self._fields.items() if not name.startswith("opt.")}

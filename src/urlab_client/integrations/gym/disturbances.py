@@ -1,0 +1,190 @@
+"""What disturbs one environment: pushes, noise on what it observes, late observations and actions, lost samples.
+
+For single, vector and batch environments, which each have one of these per environment; so the same declaration and
+seed give the same numbers in all of them.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+from collections import deque
+from collections.abc import Mapping
+from typing import Any, Final, cast
+
+import numpy as np
+
+from urlab_client.integrations.gym.spaces import Observation, SpaceMapping
+from urlab_client.protocol.base import Floats
+from urlab_client.randomise.declaration import Field, Noise, Push, Randomisation, steps_range
+from urlab_client.randomise.variation import draw_range, stream
+
+__all__ = ["Disturbances"]
+
+_NOISE, _PUSH, _LATE, _DROP = 1, 2, 3, 4
+"""First numbers of the streams of random numbers, beside `MODEL_STREAM`."""
+
+_SEED_END: Final = 2**31
+"""Seeds of episodes are below: servers may keep them in 32 bits."""
+
+
+class Disturbances:
+    """What disturbs one environment, episode by episode.
+
+    Args:
+        declaration: What was declared.
+        mapping: The articulations as spaces.
+        n_task: Numbers that a task adds to an observation.
+
+    Raises:
+        ValueError: Noise is declared on what is not observed.
+    """
+
+    def __init__(self, declaration: Randomisation, mapping: SpaceMapping, n_task: int) -> None:
+        self.seed = -1
+        self._declaration = declaration
+        self._mapping = mapping
+        self._n_task = n_task
+        self._targets = [self._noisy(noise) for noise in declaration.noise]
+        self._pushes: list[_PushSchedule] = []
+        self._noises: list[tuple[np.random.Generator, list[Floats]]] = []
+        self._drops = stream(0, _DROP)
+        self._samples: deque[Observation] = deque(maxlen=1)
+        self._shown: Observation = None
+        self._actions: deque[Any] = deque()
+        self._late_actions = 0
+
+    def begin(self, rng: np.random.Generator) -> int:
+        """Draw an episode, and return its seed.
+
+        Args:
+            rng: The environment's generator, which the seed comes from.
+        """
+        seed = self.seed = int(rng.integers(_SEED_END))
+        declared = self._declaration
+        self._pushes = [_PushSchedule(push, stream(seed, _PUSH, i)) for i, push in enumerate(declared.push)]
+        self._noises = []
+        for i, (noise, widths) in enumerate(zip(declared.noise, self._widths, strict=True)):
+            generator = stream(seed, _NOISE, i)
+            self._noises.append((generator, [generator.uniform(-noise.bias, noise.bias, n) for n in widths]))
+        late = stream(seed, _LATE)
+        observation, action = (
+            int(late.integers(low, high, endpoint=True))
+            for low, high in (steps_range(declared.delay.observation), steps_range(declared.delay.action))
+        )
+        self._samples = deque(maxlen=observation + 1)
+        self._shown = None
+        self._late_actions = action
+        self._actions.clear()
+        self._drops = stream(seed, _DROP)
+        return seed
+
+    def delayed(self, action: Any) -> Any:
+        """Return the action that has effect now: one of some time ago, or zero set-points."""
+        if not self._late_actions:
+            return action
+        self._actions.append(_copied(action))
+        return self._actions.popleft() if len(self._actions) > self._late_actions else _zero(action)
+
+    def forces(self) -> dict[str, Floats]:
+        """Return the forces on bodies during the next action, N, world frame, shape (3,); go on to the one after."""
+        found: dict[str, Floats] = {}
+        for schedule in self._pushes:
+            force = schedule.advance()
+            if force is not None:
+                found[schedule.push.body] = found.get(schedule.push.body, 0.0) + force
+        return found
+
+    def seen(self, truth: Observation) -> Observation:
+        """Return what is seen of an observation. Pictures have a latency of their own, and stay.
+
+        Args:
+            truth: The next observation of the episode, of this environment alone; not changed.
+        """
+        sample = _copied(truth)
+        for noise, targets, (generator, biases) in zip(
+            self._declaration.noise, self._targets, self._noises, strict=True
+        ):
+            for (key, field), bias in zip(targets, biases, strict=True):
+                values = self._values(sample, key, field)
+                values += bias
+                if noise.std:
+                    values += generator.normal(0.0, noise.std, values.shape)
+                if noise.uniform:
+                    values += generator.uniform(-noise.uniform, noise.uniform, values.shape)
+        self._samples.append(sample)
+        lost = self._declaration.delay.drop and self._drops.random() < self._declaration.delay.drop
+        if self._shown is None or not lost:
+            self._shown = self._samples[0]
+        shown = _copied(self._shown)
+        if isinstance(truth, dict) and "cameras" in truth:
+            shown["cameras"] = truth["cameras"]
+        return shown
+
+    def _noisy(self, noise: Noise) -> list[tuple[str, Field]]:
+        """Return which fields of which articulations noise is on."""
+        mapping = self._mapping
+        if noise.field == "task":
+            if not self._n_task:
+                raise ValueError("noise on task: the environment's task adds nothing to the observation")
+            return [("", "task")]
+        if noise.field not in mapping.fields:
+            raise ValueError(f"noise on {noise.field}, which is not observed: there are {', '.join(mapping.fields)}")
+        keys = [key for key in mapping.keys if fnmatch.fnmatchcase(key, noise.articulation)]
+        if not keys:
+            raise ValueError(f"noise on {noise.field}: no articulation is called {noise.articulation!r}")
+        return [(key, noise.field) for key in keys]
+
+    @property
+    def _widths(self) -> list[list[int]]:
+        return [
+            [self._n_task if field == "task" else self._mapping.width(key, field) for key, field in targets]
+            for targets in self._targets
+        ]
+
+    def _values(self, sample: Observation, key: str, field: Field) -> Floats:
+        """Return the view of what a target names."""
+        if field != "task":
+            return self._mapping.field(sample, key, field)
+        return sample["task"] if self._mapping.mode == "dict" else sample[-self._n_task :]
+
+
+class _PushSchedule:
+    """When one kind of push comes, and with what force."""
+
+    def __init__(self, push: Push, rng: np.random.Generator) -> None:
+        self.push = push
+        self._rng = rng
+        self._wait = self._drawn_wait()
+        self._left = 0
+        self._force: Floats = np.zeros(3)
+
+    def advance(self) -> Floats | None:
+        """Return the force during the next action, None for no push."""
+        if self._left == 0:
+            if self._wait > 0:
+                self._wait -= 1
+                return None
+            self._force = draw_range(self._rng, self.push.force, (3,))
+            self._left = self.push.lasts
+        self._left -= 1
+        if self._left == 0:
+            self._wait = self._drawn_wait()
+        return self._force
+
+    def _drawn_wait(self) -> int:
+        low, high = self.push.every
+        return int(self._rng.integers(low, high, endpoint=True))
+
+
+def _copied(tree: Any) -> Any:
+    """Copy arrays in dictionaries; pictures, which nothing changes, are left out."""
+    if isinstance(tree, Mapping):
+        entries = cast("Mapping[str, Any]", tree)
+        return {key: _copied(entry) for key, entry in entries.items() if key != "cameras"}
+    return np.array(tree)
+
+
+def _zero(action: Any) -> Any:
+    if isinstance(action, Mapping):
+        return {key: np.zeros_like(values) for key, values in cast("Mapping[str, Any]", action).items()}
+    return np.zeros_like(action)

@@ -1,0 +1,113 @@
+"""Recordings that the server made: the plugin's JSON files of joint states, read as a recording of our own is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from urlab_client.integrations._feed.quantities import quantities
+from urlab_client.integrations._feed.scene_messages import SceneLayout
+from urlab_client.integrations.record.reader import Camera, Column, Run, Summary, Table, describe_topic
+from urlab_client.integrations.record.writer import RecordingError
+from urlab_client.server.physics.recording import Frame, decode_json
+
+__all__ = ["OWNER", "JointStatesRun", "is_joint_states"]
+
+OWNER: Final = "joints"
+"""What takes the place of an articulation's key: the file names compiled joints, of whatever robot."""
+
+_NS = 1e9
+_HEAD = 64
+_COORDINATES = {1: ("",), 4: (".qw", ".qx", ".qy", ".qz"), 7: (".x", ".y", ".z", ".qw", ".qx", ".qy", ".qz")}
+_VELOCITIES = {1: ("",), 3: (".wx", ".wy", ".wz"), 6: (".vx", ".vy", ".vz", ".wx", ".wy", ".wz")}
+
+
+def is_joint_states(path: Path) -> bool:
+    """Return whether a file begins as the plugin's recordings do: an object with the list `Frames`."""
+    with path.open("rb") as file:
+        text = file.read(_HEAD).replace(b"\0", b"").lstrip(b"\xff\xfe\xef\xbb\xbf \t\r\n")
+    return text[:1] == b"{" and text[1:].lstrip()[:8].lower() == b'"frames"'
+
+
+class JointStatesRun(Run):
+    """A recording of joint states alone: no set-points, sensors or pictures."""
+
+    def summary(self, progress: Callable[[int], None] | None = None) -> Summary:
+        """Say what is in it."""
+        del progress
+        table = self.table()
+        stamps = (table.time * _NS).astype(np.int64).tolist()
+        topic = f"/{OWNER}"
+        made = datetime.fromtimestamp(self.path.stat().st_mtime, UTC).isoformat(timespec="seconds")
+        duration = float(table.time[-1] - table.time[0]) if len(table) else 0.0
+        return Summary(
+            path=self.path,
+            complete=True,
+            damage="",
+            about={"started": made, "address": "recorded by the server"},
+            duration_s=duration,
+            wall_s=duration,
+            episodes=int(table.episode[-1]) + 1 if len(table) else 0,
+            dropped_states=0,
+            dropped_frames=0,
+            topics={topic: describe_topic(topic, "joint states", stamps)} if stamps else {},
+        )
+
+    def table(self, progress: Callable[[int], None] | None = None) -> Table:
+        """Return all states, with the columns `joints/qpos` and `joints/qvel`; values are named as compiled joints are.
+
+        Raises:
+            RecordingError: The file is not a recording.
+        """
+        del progress
+        try:
+            frames = decode_json(self.path.read_bytes())
+        except ValueError as error:
+            raise RecordingError(f"{self.path}: {error}") from error
+        sim_time = np.array([frame.time for frame in frames], dtype=np.float64)
+        steps = np.diff(sim_time, prepend=sim_time[:1])
+        layout = frames[0].layout if frames else None
+        names = dict(layout.joints) if layout else {}
+        columns: dict[str, Column] = {}
+        for field, kinds in (("qpos", _COORDINATES), ("qvel", _VELOCITIES)):
+            labels = [
+                f"{name}{part}"
+                for name, slices in names.items()
+                for part in _parts(kinds, slices[0 if field == "qpos" else 1])
+            ]
+            if labels:
+                values = np.full((len(frames), len(labels)), np.nan)
+                for row, frame in enumerate(frames):
+                    given = _values(frame, field)
+                    if frame.layout is layout:
+                        values[row] = given
+                columns[f"{OWNER}/{field}"] = Column(labels, values, quantities(SceneLayout(), field, labels), labels)
+        return Table(
+            time=np.cumsum(np.maximum(steps, 0.0)),
+            sim_time=sim_time,
+            wall_ns=(sim_time * _NS).astype(np.int64),
+            step=np.arange(len(frames), dtype=np.int64),
+            episode=np.cumsum(steps < 0).astype(np.int64),
+            columns=columns,
+        )
+
+    def cameras(self) -> list[str]:
+        """Return nothing: the file holds no pictures."""
+        return []
+
+    def frames(self, camera: str, progress: Callable[[int], None] | None = None) -> Iterator[Camera]:
+        """Raise `KeyError`: the file holds no pictures."""
+        raise KeyError(f"no pictures of {camera!r} in {self.path}: a recording of the server holds joint states alone")
+
+
+def _parts(kinds: dict[int, tuple[str, ...]], where: slice) -> tuple[str, ...]:
+    width = where.stop - where.start
+    return kinds.get(width, tuple(f".{i}" for i in range(width)))
+
+
+def _values(frame: Frame, field: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    return frame.qpos if field == "qpos" else frame.qvel

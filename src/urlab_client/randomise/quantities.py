@@ -1,0 +1,238 @@
+"""Where the quantities that vary stand in a MuJoCo model, and which elements have them."""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from urlab_client.protocol.base import Floats
+from urlab_client.randomise.declaration import Quantity, Vary
+
+__all__ = ["FIELDS", "START", "Elements", "elements_of", "write"]
+
+Ints = NDArray[np.intp]
+Fields = Callable[[str], NDArray[Any]]
+"""Returns the array of a model's field, to be written in place; options are called `opt.NAME`."""
+
+START: Final[frozenset[Quantity]] = frozenset({"position", "base_position", "base_yaw"})
+"""Quantities of the state in which an episode starts."""
+
+FIELDS: Final[dict[Quantity, tuple[str, ...]]] = {
+    "friction": ("geom_friction",),
+    "mass": ("body_mass", "body_inertia"),
+    "inertia": ("body_inertia",),
+    "centre_of_mass": ("body_ipos",),
+    "armature": ("dof_armature",),
+    "damping": ("dof_damping",),
+    "friction_loss": ("dof_frictionloss",),
+    "stiffness": ("jnt_stiffness",),
+    "kp": ("actuator_gainprm", "actuator_biasprm"),
+    "kv": ("actuator_gainprm", "actuator_biasprm"),
+    "strength": ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange"),
+    "gravity": ("opt.gravity",),
+    "light_position": ("light_pos",),
+    "light_colour": ("light_diffuse",),
+    "colour": ("geom_rgba",),
+    "camera_position": ("cam_pos",),
+    "camera_rotation": ("cam_quat",),
+    "camera_fovy": ("cam_fovy",),
+}
+"""Fields of the model that a quantity is written to."""
+
+DERIVED_FROM: Final = frozenset(
+    {"body_mass", "body_inertia", "body_ipos", "dof_armature", "cam_pos", "cam_quat", "light_pos"}
+)
+"""Fields that `mj_setConst` computes others from."""
+
+_KINDS: Final[dict[Quantity, str]] = {
+    **dict.fromkeys(("friction", "colour"), "geom"),
+    **dict.fromkeys(("mass", "inertia", "centre_of_mass"), "body"),
+    **dict.fromkeys(("armature", "damping", "friction_loss", "stiffness", "position"), "joint"),
+    **dict.fromkeys(("base_position", "base_yaw"), "free joint"),
+    **dict.fromkeys(("kp", "kv", "strength"), "actuator"),
+    **dict.fromkeys(("light_position", "light_colour"), "light"),
+    **dict.fromkeys(("camera_position", "camera_rotation", "camera_fovy"), "camera"),
+}
+_OBJECTS: Final = {
+    "geom": (mujoco.mjtObj.mjOBJ_GEOM, "ngeom"),
+    "body": (mujoco.mjtObj.mjOBJ_BODY, "nbody"),
+    "joint": (mujoco.mjtObj.mjOBJ_JOINT, "njnt"),
+    "free joint": (mujoco.mjtObj.mjOBJ_JOINT, "njnt"),
+    "actuator": (mujoco.mjtObj.mjOBJ_ACTUATOR, "nactuator"),
+    "light": (mujoco.mjtObj.mjOBJ_LIGHT, "nlight"),
+    "camera": (mujoco.mjtObj.mjOBJ_CAMERA, "ncam"),
+}
+_FIXED, _AFFINE, _NO_BIAS = 0, 1, 0  # mjGAIN_FIXED, mjGAIN_AFFINE and mjBIAS_AFFINE, mjBIAS_NONE
+_FREE: Final = int(mujoco.mjtJoint.mjJNT_FREE)
+_SCALAR: Final = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+
+
+@dataclass(frozen=True, eq=False)
+class Elements:
+    """Elements of a model that have a quantity.
+
+    Attributes:
+        ids: Their ids.
+        names: What they are called in what is recorded, parallel.
+    """
+
+    ids: Ints
+    names: tuple[str, ...]
+
+
+def elements_of(vary: Vary, model: mujoco.MjModel, controlled: frozenset[int]) -> Elements:
+    """Return the elements whose quantity varies.
+
+    A geom is found by its own name or its body's, a free joint likewise.
+
+    Args:
+        vary: What varies.
+        model: The compiled scene.
+        controlled: Actuators that a controller with gains drives.
+
+    Raises:
+        ValueError: There are none.
+    """
+    if vary.what == "gravity":
+        return Elements(np.zeros(1, dtype=np.intp), ("scene",))
+    kind = _KINDS[vary.what]
+    names = _names(model, kind)
+    aliases = _aliases(model, kind, names)
+    having = [i for i in range(len(names)) if _has(vary.what, model, i, controlled)]
+    patterns = [pattern.replace("/", "_", 1) for pattern in vary.patterns]
+    chosen = [i for i in having if any(fnmatch.fnmatchcase(alias, p) for alias in aliases[i] for p in patterns)]
+    if not chosen:
+        there = ", ".join(dict.fromkeys(alias for i in having for alias in aliases[i] if alias)) or "none"
+        raise ValueError(f"no {kind} with a {vary.what} is called {' or '.join(vary.patterns)}; there are: {there}")
+    return Elements(np.array(chosen, dtype=np.intp), tuple(names[i] or aliases[i][-1] for i in chosen))
+
+
+def write(vary: Vary, elements: Elements, drawn: Floats, model: mujoco.MjModel, fields: Fields) -> None:
+    """Write what was drawn into the fields of a model, on top of what they hold.
+
+    Args:
+        vary: What varies, which is not in `START`.
+        elements: Where.
+        drawn: The numbers, shape (n elements, width).
+        model: The compiled scene, for what does not vary.
+        fields: Returns the fields.
+    """
+    ids = elements.ids
+    match vary.what:
+        case "friction":
+            _change(vary, fields("geom_friction")[:, 0], ids, drawn[:, 0])
+        case "mass":
+            mass = fields("body_mass")
+            before = mass[ids].copy()
+            _change(vary, mass, ids, drawn[:, 0], least=0.0)
+            fields("body_inertia")[ids] *= (mass[ids] / before)[:, None]
+        case "armature" | "damping" | "friction_loss":
+            dofs, owners = _dofs(model, ids)
+            _change(vary, fields(FIELDS[vary.what][0]), dofs, drawn[owners, 0], least=0.0)
+        case "stiffness":
+            _change(vary, fields("jnt_stiffness"), ids, drawn[:, 0], least=0.0)
+        case "kp" | "kv":
+            _write_gain(vary.what, ids, drawn[:, 0], model, fields)
+        case "inertia" | "strength":
+            for name in FIELDS[vary.what]:
+                fields(name)[ids] *= drawn
+        case "gravity":
+            gravity = fields("opt.gravity")
+            gravity[:] = _changed(vary, gravity, drawn[0])
+        case "colour":
+            rgba = fields("geom_rgba")
+            rgba[ids, :3] = np.clip(_changed(vary, rgba[ids, :3], drawn), 0.0, 1.0)
+        case "camera_rotation":
+            turned = fields("cam_quat")
+            for i, vector in zip(ids, drawn, strict=True):
+                turned[i] = _rotated(turned[i], vector)
+        case _:
+            field = fields(FIELDS[vary.what][0])
+            values = drawn if field.ndim > 1 else drawn[:, 0]
+            field[ids] = _changed(vary, field[ids], values)
+
+
+def _change(vary: Vary, field: NDArray[Any], ids: Ints, drawn: Floats, least: float = -np.inf) -> None:
+    field[ids] = np.maximum(_changed(vary, field[ids], drawn), least)
+
+
+def _changed(vary: Vary, values: NDArray[Any], drawn: Floats) -> NDArray[Any]:
+    match vary.by:
+        case "scale":
+            return values * drawn
+        case "add":
+            return values + drawn
+        case "set":
+            return np.broadcast_to(drawn, values.shape)
+
+
+def _write_gain(what: str, ids: Ints, factors: Floats, model: mujoco.MjModel, fields: Fields) -> None:
+    """Scale a gain of servos, whose force is gain * ctrl + bias0 + bias1 * length + bias2 * velocity."""
+    gain, bias = fields("actuator_gainprm"), fields("actuator_biasprm")
+    servos = model.actuator_biastype[ids] == _AFFINE
+    for i, factor in zip(ids[servos], factors[servos], strict=True):
+        by_position = model.actuator_biasprm[i, 1] != 0.0
+        if what == "kp":
+            gain[i, 0] *= factor
+            bias[i, 1] *= factor
+        else:
+            bias[i, 2] *= factor
+            if not by_position:  # a velocity servo, whose gain is kv
+                gain[i, 0] *= factor
+
+
+def _has(what: Quantity, model: mujoco.MjModel, i: int, controlled: frozenset[int]) -> bool:
+    match what:
+        case "mass" | "inertia" | "centre_of_mass":
+            return bool(model.body_mass[i] > 0.0)
+        case "base_position" | "base_yaw":
+            return bool(model.jnt_type[i] == _FREE)
+        case "position":
+            return bool(model.jnt_type[i] in _SCALAR)
+        case "kp" | "kv":
+            affine = model.actuator_gaintype[i] == _FIXED and model.actuator_biastype[i] == _AFFINE
+            column = 1 if what == "kp" else 2
+            return i in controlled or bool(affine and model.actuator_biasprm[i, column] != 0.0)
+        case "strength":
+            return bool(
+                model.actuator_gaintype[i] in (_FIXED, _AFFINE) and model.actuator_biastype[i] in (_NO_BIAS, _AFFINE)
+            )
+        case _:
+            return True
+
+
+def _names(model: mujoco.MjModel, kind: str) -> list[str]:
+    objects, count = _OBJECTS[kind]
+    number = getattr(model, count, None)
+    if number is None:
+        number = model.nu  # a release whose actuators all have one control
+    return [mujoco.mj_id2name(model, objects, i) or "" for i in range(number)]
+
+
+def _aliases(model: mujoco.MjModel, kind: str, names: Sequence[str]) -> list[tuple[str, ...]]:
+    """Return what each element may be called: a geom or free joint also after its body."""
+    owners = {"geom": "geom_bodyid", "free joint": "jnt_bodyid"}.get(kind)
+    if owners is None:
+        return [(name,) for name in names]
+    bodies = _names(model, "body")
+    return [(name, bodies[body]) for name, body in zip(names, getattr(model, owners), strict=True)]
+
+
+def _dofs(model: mujoco.MjModel, joints: Ints) -> tuple[Ints, Ints]:
+    """Return the degrees of freedom of joints, and whose each is."""
+    which = [np.flatnonzero(model.dof_jntid == joint) for joint in joints]
+    owners = np.repeat(np.arange(len(joints)), [len(found) for found in which])
+    return np.concatenate(which).astype(np.intp), owners.astype(np.intp)
+
+
+def _rotated(quaternion: Floats, vector: Floats) -> Floats:
+    """Turn an orientation by a rotation vector in its own frame, radians."""
+    turned = np.array(quaternion, dtype=np.float64)
+    mujoco.mju_quatIntegrate(turned, np.asarray(vector, dtype=np.float64), 1.0)
+    return turned

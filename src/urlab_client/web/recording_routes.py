@@ -1,0 +1,111 @@
+"""The part of the HTTP API that is about recordings and replays."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from typing import TypeAlias
+
+import msgspec
+from msgspec import Struct
+from starlette.background import BackgroundTask
+from starlette.requests import Request
+from starlette.responses import FileResponse, Response
+
+from urlab_client.web.console_session import ConsoleSession
+from urlab_client.web.driving_lease import Viewer
+from urlab_client.web.ops import encode
+
+__all__ = ["RecordingRoutes"]
+
+_Handler: TypeAlias = Callable[[Request], Awaitable[Response]]
+
+
+class _RecordRequest(Struct):
+    cameras: bool = True
+
+
+class _ReplayRequest(Struct):
+    name: str = ""
+    placing: bool = False
+    time: float | None = None
+    playing: bool | None = None
+    rate: float | None = None
+
+
+class RecordingRoutes:
+    """Handlers of `/api/recording`, `/api/recordings` and `/api/replay`.
+
+    Args:
+        console: The session that all viewers share.
+        viewer: Says who asks.
+    """
+
+    def __init__(self, console: ConsoleSession, viewer: Callable[[Request], Viewer]) -> None:
+        self._console = console
+        self._viewer = viewer
+
+    def routes(self) -> list[tuple[str, _Handler, list[str]]]:
+        """Return path, handler and methods of each route."""
+        return [
+            ("/api/recording", self._record, ["POST", "DELETE"]),
+            ("/api/recordings", self._list, ["GET"]),
+            ("/api/recordings/{name}", self._recording, ["GET", "PUT", "DELETE"]),
+            ("/api/replay", self._replay, ["POST", "DELETE"]),
+        ]
+
+    async def _record(self, request: Request) -> Response:
+        viewer = self._viewer(request)
+        console = self._console
+        console.lease.use(viewer)
+        if request.method == "DELETE":
+            found = await console.recordings.stop()
+            console.note("call", viewer.name, "stop recording", found["name"])
+            return _json(found)
+        asked = msgspec.json.decode(await request.body() or b"{}", type=_RecordRequest)
+        name = await console.recordings.start(cameras=asked.cameras)
+        console.note("call", viewer.name, "record", name)
+        return _json({"name": name})
+
+    async def _list(self, request: Request) -> Response:
+        return _json({"recordings": self._console.recordings.list(), "folder": str(self._console.recordings.folder)})
+
+    async def _recording(self, request: Request) -> Response:
+        name, recordings = request.path_params["name"], self._console.recordings
+        if request.method != "GET":
+            viewer = self._viewer(request)
+            self._console.lease.use(viewer)
+            if request.method == "DELETE":
+                recordings.remove(name)
+                self._console.note("call", viewer.name, "delete recording", name)
+                return _json({})
+            found = await recordings.take_in(name, request.stream())
+            self._console.note("call", viewer.name, "upload recording", name)
+            return _json(found)
+        wanted = request.query_params.get("as", "")
+        if wanted == "about":
+            return _json(await recordings.describe(name))
+        if not wanted:
+            return FileResponse(recordings.path(name), filename=name, media_type="application/octet-stream")
+        making = recordings.converted(name, wanted, request.query_params.get("camera", ""))
+        path = await making.__aenter__()
+
+        async def drop() -> None:
+            await making.__aexit__(None, None, None)
+
+        return FileResponse(path, filename=path.name, background=BackgroundTask(drop))
+
+    async def _replay(self, request: Request) -> Response:
+        viewer, console = self._viewer(request), self._console
+        console.lease.use(viewer)
+        if request.method == "DELETE":
+            await console.replay.end()
+            return _json({})
+        asked = msgspec.json.decode(await request.body(), type=_ReplayRequest)
+        if asked.name:
+            await console.replay.begin(console.recordings.path(asked.name), placing=asked.placing)
+            console.note("call", viewer.name, "replay", asked.name)
+        return _json(await console.replay.change(at=asked.time, playing=asked.playing, rate=asked.rate))
+
+
+def _json(value: object) -> Response:
+    return Response(encode(value), media_type="application/json")

@@ -1,0 +1,56 @@
+// The strip that a replay is steered with: place and pace, in seconds of the recording's clock.
+
+import { $, h, text } from "./dom.js";
+import { ask, on } from "./link.js";
+import { clockTime } from "./recording.js";
+
+const PACES = [0.1, 0.25, 0.5, 1, 2, 4];
+const line = h("input", { id: "timeline", type: "range", min: 0, max: 1, step: "any", value: 0, oninput: () => seek(+line.value),
+  "aria-label": "Place in the recording, seconds" });
+const name = h("b", { class: "name" });
+const where = h("span", { class: "num", id: "replay-time" });
+const play = h("button", { id: "replay-play", onclick: toggleReplay }, "▶");
+const pace = h("select", { "aria-label": "Pace of the replay", onchange: () => ask("POST", "api/replay", { rate: +pace.value }) },
+  PACES.map((rate) => h("option", { value: rate }, `${rate}×`)));
+const placing = h("button", { class: "quiet", id: "placing", title: "Place the robots of the simulation, too: its cameras follow, its mode is puppet meanwhile",
+  onclick: () => ask("POST", "api/replay", { name: replay.name, placing: !replay.placing }) }, "Move the simulation, too");
+let replay = null;
+let wanted = null;
+let seeking = false;
+
+export function toggleReplay() {
+  return ask("POST", "api/replay", { playing: !replay?.playing });
+}
+
+/** Go to a place; of those asked for while one is on its way, the newest. */
+async function seek(to) {
+  wanted = to;
+  if (seeking) return;
+  seeking = true;
+  while (wanted !== null) {
+    const next = wanted;
+    wanted = null;
+    await ask("POST", "api/replay", { time: next, playing: false });
+  }
+  seeking = false;
+}
+
+export function makeReplay() {
+  $("replay").append(h("span", { class: "tag" }, "Replay"), name, play, line, where, pace, placing,
+    h("button", { id: "replay-end", class: "primary", onclick: () => ask("DELETE", "api/replay") }, "Back to live"));
+  on("status", (status) => {
+    replay = status.replay;
+    $("replay").hidden = replay === null;
+    document.body.classList.toggle("replaying", replay !== null);
+    if (!replay) return;
+    text(name, replay.name.replace(/\.mcap$/, ""));
+    text(play, replay.playing ? "❚❚" : "▶");
+    play.setAttribute("aria-label", replay.playing ? "Pause the replay" : "Play the replay");
+    placing.setAttribute("aria-pressed", replay.placing);
+    if (document.activeElement !== pace) pace.value = replay.rate;
+    line.max = replay.seconds;
+    const held = seeking || line.matches(":active");
+    if (!held) line.value = replay.time;
+    text(where, `${clockTime(held ? +line.value : replay.time)} of ${clockTime(replay.seconds)}`);
+  });
+}
