@@ -68,7 +68,7 @@ def as_written(reply: R, request: Request[Any]) -> R:
 
 
 def _compiled(kind: Literal["body", "geom"], name: str, objects: SceneObjects, model: mujoco.MjModel | None) -> str:
-    if model is None:
+    if model is None or not isinstance(name, str):  # which would crash MuJoCo, and which the request is refused for
         return name
     import mujoco  # noqa: PLC0415
 
