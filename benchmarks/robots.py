@@ -68,7 +68,9 @@ def dialect() -> str:
 
 
 @functools.cache
-def recorded(joints: int, count: int = 1, *, mode: str = "direct", terrain: int = 0) -> Mapping[str, bytes]:
+def recorded(
+    joints: int, count: int = 1, *, mode: str = "direct", terrain: int = 0, spoken: str = ""
+) -> Mapping[str, bytes]:
     """Return what the simulated server answers to `hello`, `meta`, `set_mode` and `step`, by op.
 
     Args:
@@ -76,18 +78,20 @@ def recorded(joints: int, count: int = 1, *, mode: str = "direct", terrain: int 
         count: Robots.
         mode: Step mode that the server is left in.
         terrain: See `robot_mjcf`.
+        spoken: Dialect of the answers, where it is not that of all servers.
     """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "robot.xml"
         path.write_text(robot_mjcf(joints, terrain=terrain))
-        return recorded_of(path, count, mode=mode)
+        return recorded_of(path, count, mode=mode, spoken=spoken)
 
 
-def recorded_of(path: Path, count: int = 1, *, mode: str = "direct") -> dict[str, bytes]:
+def recorded_of(path: Path, count: int = 1, *, mode: str = "direct", spoken: str = "") -> dict[str, bytes]:
     """Return what `recorded` does of the robots in an MJCF file."""
     answers: dict[str, bytes] = {}
     # Older packages know one dialect only, and no option.
-    options: dict[str, Any] = {} if dialect() == "alpha" else {"dialect": dialect()}
+    spoken = spoken or dialect()
+    options: dict[str, Any] = {} if spoken == "alpha" else {"dialect": spoken}
     with SimulatedServer(*[path] * count, play=True, **options) as server, Requester(server.step_port) as floor:
         answers["hello"] = floor.ask(encode_request(Hello(), ""))
         hello = decode_reply(op_of(Hello), HelloOk, answers["hello"])
