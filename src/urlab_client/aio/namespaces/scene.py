@@ -14,7 +14,11 @@ from urlab_client.aio.model.numbers import finite
 from urlab_client.aio.model.upload import flatten, upload
 from urlab_client.aio.namespaces._base import Vector, as_quat, as_vec3, target_by
 from urlab_client.aio.namespaces._ops import SceneOps
+from urlab_client.aio.namespaces.lasting import SceneEdit
+from urlab_client.aio.namespaces.sim import SimNamespace
+from urlab_client.aio.session import Session
 from urlab_client.protocol.base import Reply, Request
+from urlab_client.protocol.enums import PIEState
 from urlab_client.protocol.errors import CreateLevelFailed, ImportFailed, UnknownOp
 from urlab_client.protocol.messages.outliner import ListActors
 from urlab_client.protocol.messages.scene import (
@@ -50,6 +54,43 @@ R = TypeVar("R", bound=Reply)
 
 class SceneNamespace(SceneOps):
     """Editor-time authoring. Edits during play show after the next start of play."""
+
+    def __init__(self, session: Session, sim: SimNamespace) -> None:
+        super().__init__(session)
+        self._sim = sim
+        self._edits = 0  # blocks of `edit()` that are open
+
+    def edit(self, *, timeout_s: float = 30.0) -> SceneEdit:
+        """Edit the level in a `with` block, and restart play once at its end, so that the simulation has the edits.
+
+        Where no play runs at the end, nothing is started. Of nested blocks the outermost one restarts. After the
+        restart the client's own step mode is in force again; in live mode physics starts paused.
+
+        If the block raises, play is not restarted: it goes on in the world as it was, and what was edited before stays
+        in the level, as the editor has no op to undo it. The exception carries a note that says so.
+
+        Args:
+            timeout_s: Seconds to wait for the compile.
+
+        Raises:
+            URLabPIEError: On leaving: the level does not compile as it is now. The edits stay, and play is off.
+
+        Example:
+            async with client.scene.edit():
+                await client.scene.spawn_actor(robot, "left", location=(0, 1, 0))
+                await client.scene.spawn_actor(robot, "right", location=(0, -1, 0))
+        """
+        return SceneEdit(self._begin_edit, lambda well: self._end_edit(well=well, timeout_s=timeout_s))
+
+    def _begin_edit(self) -> None:
+        self._edits += 1
+
+    async def _end_edit(self, *, well: bool, timeout_s: float) -> None:
+        self._edits -= 1
+        if not well or self._edits or (await self._sim.status()).state is PIEState.OFF:
+            return
+        await self._sim.stop()
+        await self._sim.start(timeout_s=timeout_s)
 
     async def import_xml(
         self,

@@ -10,6 +10,7 @@ import msgspec
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.namespaces._base import Namespace
+from urlab_client.aio.namespaces.lasting import Playing
 from urlab_client.aio.session import Session, Turn
 from urlab_client.aio.state.discovery import Discovery
 from urlab_client.aio.state.pending_outcomes import leaves_open
@@ -61,13 +62,17 @@ class SimNamespace(Namespace):
             URLabPIEError: Play did not become ready; its message carries the compile log.
         """
         async with self._session.turn(BeginPie, timeout=timeout, each=True) as turn:
-            reply = await self._play(turn, level_path, timeout_s, on_progress)
-            state = reply.state
-            payload = reply.handshake_payload
-            result = PIEStartResult(state=state, compile_error=reply.compile_error)
-            if payload is not None:
-                await self._discovery.adopt(turn, payload)
-                result.handshake_payload = msgspec.to_builtins(payload)
+            self._state.switching_play = True
+            try:
+                reply = await self._play(turn, level_path, timeout_s, on_progress)
+                state = reply.state
+                payload = reply.handshake_payload
+                result = PIEStartResult(state=state, compile_error=reply.compile_error)
+                if payload is not None:
+                    await self._discovery.adopt(turn, payload)
+                    result.handshake_payload = msgspec.to_builtins(payload)
+            finally:
+                self._state.switching_play = False
         if raise_on_failure and not result.is_ready:
             explanation = reply.compile_error or (
                 f"no compiled model within {timeout_s:g} s; does the level have a manager (scene.ensure_manager())?"
@@ -118,7 +123,7 @@ class SimNamespace(Namespace):
         """
         loop = running_loop()
         async with self._session.turn(StopPie, timeout=timeout, each=True) as turn:
-            self._state.stopping = True
+            self._state.switching_play = True
             # On Windows, what we have mapped the server could neither remove nor make anew.
             self._state.publishers.release_regions()
             try:
@@ -132,8 +137,26 @@ class SimNamespace(Namespace):
                         )
                     await turn.aside(asyncio.sleep(_STOP_POLL_S))
             finally:
-                self._state.stopping = False
+                self._state.switching_play = False
             self._state.on_play_ended("stopped by this client")
+
+    def playing(self, level_path: str | None = None, *, timeout_s: float = 30.0) -> Playing:
+        """Play while a `with` block lasts: start it on entering, and stop it on leaving, also after an exception.
+
+        Play that runs already is taken over as `start()` does, and goes on after the block.
+
+        Args:
+            level_path: Level to open first, a full `/Game/` path; None for the open one.
+            timeout_s: Seconds to wait for the compile.
+
+        Raises:
+            URLabPIEError: On entering: play did not become ready. It is stopped again.
+
+        Example:
+            async with client.sim.playing():
+                await client.step(100)
+        """
+        return Playing(lambda: self.start(level_path, timeout_s=timeout_s), self.stop, self.status)
 
     async def status(self, *, timeout: Timeout = DEFAULT) -> PIEStatus:
         """Read the state of play."""

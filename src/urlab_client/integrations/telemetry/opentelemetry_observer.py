@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
 
-from urlab_client.integrations._extras import need
+from urlab_client._extras import need
 from urlab_client.integrations.telemetry.durations import DURATIONS_S
 from urlab_client.protocol.client_types import CallOutcome, CallRecord
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from urlab_client.integrations._extras import need
+from urlab_client._extras import need
 from urlab_client.integrations.telemetry.durations import DURATIONS_S
 from urlab_client.protocol.client_types import CallRecord
 

@@ -20,6 +20,7 @@ from urlab_client.protocol.scene_types import (
 )
 from urlab_client.protocol.types import JobStatus, UploadProgress
 from urlab_client.sync.namespaces._ops import SceneOps
+from urlab_client.sync.namespaces.lasting import SceneEdit
 
 if TYPE_CHECKING:
     import mujoco
@@ -32,6 +33,28 @@ class SceneNamespace(SceneOps, twin=aio.SceneNamespace):
 
     __slots__ = ()
     _aio: aio.SceneNamespace  # pyright: ignore[reportIncompatibleVariableOverride]  # never assigned after construction
+
+    def edit(self, *, timeout_s: float = 30.0) -> SceneEdit:
+        """Edit the level in a `with` block, and restart play once at its end, so that the simulation has the edits.
+
+        Where no play runs at the end, nothing is started. Of nested blocks the outermost one restarts. After the
+        restart the client's own step mode is in force again; in live mode physics starts paused.
+
+        If the block raises, play is not restarted: it goes on in the world as it was, and what was edited before stays
+        in the level, as the editor has no op to undo it. The exception carries a note that says so.
+
+        Args:
+            timeout_s: Seconds to wait for the compile.
+
+        Raises:
+            URLabPIEError: On leaving: the level does not compile as it is now. The edits stay, and play is off.
+
+        Example:
+            with client.scene.edit():
+                client.scene.spawn_actor(robot, "left", location=(0, 1, 0))
+                client.scene.spawn_actor(robot, "right", location=(0, -1, 0))
+        """
+        return self._wrap(SceneEdit, self._aio.edit(timeout_s=timeout_s))
 
     def import_xml(
         self,

@@ -10,6 +10,7 @@ from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.namespaces import sim as aio
 from urlab_client.protocol.types import PIEStartResult, PIEStatus
 from urlab_client.sync._facade import Facade
+from urlab_client.sync.namespaces.lasting import Playing
 
 __all__ = ["SimNamespace"]
 
@@ -64,6 +65,24 @@ class SimNamespace(Facade, twin=aio.SimNamespace):
             URLabTimeoutError: The editor agreed, but play has not ended after ten seconds.
         """
         self._portal.call(self._aio.stop, timeout=timeout)
+
+    def playing(self, level_path: str | None = None, *, timeout_s: float = 30.0) -> Playing:
+        """Play while a `with` block lasts: start it on entering, and stop it on leaving, also after an exception.
+
+        Play that runs already is taken over as `start()` does, and goes on after the block.
+
+        Args:
+            level_path: Level to open first, a full `/Game/` path; None for the open one.
+            timeout_s: Seconds to wait for the compile.
+
+        Raises:
+            URLabPIEError: On entering: play did not become ready. It is stopped again.
+
+        Example:
+            with client.sim.playing():
+                client.step(100)
+        """
+        return self._wrap(Playing, self._aio.playing(level_path, timeout_s=timeout_s))
 
     def status(self, *, timeout: Timeout = DEFAULT) -> PIEStatus:
         """Read the state of play."""

@@ -30,7 +30,7 @@ $("help").append(h("h2", {}, "Keys"),
   h("form", { method: "dialog" }, h("button", {}, "Close")));
 
 document.addEventListener("keydown", (event) => {
-  if (event.ctrlKey || event.metaKey || event.altKey || event.repeat || $("help").open) return;
+  if (event.ctrlKey || event.metaKey || event.altKey || event.repeat || document.querySelector("dialog[open]")) return;
   const field = event.target.closest("input:not([type=range], [type=checkbox]), select, textarea");
   const button = event.key === " " && event.target.closest("button, summary, [type=checkbox]");
   if ((field || button) && event.key !== "Escape") return;

@@ -1,15 +1,12 @@
 // Articulations: joint positions against their ranges, actuator sliders, gains, commanded twist.
 
+import { ActuatorRow, actuatorTable, groups, share, stillness } from "./actuators.js";
+import { now } from "./bar.js";
 import { $, h, number, text } from "./dom.js";
-import { on, op, setPoint } from "./link.js";
+import { ask, on, op } from "./link.js";
 
 let robots = [];
 const GAINS = ["kp", "kv", "torque_limit"];
-const UNITS = { hinge: "rad", slide: "m" };
-
-function share(value, [low, high]) {
-  return Math.min(1, Math.max(0, (value - low) / (high - low || 1)));
-}
 
 class Robot {
   constructor(art) {
@@ -19,43 +16,24 @@ class Robot {
     this.boxes = [];
     const joints = art.joints.filter((joint) => joint.kind === "hinge" || joint.kind === "slide");
     const driven = new Set(art.actuators.map((actuator) => actuator.joint));
-    this.element = h("section", { class: "card robot", "data-robot": art.key },
-      h("h2", {}, art.key, h("span", { class: "tag" }, `${art.joints.length} joints · ${art.actuators.length} actuators`)),
-      art.actuators.length ? h("div", { class: "table actuators" }, art.actuators.map((actuator) => this.actuator(actuator, art))) : null,
+    this.still = h("p", { class: "still", hidden: true });
+    const why = h("button", { class: "quiet", title: "Look from the sockets inwards why it might not move", onclick: () => explain(art.key) }, "Why does it not move?");
+    const tables = groups(art).map((group) => actuatorTable(group, group.actuators.map((actuator) => this.actuator(actuator, art))));
+    this.element = h("section", { class: "card robot", "data-robot": art.key, "aria-label": art.key },
+      h("h2", {}, art.key, h("span", { class: "tag" }, `${count(art.joints.length, "joint")} · ${count(art.actuators.length, "actuator")}`),
+        h("span", { class: "space" }), why),
+      this.still, ...tables,
       fold("Joints", joints.some((joint) => !driven.has(joint.name)) && !art.actuators.length,
-        h("div", { class: "table" }, joints.map((joint) => this.joint(joint)))),
+        h("div", { class: "table joints" }, joints.map((joint) => this.joint(joint)))),
       art.controller && GAINS.some((gain) => gain in art.controller.params) ? fold("Gains", false, this.gains(art)) : null,
       art.joints.some((joint) => joint.kind === "free") ? fold("Commanded twist", false, this.twist()) : null);
+    this.art = art;
   }
 
   actuator(actuator, art) {
-    const joint = art.joints.find((one) => one.name === actuator.joint);
-    // A controller's set-points are joint positions, whatever its actuators take.
-    const controlled = joint && art.controller?.kind === "pd";
-    const follows = joint && (actuator.kind === "position" || controlled);
-    const range = (controlled ? joint.range : actuator.range) ?? (controlled ? [-Math.PI, Math.PI] : [-1, 1]);
-    const step = (range[1] - range[0]) / 1000;
-    const slider = h("input", { type: "range", min: range[0], max: range[1], step, value: 0, "data-actuator": actuator.name,
-      "aria-label": `${actuator.name} set-point`, title: "Set-point; double-click: middle of the range" });
-    const mark = h("i", { class: "mark", title: "Where the joint is" });
-    const shown = h("span", { class: "num", "data-value": actuator.name });
-    let held = 0;
-    const set = () => {
-      held = performance.now();
-      setPoint(this.key, actuator.name, +slider.value);
-    };
-    slider.addEventListener("input", set);
-    slider.addEventListener("dblclick", () => { slider.value = (range[0] + range[1]) / 2; set(); });
-    this.rows.push((state) => {
-      const target = state.targets?.[actuator.index] ?? (controlled ? state.qpos?.[joint.index] : state.ctrl?.[actuator.index]);
-      // Not while somebody moves it here: what comes is older than what they do.
-      if (target != null && performance.now() - held > 700 && !slider.matches(":active")) slider.value = target;
-      const where = follows ? state.qpos?.[joint.index] : state.ctrl?.[actuator.index];
-      mark.style.left = `calc(8px + ${share(where ?? 0, range)} * (100% - 16px))`; // as far as the thumb's middle goes
-      text(shown, number(where));
-    });
-    return h("label", { class: "line" }, h("span", { class: "name", title: actuator.kind ?? "" }, actuator.name),
-      h("span", { class: "track" }, slider, mark), shown);
+    const row = new ActuatorRow(this.key, actuator, art);
+    this.rows.push((state) => row.draw(state));
+    return row;
   }
 
   joint(joint) {
@@ -64,13 +42,13 @@ class Robot {
     const shown = h("span", { class: "num", "data-joint": joint.name });
     this.rows.push((state) => {
       const value = state.qpos?.[joint.index];
-      text(shown, number(value));
+      text(shown, `${number(value)} ${joint.unit}`);
       if (!range || value == null) return;
       const at = share(value, range);
       bar.style.left = `${100 * at}%`;
       bar.classList.toggle("limit", at < 0.02 || at > 0.98);
     });
-    return h("div", { class: "line", title: range ? `${range[0].toFixed(3)} … ${range[1].toFixed(3)} ${UNITS[joint.kind]}` : "no limits" },
+    return h("div", { class: "line", title: range ? `${range[0].toFixed(3)} … ${range[1].toFixed(3)} ${joint.unit}` : "no limits" },
       h("span", { class: "name" }, joint.name),
       h("span", { class: range ? "track bar" : "track" }, range ? bar : h("small", {}, "no limits")), shown);
   }
@@ -133,12 +111,30 @@ class Robot {
 
   /** Take over what may change while the robot stays the same; not what somebody is typing. */
   update(art) {
+    this.art = art;
     for (const take of this.boxes) take(art.controller?.params ?? {});
   }
 
   draw(state) {
     for (const row of this.rows) row(state);
+    const said = stillness(this.art, state, now.status);
+    this.still.hidden = !said;
+    text(this.still, said);
   }
+}
+
+const count = (n, what) => `${n} ${what}${n === 1 ? "" : "s"}`;
+
+/** Show what the client finds out about a robot that does not move. */
+async function explain(key) {
+  const answer = await ask("GET", "api/explain");
+  if (!answer) return;
+  const findings = answer.findings.filter((one) => one.verdict !== "ok" && (one.subject === key || !document.querySelector(`[data-robot="${one.subject}"]`)));
+  $("findings").replaceChildren(h("h2", {}, `Why does ${key} not move?`),
+    h("ul", {}, findings.length ? findings.map((one) => h("li", { class: one.verdict }, h("b", {}, one.subject), ` ${one.text}`))
+      : h("li", {}, "Nothing that would keep it from moving was found.")),
+    h("form", { method: "dialog" }, h("button", {}, "Close")));
+  $("findings").showModal();
 }
 
 export function fold(title, open, ...content) {

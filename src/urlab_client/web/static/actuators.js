@@ -1,0 +1,118 @@
+// Rows of the joint panel: an actuator's set-point as slider and number, beside what its joint measures.
+
+import { h, number, text } from "./dom.js";
+import { setPoint } from "./link.js";
+
+const HELD_MS = 700;
+const UNKNOWN = { position: [-Math.PI, Math.PI], velocity: [-5, 5], force: [-10, 10], "": [-1, 1] };
+const MEANINGS = { position: "Position", velocity: "Velocity", force: "Force or torque", "": "Control" };
+
+export function share(value, [low, high]) {
+  return Math.min(1, Math.max(0, (value - low) / (high - low || 1)));
+}
+
+/** Digits that tell values of this range apart, and no more. */
+export const digits = ([low, high]) => Math.min(4, Math.max(1, 3 - Math.floor(Math.log10(Math.max(1e-3, high - low)))));
+
+const shortly = (value) => `${+value.toPrecision(3)}`.replace("-", "−");
+
+/** Actuators that share a scale: what set-points mean, and in which unit. */
+export function groups(art) {
+  const found = new Map();
+  for (const actuator of art.actuators) {
+    const key = `${actuator.takes}|${actuator.unit}`;
+    if (!found.has(key)) found.set(key, { takes: actuator.takes, unit: actuator.unit, actuators: [] });
+    found.get(key).actuators.push(actuator);
+  }
+  return [...found.values()];
+}
+
+export class ActuatorRow {
+  constructor(robot, actuator, art) {
+    this.robot = robot;
+    this.actuator = actuator;
+    this.joint = art.joints.find((one) => one.name === actuator.joint);
+    this.follows = actuator.takes === "position" && this.joint !== undefined; // the joint is on the slider's scale
+    const range = (this.range = actuator.range ?? UNKNOWN[actuator.takes]);
+    const name = actuator.name;
+    this.slider = h("input", { type: "range", min: range[0], max: range[1], step: (range[1] - range[0]) / 1000, value: 0,
+      "data-actuator": name, "aria-label": `${name} set-point${actuator.unit ? `, ${actuator.unit}` : ""}`, oninput: () => this.set(+this.slider.value) });
+    this.box = h("input", { type: "number", step: "any", "data-set-point": name, "aria-label": `${name} set-point as a number`,
+      onchange: () => this.box.value !== "" && this.set(+this.box.value) });
+    this.mark = h("i", { class: "mark", title: this.follows ? "Where the joint is" : "What was applied" });
+    this.measured = h("span", { class: "num", "data-value": name });
+    this.held = -Infinity;
+    const limits = actuator.range ? `${shortly(range[0])} … ${shortly(range[1])} ${actuator.unit}` : "no limits";
+    this.element = h("div", { class: "line", role: "group", "aria-label": name },
+      h("span", { class: "name", title: [actuator.kind, actuator.joint && `drives ${actuator.joint}`, limits].filter(Boolean).join(", ") }, name),
+      h("span", { class: "track" }, this.slider, this.mark,
+        h("small", { class: "low" }, actuator.range ? shortly(range[0]) : "no limit"),
+        h("small", { class: "high" }, actuator.range ? shortly(range[1]) : "no limit")),
+      this.box, this.measured,
+      h("span", { class: "few" },
+        h("button", { class: "tiny", title: `${name} to zero`, "aria-label": `${name} to zero`, onclick: () => this.zero() }, "0"),
+        h("button", { class: "tiny", title: `${name} home`, "aria-label": `${name} home`, onclick: () => this.home() }, "⌂")));
+  }
+
+  set(value) {
+    const within = Math.min(Math.max(value, this.actuator.range?.[0] ?? -Infinity), this.actuator.range?.[1] ?? Infinity);
+    this.held = performance.now();
+    this.slider.value = within;
+    this.write(within);
+    setPoint(this.robot, this.actuator.name, within);
+  }
+
+  zero() {
+    this.set(0);
+  }
+
+  home() {
+    this.set(this.actuator.home);
+  }
+
+  write(value) {
+    if (document.activeElement !== this.box || performance.now() - this.held < HELD_MS) this.box.value = value.toFixed(digits(this.range));
+  }
+
+  draw(state) {
+    const { index } = this.actuator;
+    const applied = state.ctrl?.[index];
+    const position = this.joint && state.qpos?.[this.joint.index];
+    const target = state.targets?.[index] ?? (this.follows ? position : applied);
+    // Not while somebody moves it here: what comes is older than what they do.
+    if (target != null && performance.now() - this.held > HELD_MS && !this.slider.matches(":active")) {
+      this.slider.value = target;
+      if (document.activeElement !== this.box) this.write(target);
+    }
+    const where = this.follows ? position : applied;
+    this.mark.style.left = `calc(8px + ${share(where ?? 0, this.range)} * (100% - 16px))`; // as far as the thumb's middle goes
+    const shown = this.joint ? [position, this.joint.unit] : [applied, this.actuator.unit];
+    text(this.measured, `${number(shown[0])} ${shown[1]}`);
+  }
+}
+
+/** A table of actuators of one scale, with what can be done to all of them. */
+export function actuatorTable(group, rows) {
+  const act = (what) => rows.forEach((row) => row[what]());
+  return h("div", { class: "table actuators" },
+    h("div", { class: "line head" },
+      h("span", { class: "name" }, `${MEANINGS[group.takes]}${group.unit ? ` · ${group.unit}` : ""}`),
+      h("span", {}, "set-point"), h("span", {}, "command"), h("span", { class: "right" }, rows.some((row) => row.joint) ? "measured" : "applied"),
+      h("span", { class: "few" },
+        h("button", { class: "tiny", title: "All to zero", "aria-label": "All to zero", onclick: () => act("zero") }, "0"),
+        h("button", { class: "tiny", title: "All home", "aria-label": "All home", onclick: () => act("home") }, "⌂"))),
+    rows.map((row) => row.element));
+}
+
+/** Why a robot lies there, as far as its state tells; else nothing. */
+export function stillness(art, state, status) {
+  if (!art.actuators.length) return "It has no actuators: it moves by contacts and gravity only.";
+  if (status?.source === "ui") return "The editor's panel drives it (control “ui”): set-points from here have no effect.";
+  const limits = Object.values(art.controller?.params.torque_limit ?? {});
+  if (limits.length && limits.every((limit) => limit === 0)) return "Its torque limits are 0, so that nothing drives it. Raise them under “Gains”.";
+  const forces = art.actuators.filter((actuator) => actuator.takes === "force");
+  if (forces.length === art.actuators.length && forces.every((actuator) => !state.ctrl?.[actuator.index])) {
+    return "Nothing drives it: all its forces are 0. Move a slider, or run a policy.";
+  }
+  return "";
+}
