@@ -73,7 +73,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
             self._disturbances = [Disturbances(randomise, mapping, n_task) for _ in range(num_envs)]
         self.task = task
         self.num_envs = num_envs
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.autoreset_mode: AutoresetMode = AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.single_observation_space = observation_space
         self.single_action_space = mapping.action_space
