@@ -25,7 +25,7 @@ def report() -> dict[str, Any]:
     """Return what pyright says of the package that this interpreter imports."""
     # It looks for the interpreter on the path, and for nothing else, when it verifies types.
     here = Path(sys.executable).parent
-    done = subprocess.run(
+    done = subprocess.run(  # noqa: S603 - the type checker of this environment
         [here / "pyright", "--verifytypes", PACKAGE, "--ignoreexternal", "--outputjson"],
         env={**os.environ, "PATH": f"{here}{os.pathsep}{os.environ['PATH']}"},
         capture_output=True,
