@@ -29,6 +29,7 @@ logger: logging.Logger = logging.getLogger("urlab_client.cli")
 _COMMANDS = (
     "serve",
     "console",
+    "mcp",
     "ping",
     "doctor",
     "demo",

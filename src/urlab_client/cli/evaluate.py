@@ -151,7 +151,10 @@ def _in_task(
 
     if task not in TASKS:
         raise CommandError(f"--task: there is no {task!r}; there are: {', '.join(TASKS)}")
-    network, kind = OnnxNetwork(arguments.policy), TASKS[task]
+    kind = TASKS[task]
+    if kind.cameras:
+        raise CommandError(f"--task: {task} observes pictures, which a batch has none of")
+    network = OnnxNetwork(arguments.policy)
     copies = min(arguments.episodes, _MOST_COPIES)
     disabled = AutoresetMode.DISABLED
     env = URLabBatchEnv(kind.scene_address, copies, task=kind(), randomise=declared, autoreset_mode=disabled)

@@ -68,6 +68,9 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
             server and network those that nobody looks at; `frames()` is received all the same.
         claim_control: Take control of a robot with the first write to it, where robots have one owner. False is for
             those who look on, and for those who say `articulation.claim()`.
+        keep_session: After the first `discover()`, discover again by itself when the server has been restarted or play
+            has been started by somebody else; `events()` tells of it. A session that another client has taken over is
+            never taken back, and while a step or reset is in doubt, `resync()` comes first.
         observe: Called with a `CallRecord` when a request is over, whatever became of it: op, bytes, time in the queue,
             round trip, outcome. It runs on the client's event loop, so it must be quick and must not call the client;
             what it raises is logged and changes nothing.
@@ -102,6 +105,7 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
         trust_server: bool = False,
         live_pictures: bool = True,
         claim_control: bool = True,
+        keep_session: bool = False,
         observe: Callable[[CallRecord], object] | None = None,
     ) -> None:
         super().__init__(
@@ -124,6 +128,7 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
                 trust_server=trust_server,
                 live_pictures=live_pictures,
                 claim_control=claim_control,
+                keep_session=keep_session,
                 observe=observe,
             )
         )

@@ -13,7 +13,7 @@ from urlab_client.aio.state.handshake import examine
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_mode import promote
 from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.errors import URLabError
+from urlab_client.protocol.errors import URLabError, URLabVersionMismatch
 from urlab_client.protocol.messages.session import NOT_SENT, Hello, HelloOk
 from urlab_client.protocol.messages.streams import PlayStarted
 
@@ -41,7 +41,7 @@ class Discovery:
         self._check_version = check_version
         self._promote = promote
         self._trusted = trusted
-        self._mismatch_said = False
+        self._said = ""  # what other versions of MuJoCo came to
 
     async def open(self, turn: Turn, observations: str) -> HelloOk:
         """Open a session and take over what the server says."""
@@ -62,17 +62,22 @@ class Discovery:
         if mismatch is not None:
             if self._check_version:
                 raise mismatch
-            if not self._mismatch_said:
-                self._mismatch_said = True
-                warnings.warn(
-                    f"{mismatch.args[0]} The local model is compiled here from XML and only approximates the server's.",
-                    stacklevel=2,
-                )
             if hello.mjcf_compiled is None:
                 hello = await self._hello_with_assets(turn)
+            self._warn_once(mismatch, has_xml=hello.mjcf_compiled is not None)
         if hello.mjb is not None and not self._trusted:
             hello = await self._without_binary(turn, hello)
         return hello
+
+    def _warn_once(self, mismatch: URLabVersionMismatch, *, has_xml: bool) -> None:
+        consequence = (
+            "The local model is compiled here from XML and only approximates the server's."
+            if has_xml
+            else "There is no local model, because the server does not offer it as XML."
+        )
+        if self._said != consequence:
+            self._said = consequence
+            warnings.warn(f"{mismatch.args[0]} {consequence}", stacklevel=2)
 
     async def _hello_with_assets(self, turn: Turn) -> HelloOk:
         state = self._state

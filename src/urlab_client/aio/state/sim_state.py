@@ -84,7 +84,7 @@ class SimState:
         sim_time: Simulation time of the last reply, seconds.
         on_adopted: Told of each handshake taken over, and of the end of play.
         pending: Requests whose replies were lost.
-        stopping: Whether this client is ending play, so that its end is not news.
+        switching_play: Whether this client is starting or ending play, so that neither is news.
         observers: Who looks on, such as recorders.
         step_streams: Where the pictures of steps are looked for if replies bring older ones.
     """
@@ -128,7 +128,7 @@ class SimState:
         self._live_pictures = live_pictures
         self.pending: PendingOutcomes = PendingOutcomes()
         self.on_adopted: Callable[[], None] | None = None
-        self.stopping = False
+        self.switching_play = False
         self.observers: tuple[ClientObserver, ...] = ()  # replaced, never changed: from any thread
 
     @property
