@@ -43,11 +43,14 @@ def for_the_server(request: Q, objects: SceneObjects, model: mujoco.MjModel | No
         case SetTwist(articulation=str(name)) | SetControlSource(articulation=str(name)):
             robot = objects.articulations.get(name)
             return request if robot is None else replace(request, articulation=robot.prefix)
-        case SetMocapPose(body=body) | ReadMocapPose(body=body):
+        # MuJoCo takes the process down for a name that is not text; what is wrong with it is said later.
+        case SetMocapPose(body=str(body)) | ReadMocapPose(body=str(body)):
             return replace(request, body=_compiled("body", body, objects, model))
         case GetContacts(filter=names) if names is not None:
             meant = {
-                side: name and _compiled("body" if side.startswith("body") else "geom", name, objects, model)
+                side: _compiled("body" if side.startswith("body") else "geom", name, objects, model)
+                if isinstance(name, str) and name
+                else name
                 for side, name in asdict(names).items()
             }
             return replace(request, filter=replace(names, **meant))
@@ -68,8 +71,11 @@ def as_written(reply: R, request: Request[Any]) -> R:
 
 
 def _compiled(kind: Literal["body", "geom"], name: str, objects: SceneObjects, model: mujoco.MjModel | None) -> str:
-    if model is None:
-        return name
+    match name:
+        case str() if model is not None:
+            pass
+        case _:  # MuJoCo crashes where a name is None; whoever encodes the request says what is wrong
+            return name
     import mujoco  # noqa: PLC0415
 
     number = mujoco.mjtObj.mjOBJ_BODY if kind == "body" else mujoco.mjtObj.mjOBJ_GEOM
