@@ -80,7 +80,7 @@ class PendingOutcomes:
     def add_reset(self, state: Counters, keyframe: str | None) -> None:
         """Note that a reset was sent and an error came instead of its reply."""
         self._note(state)
-        self.reset: bool = True
+        self.reset = True
         self.keyframe = keyframe
 
     def give_back(self, applied: int) -> None:
