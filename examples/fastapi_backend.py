@@ -16,13 +16,14 @@ from urlab_client import URLabConnectionError, URLabError
 from urlab_client.aio import URLabClient
 from urlab_client.protocol.descriptions import ArticulationDescription, SceneDescription
 
-client = URLabClient(os.environ.get("URLAB_ADDRESS", "sim://arm?play&unpaused"))
+client = URLabClient(os.environ.get("URLAB_ADDRESS", "sim://arm?play&unpaused"), keep_session=True)
 
 
 @asynccontextmanager
 async def lifespan(_: FastAPI) -> AsyncGenerator[None]:
     async with client:
-        await client.discover()
+        if "URLAB_WATCH" not in os.environ:  # a worker beside the one that drives only reads states
+            await client.discover()
         yield
 
 

@@ -28,6 +28,7 @@ NOT_RUN = {
     r"(ssh|scp) ": "goes to a second machine",
     r"urlab console( tcp://10\..*)?$": "goes to an editor",
     r"urlab mcp ": "tests/mcp run it",
+    r"uvicorn fastapi_backend:app": "tests/examples/test_fastapi_backend.py serves it",
     r".* --python lerobot-env/": "needs LeRobot, which has an environment of its own",
     r"(KEY=\$\()?curl ": "test_docs_console.py makes these requests",
 }

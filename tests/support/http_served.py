@@ -8,6 +8,7 @@ from collections.abc import AsyncGenerator
 
 import httpx2
 from starlette.types import ASGIApp
+from waiting import DEADLINE_S
 
 from urlab_client.cli._pages import bound, serve
 
@@ -20,7 +21,8 @@ async def served(application: ASGIApp, *, lifespan: bool = True) -> AsyncGenerat
         serving = asyncio.create_task(serve(application, listener, ready.set, ended, lifespan=lifespan))
         await ready.wait()
         try:
-            async with httpx2.AsyncClient(base_url=f"http://127.0.0.1:{listener.getsockname()[1]}") as http:
+            url = f"http://127.0.0.1:{listener.getsockname()[1]}"
+            async with httpx2.AsyncClient(base_url=url, timeout=DEADLINE_S) as http:
                 yield http
         finally:
             ended.set()

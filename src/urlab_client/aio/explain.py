@@ -71,6 +71,10 @@ async def _examine(config: ClientConfig, session: Session, state: SimState) -> A
     yield Finding(
         Verdict.OK, "server", f"It answers in {1e3 * (loop.time() - before):.1f} ms and offers {len(ops)} ops."
     )
+    if config.read_only:
+        text = "This client is read-only. What keeps robots from moving, the client that drives can find out."
+        yield Finding(Verdict.NOTE, "session", text)
+        return
     hello = state.hello
     if hello is None or not session.session_id:
         yield Finding(Verdict.PROBLEM, "session", "No session is open. Call discover() first.")

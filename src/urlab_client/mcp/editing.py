@@ -105,17 +105,10 @@ class Tools(Moving):
 
     async def _edit(self, work: Callable[[], Awaitable[None]], progress: Progress, done: str) -> Edited:
         """Change the level and let play begin anew, if it ran."""
-        client = self.client
 
         async def restarted() -> None:
-            playing = client.manager_present
-            if playing:
-                await client.sim.stop()
-            try:
+            async with self.client.scene.edit():
                 await work()
-            finally:
-                if playing:
-                    await client.sim.start()
 
         await self.driving.drive(restarted, progress)
         return self._edited(done)

@@ -12,9 +12,10 @@ from urlab_client.aio.session import Turn
 from urlab_client.aio.state.handshake import examine
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_mode import promote
+from urlab_client.protocol.codec import decode_reply, op_of
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import URLabError, URLabVersionMismatch
-from urlab_client.protocol.messages.session import NOT_SENT, Hello, HelloOk
+from urlab_client.protocol.messages.session import NOT_SENT, Hello, HelloOk, Meta
 from urlab_client.protocol.messages.streams import PlayStarted
 
 __all__ = ["Discovery"]
@@ -50,6 +51,21 @@ class Discovery:
         state.level = state.sent_level = observations
         await self.adopt(turn, hello)
         return hello
+
+    async def look_on(self, turn: Turn, handshake: bytes) -> None:
+        """Take over what another client's `handshake()` says, without opening a session.
+
+        Raises:
+            ValueError: It is none.
+        """
+        session = self._state.session
+        try:
+            hello = decode_reply(op_of(Hello), HelloOk, handshake)
+        except URLabError as error:
+            raise ValueError(f"this is not what handshake() returns: {error}") from None
+        listed = [op.name for op in (await turn.call(Meta())).ops]
+        session.features = session.features.with_ops(listed).with_hello(hello)
+        await self.adopt(turn, hello)
 
     async def _loadable(self, turn: Turn, hello: HelloOk) -> HelloOk:
         """Return a handshake whose model this process can and may load.

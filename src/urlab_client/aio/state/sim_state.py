@@ -226,9 +226,14 @@ class SimState:
                 record.pose = None
             self._take_over(reply, parts, received, into_mirror=True)
 
+    @property
+    def _trusted(self) -> bool:
+        """Whether published states can be this session's; a client that looks on has none to lose."""
+        return self.session.confirmed or self.session.read_only
+
     def matches(self, snapshot: StateSnapshot) -> bool:
         """Whether a published state is of the world that the handshake described, as far as that can be seen."""
-        if not self.session.confirmed or snapshot.per_articulation.keys() != self.objects.records.keys():
+        if not self._trusted or snapshot.per_articulation.keys() != self.objects.records.keys():
             return False
         try:
             self._checked(snapshot, "state/full")
@@ -240,7 +245,7 @@ class SimState:
         age = self.wall_time_sec - snapshot.wall_time.sec + (self.wall_time_nsec - snapshot.wall_time.nsec) / 1e9
         if 0 < age < _OVERTAKEN_S:
             return  # sent before the last reply, arrived after it
-        if not self.session.confirmed:
+        if not self._trusted:
             return  # the connection was lost: this may be another server's
         known = self.objects.records
         if snapshot.per_articulation.keys() != known.keys():
