@@ -71,11 +71,8 @@ def as_written(reply: R, request: Request[Any]) -> R:
 
 
 def _compiled(kind: Literal["body", "geom"], name: str, objects: SceneObjects, model: mujoco.MjModel | None) -> str:
-    match name:
-        case str() if model is not None:
-            pass
-        case _:  # MuJoCo crashes where a name is None; whoever encodes the request says what is wrong
-            return name
+    if model is None:
+        return name
     import mujoco  # noqa: PLC0415
 
     number = mujoco.mjtObj.mjOBJ_BODY if kind == "body" else mujoco.mjtObj.mjOBJ_GEOM
