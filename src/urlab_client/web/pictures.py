@@ -43,7 +43,7 @@ class EncodedPicture:
         self.seq = seq
         self.received_ns = received_ns
         self.jpeg = encoded
-        self.head = msgspec.json.encode(PictureHead(seq, received_ns / 1e6, sim_time, mode))
+        self.head: bytes = msgspec.json.encode(PictureHead(seq, received_ns / 1e6, sim_time, mode))
 
     def frame(self) -> bytes:
         """Return length of the head (4 bytes, little-endian), head, and JPEG."""
