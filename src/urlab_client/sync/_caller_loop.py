@@ -15,9 +15,11 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextvars import Context
-from typing import Any
+from typing import Any, TypeVarTuple
 
 __all__ = ["CallerLoop"]
+
+Ts = TypeVarTuple("Ts")
 
 # Rounds of callbacks in a row after which sockets are looked at, though there are more callbacks to run.
 _ROUNDS = 4
@@ -63,7 +65,9 @@ class CallerLoop(asyncio.SelectorEventLoop):
         nothing: Mapping[int, Any] = {}
         self._poll, self._keys = _parts(self._selector) if self._as_known else (None, nothing)
 
-    def call_soon(self, callback: Callable[..., object], *args: Any, context: Context | None = None) -> asyncio.Handle:
+    def call_soon(
+        self, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
+    ) -> asyncio.Handle:
         """See `asyncio.AbstractEventLoop.call_soon`."""
         if not self._as_known or self._closed or self._debug:  # there is more to be done, or to be refused
             return super().call_soon(callback, *args, context=context)
