@@ -106,6 +106,7 @@ def recorded_of(path: Path, count: int = 1, *, mode: str = "direct", spoken: str
 def _of_owned_robots(floor: Requester, hello: HelloOk) -> dict[str, bytes]:
     """Return what else a server answers to whoever drives its robots, and a handshake that names no other ports."""
     from urlab_client.protocol.messages.control import ClaimControl  # noqa: PLC0415  # older packages lack it
+    from urlab_client.protocol.messages.runtime import SetPaused  # noqa: PLC0415
 
     claim = ClaimControl(articulation=hello.articulations[0].prefix)
     plain = msgspec.msgpack.decode(floor.ask(encode_request(Hello(), "")))
@@ -113,6 +114,7 @@ def _of_owned_robots(floor: Requester, hello: HelloOk) -> dict[str, bytes]:
         plain.pop(elsewhere, None)
     return {
         "claim_control": floor.ask(encode_request(claim, plain["session_id"])),
+        "set_paused": floor.ask(encode_request(SetPaused(paused=True), plain["session_id"])),
         "hello": msgspec.msgpack.encode(plain),
     }
 

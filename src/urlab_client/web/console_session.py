@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Audience", "ConsoleSession", "Link", "LogEntry"]
 
-log = logging.getLogger("urlab_client.web")
+log: logging.Logger = logging.getLogger("urlab_client.web")
 
 _PERIOD_S = 1 / 60
 _RETRY_S = 1.0
@@ -87,7 +87,7 @@ class Audience:
 
     def __init__(self, viewer: Viewer) -> None:
         self.viewer = viewer
-        self.changed = asyncio.Event()
+        self.changed: asyncio.Event = asyncio.Event()
 
 
 class ConsoleSession:
@@ -102,18 +102,18 @@ class ConsoleSession:
     def __init__(self, client: URLabClient, lease: DrivingLease, recordings: Path) -> None:
         self.client = client
         self.lease = lease
-        self.link = Link("connecting", since=time.time())
-        self.world = WorldDescription()
-        self.world_json = encode({"type": "world", "world": self.world})
+        self.link: Link = Link("connecting", since=time.time())
+        self.world: WorldDescription = WorldDescription()
+        self.world_json: bytes = encode({"type": "world", "world": self.world})
         self.state_json: bytes | None = None
-        self.state_seq = 0
+        self.state_seq: int = 0
         self.entries: deque[LogEntry] = deque(maxlen=_KEPT)
         self.audience: set[Audience] = set()
         self.snapshot: StateSnapshot | None = None
-        self.mujoco_viewer = MujocoViewer(client)
-        self.controls = Controls(self)
-        self.recordings = Recordings(client, recordings)
-        self.replay = Replay(self)
+        self.mujoco_viewer: MujocoViewer = MujocoViewer(client)
+        self.controls: Controls = Controls(self)
+        self.recordings: Recordings = Recordings(client, recordings)
+        self.replay: Replay = Replay(self)
         self._bells: set[asyncio.Event] = set()
         self._n = 0
         self._want: str | None = "discover"

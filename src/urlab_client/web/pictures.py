@@ -42,7 +42,9 @@ class EncodedPicture:
         self.seq = seq
         self.received_ns = received_ns
         self.jpeg = encoded
-        self.head = msgspec.json.encode({"seq": seq, "received": received_ns / 1e6, "sim_time": sim_time, "mode": mode})
+        self.head: bytes = msgspec.json.encode(
+            {"seq": seq, "received": received_ns / 1e6, "sim_time": sim_time, "mode": mode}
+        )
 
     def frame(self) -> bytes:
         """Return length of the head (4 bytes, little-endian), head, and JPEG."""

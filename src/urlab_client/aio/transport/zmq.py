@@ -49,7 +49,7 @@ from urlab_client.protocol.messages.streams import (
 
 __all__ = ["ZmqTransport"]
 
-log = logging.getLogger("urlab_client.transport")
+log: logging.Logger = logging.getLogger("urlab_client.transport")
 
 # Plain numbers: each operation on the enumerations costs about a microsecond, and a request takes a dozen.
 _NOBLOCK = int(zmq.NOBLOCK)
@@ -111,8 +111,8 @@ class ZmqTransport:
         self._closed = False
         self._obstacle = connection_status.UNANSWERED
         self._attempts = connection_status.Attempts(0.0)
-        self.lost_at = 0.0
-        self.refused = False
+        self.lost_at: float = 0.0
+        self.refused: bool = False
         self._silent_since: float | None = None
         self._retrying = False
         self.on_event: Callable[[ClientEvent], None] | None = None
