@@ -21,7 +21,7 @@ from selenium.webdriver.support.ui import WebDriverWait
 pytestmark = pytest.mark.browser
 
 TOO_WIDE = """[...document.querySelectorAll('main *, header *')]
-  .filter((one) => !one.closest('.frame, .entries, .actors') && one.getBoundingClientRect().right > innerWidth + 1)
+  .filter((one) => !one.closest('.frame, .entries, .actors, .recordings') && one.getBoundingClientRect().right > innerWidth + 1)
   .map((one) => one.outerHTML.slice(0, 80))"""
 
 
@@ -71,7 +71,7 @@ def test_the_stop_button_stops_and_space_goes_on(page: Page) -> None:
     page.click("#stop")
     page.until(f"!({RUNNING})")
     page.slide(0.9)
-    page.until("document.querySelector('#log').innerText.includes('set_paused')")
+    page.until("document.querySelector('#log').innerText.includes('set paused')")
     assert not page.look(page.elbow_is(0.9))
     page.driver.execute_script("document.dispatchEvent(new KeyboardEvent('keydown', {key: ' ', bubbles: true}))")
     page.driver.execute_script("document.body.dispatchEvent(new KeyboardEvent('keydown', {key: ' ', bubbles: true}))")
@@ -158,7 +158,7 @@ def test_actors_are_spawned_moved_and_removed_and_nobody_loses_what_they_type(pa
     page.until("document.querySelector('[data-actor=third]') !== null")
     assert x == page.driver.switch_to.active_element
     assert x.get_attribute("value") == "1.5"
-    page.find("[data-actor=second] button[title^=Move]").click()
+    page.find("[data-actor=second] [aria-label='Move second']").click()
     page.asked("api/ops/list_actors", lambda _: where("second")[0] == 1.5, {})
     for actor in ("second", "third"):
         remove = page.find(f"[data-actor={actor}] button[title^=Remove]")
