@@ -18,7 +18,8 @@ from urlab_client.web.driving_lease import Viewer
 from urlab_client.web.ops import encode
 
 if TYPE_CHECKING:
-    from urlab_client.aio import URLabBlueprint, URLabClient
+    from urlab_client.aio import URLabClient
+    from urlab_client.protocol.scene_types import URLabBlueprint
 
 __all__ = ["ModelRoutes", "take_model"]
 
