@@ -13,8 +13,8 @@ import msgspec
 
 from benchmarks.harness import Result, measure
 from benchmarks.machine import describe
+from benchmarks.robots import DIALECT
 from benchmarks.rows import all_rows, one_row
-from benchmarks.rows.simulated import DIALECT
 
 
 def main() -> int:
@@ -27,7 +27,7 @@ def main() -> int:
     parser.add_argument("--json", type=Path, default=Path("benchmarks.json"), help="file to write (%(default)s)")
     parser.add_argument("--seconds", type=float, help="seconds to measure each row, instead of 10, or 1 with --quick")
     parser.add_argument(
-        "--dialect", choices=("alpha", "beta"), default="alpha", help="of the rows' simulated servers (%(default)s)"
+        "--dialect", choices=("alpha", "beta"), default="alpha", help="what the rows' servers speak (%(default)s)"
     )
     parser.add_argument("--list", action="store_true", help="list the rows and stop")
     options = parser.parse_args()

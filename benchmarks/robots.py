@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import functools
 import importlib.util
+import os
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from benchmarks.canned import Requester
 from urlab_client.protocol.base import Request
@@ -16,7 +19,10 @@ from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.protocol.messages.session import Hello, HelloOk, Meta, Step
 from urlab_client.server import SimulatedServer
 
-__all__ = ["humanoid", "recorded", "recorded_of", "robot_mjcf"]
+__all__ = ["DIALECT", "dialect", "humanoid", "recorded", "recorded_of", "robot_mjcf"]
+
+DIALECT = "URLAB_BENCHMARK_DIALECT"
+"""Environment variable that names the dialect of all servers, for child processes, too."""
 
 _SENSORS = """
     <gyro name="imu_gyro" site="imu"/>
@@ -56,8 +62,15 @@ def robot_mjcf(joints: int, *, terrain: int = 0, standing: bool = False) -> str:
     </mujoco>"""
 
 
+def dialect() -> str:
+    """Return the dialect of all servers."""
+    return os.environ.get(DIALECT, "alpha")
+
+
 @functools.cache
-def recorded(joints: int, count: int = 1, *, mode: str = "direct", terrain: int = 0) -> Mapping[str, bytes]:
+def recorded(
+    joints: int, count: int = 1, *, mode: str = "direct", terrain: int = 0, spoken: str = ""
+) -> Mapping[str, bytes]:
     """Return what the simulated server answers to `hello`, `meta`, `set_mode` and `step`, by op.
 
     Args:
@@ -65,23 +78,45 @@ def recorded(joints: int, count: int = 1, *, mode: str = "direct", terrain: int 
         count: Robots.
         mode: Step mode that the server is left in.
         terrain: See `robot_mjcf`.
+        spoken: Dialect of the answers, where it is not that of all servers.
     """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "robot.xml"
         path.write_text(robot_mjcf(joints, terrain=terrain))
-        return recorded_of(path, count, mode=mode)
+        return recorded_of(path, count, mode=mode, spoken=spoken)
 
 
-def recorded_of(path: Path, count: int = 1, *, mode: str = "direct") -> dict[str, bytes]:
+def recorded_of(path: Path, count: int = 1, *, mode: str = "direct", spoken: str = "") -> dict[str, bytes]:
     """Return what `recorded` does of the robots in an MJCF file."""
     answers: dict[str, bytes] = {}
-    with SimulatedServer(*[path] * count, play=True) as server, Requester(server.step_port) as floor:
+    # Older packages know one dialect only, and no option.
+    spoken = spoken or dialect()
+    options: dict[str, Any] = {} if spoken == "alpha" else {"dialect": spoken}
+    with SimulatedServer(*[path] * count, play=True, **options) as server, Requester(server.step_port) as floor:
         answers["hello"] = floor.ask(encode_request(Hello(), ""))
         hello = decode_reply(op_of(Hello), HelloOk, answers["hello"])
         others: list[Request[Any]] = [Meta(), SetMode(mode=mode), Step()]
         for request in others:
             answers[op_of(request).name] = floor.ask(encode_request(request, hello.session_id))
+        if options:
+            answers |= _of_owned_robots(floor, hello)
     return answers
+
+
+def _of_owned_robots(floor: Requester, hello: HelloOk) -> dict[str, bytes]:
+    """Return what else a server answers to whoever drives its robots, and a handshake that names no other ports."""
+    from urlab_client.protocol.messages.control import ClaimControl  # noqa: PLC0415  # older packages lack it
+    from urlab_client.protocol.messages.runtime import SetPaused  # noqa: PLC0415
+
+    claim = ClaimControl(articulation=hello.articulations[0].prefix)
+    plain = msgspec.msgpack.decode(floor.ask(encode_request(Hello(), "")))
+    for elsewhere in ("instance", "shm_rpc"):
+        plain.pop(elsewhere, None)
+    return {
+        "claim_control": floor.ask(encode_request(claim, plain["session_id"])),
+        "set_paused": floor.ask(encode_request(SetPaused(paused=True), plain["session_id"])),
+        "hello": msgspec.msgpack.encode(plain),
+    }
 
 
 def humanoid() -> Path:

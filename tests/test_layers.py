@@ -63,6 +63,7 @@ ALLOWED: dict[str, frozenset[str]] = {
     ),
     "cluster": frozenset({"_installation", "integrations", "protocol", "sync"}),
     "web": frozenset({"_extras", "_installation", "aio", "integrations", "protocol"}),
+    "mcp": frozenset({"_extras", "aio", "protocol", "web"}),
     "cli": frozenset(
         {
             "",
@@ -74,6 +75,7 @@ ALLOWED: dict[str, frozenset[str]] = {
             "enums",
             "integrations",
             "keys",
+            "mcp",
             "protocol",
             "randomise",
             "server",
@@ -224,7 +226,7 @@ def test_imports_inside_the_large_layers_point_one_way() -> None:
 
 
 # What stands on the client uses its public API alone.
-ON_THE_CLIENT = ("integrations", "cluster", "web", "cli")
+ON_THE_CLIENT = ("integrations", "cluster", "web", "mcp", "cli")
 # Public by the reference all the same.
 PUBLIC_ALL_THE_SAME = frozenset({"_data_lock"})
 

@@ -109,13 +109,14 @@ def main() -> None:
             command("console", ready["address"], *ports, f"--recordings={recordings}") as (_, said),
             browser() as driver,
         ):
+            page = Photographer(driver, folder)
+            page.resize(1440, 1000, "light")  # before there is a 3-D view, which takes its time to follow
             driver.get(next(word for word in said.split() if word.startswith("http://")))
-            take_all(Photographer(driver, folder), server)
+            take_all(page, server)
 
 
 def take_all(page: Photographer, server: subprocess.Popen[str]) -> None:
     driver = page.driver
-    page.resize(1440, 1000, "light")
     page.until("document.querySelectorAll('[data-robot]').length == 2")
     page.until("document.querySelector('#view .cover').hidden")
     driver.execute_script(MOVE)
@@ -127,7 +128,7 @@ def take_all(page: Photographer, server: subprocess.Popen[str]) -> None:
         page.settle()
         page.shoot(name)
     driver.execute_script("document.querySelector('#sheet-toggle').click()")
-    page.resize(1440, 700, "light")
+    page.resize(1440, 1000, "light")
     driver.execute_script("document.querySelector('#record').click()")
     page.until("document.querySelector('[data-recording] .replay') !== null")
     driver.execute_script("clearInterval(window.moving); document.querySelector('[data-recording] .replay').click()")

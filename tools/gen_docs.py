@@ -346,6 +346,7 @@ def around() -> list[str]:
         "urlab_client.randomise",
         "urlab_client.cluster",
         "urlab_client.web",
+        "urlab_client.mcp",
         "urlab_client.keys",
         "pytest_urlab",
     ]

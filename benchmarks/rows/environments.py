@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from benchmarks.harness import Burst, Pair, Row
-from benchmarks.robots import humanoid
+from benchmarks.robots import dialect, humanoid
 
 __all__ = ["ROWS"]
 
@@ -47,22 +47,27 @@ def _against(ours: Callable[[], Any], copies: int, own_copies: int | None) -> It
         yield Pair(ours=_stepping(environment, copies), floor=_stepping(own, own_copies or 1))
 
 
+def _address() -> str:
+    chosen = "" if dialect() == "alpha" else f"?dialect={dialect()}"  # older packages have no such option
+    return f"sim://{humanoid()}{chosen}"
+
+
 def _single() -> Any:
     from urlab_client.integrations.gym import URLabEnv  # noqa: PLC0415  # an extra
 
-    return URLabEnv.connect(f"sim://{humanoid()}", n_substeps=_SUBSTEPS)
+    return URLabEnv.connect(_address(), n_substeps=_SUBSTEPS)
 
 
 def _vector() -> Any:
     from urlab_client.integrations.gym import URLabVectorEnv  # noqa: PLC0415  # an extra
 
-    return URLabVectorEnv(f"sim://{humanoid()}", _SERVERS, n_substeps=_SUBSTEPS)
+    return URLabVectorEnv(_address(), _SERVERS, n_substeps=_SUBSTEPS)
 
 
 def _batch() -> Any:
     from urlab_client.integrations.gym import URLabBatchEnv  # noqa: PLC0415  # an extra
 
-    return URLabBatchEnv(f"sim://{humanoid()}", _BATCH, n_substeps=_SUBSTEPS)
+    return URLabBatchEnv(_address(), _BATCH, n_substeps=_SUBSTEPS)
 
 
 def _rows() -> tuple[Row, ...]:

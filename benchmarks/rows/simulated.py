@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import statistics
 import subprocess
 import sys
@@ -19,14 +18,12 @@ import mujoco
 from benchmarks.canned import Requester, server
 from benchmarks.conditions import warm
 from benchmarks.harness import Burst, Figure, Pair, Row
-from benchmarks.robots import humanoid, recorded_of, robot_mjcf
+from benchmarks.robots import dialect, humanoid, recorded_of, robot_mjcf
 from urlab_client.protocol.codec import decode_reply, encode_request, op_of
 from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.protocol.messages.session import Hello, HelloOk, Reset, Step
 
-__all__ = ["DIALECT", "ROWS"]
-
-DIALECT = "URLAB_BENCHMARK_DIALECT"
+__all__ = ["ROWS"]
 """What the simulated servers of these rows speak; rows may run in processes of their own."""
 
 _JOINTS = 29
@@ -79,7 +76,7 @@ def _simulated(path: Path) -> Iterator[_Simulated]:
         "--play",
         "--json",
         "--until-eof",
-        f"--dialect={os.environ.get(DIALECT, 'alpha')}",
+        f"--dialect={dialect()}",
         *ports,
     ]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:

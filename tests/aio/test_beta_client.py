@@ -479,6 +479,25 @@ async def test_another_mujoco_is_worked_with(mode: str) -> None:
         beta.close()
 
 
+async def test_another_mujoco_without_xml_leaves_no_model_and_says_so() -> None:
+    beta = ScriptedBeta(skew=True)
+    whole = beta.answers["hello"]
+    beta.on(
+        "hello", lambda request: {k: v for k, v in whole(request).items() if k not in ("mjcf_compiled", "vfs_assets")}
+    )
+    try:
+        async with client_of(beta, step_mode="direct", mujoco_version_check=False) as client:
+            with pytest.warns(UserWarning, match=r"MuJoCo 3\.11\.1.*There is no local model") as said:
+                await client.discover()
+            assert len(said) == 1
+            assert (client.model, client.model_is_approximate) == (None, False)
+            client.articulations["arm_a"].ctrl_array[:] = 0.5
+            await client.step(2)
+            assert beta.ctrl["arm_C_0"] == [0.5]
+    finally:
+        beta.close()
+
+
 async def test_a_version_string_decides_nothing(client: URLabClient, beta: ScriptedBeta) -> None:
     """Beta statement 80."""
     await client.sim.start()

@@ -8,9 +8,8 @@ import sys
 from collections.abc import AsyncIterator
 from typing import Any, TypeVar
 
-import msgspec
 import pytest
-import zmq
+from behind_its_back import behind_its_back
 from relay import Relay
 from waiting import DEADLINE_S, pass_time
 from waiting import until as wait_until
@@ -50,20 +49,6 @@ async def until(events: Stream[ClientEvent], kind: type[E]) -> E:
 async def server() -> AsyncIterator[SimulatedServer]:
     async with SimulatedServer("arm", play=True) as made:
         yield made
-
-
-async def behind_its_back(server: SimulatedServer, client: URLabClient, op: str) -> None:
-    """Do what somebody at the editor does, where no client is told."""
-
-    def ask() -> None:
-        with zmq.Context() as context, context.socket(zmq.REQ) as socket:
-            socket.linger = 0
-            socket.rcvtimeo = round(1e3 * DEADLINE_S)
-            socket.connect(f"tcp://127.0.0.1:{server.client_options()['step_port']}")
-            socket.send(msgspec.msgpack.encode({"op": op, "session_id": client.session_id}))
-            assert msgspec.msgpack.decode(socket.recv())["op"] == f"{op}_ok"
-
-    await asyncio.to_thread(ask)
 
 
 async def test_play_that_is_stopped_in_the_editor_is_noticed_and_so_is_the_next(server: SimulatedServer) -> None:

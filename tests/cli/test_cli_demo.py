@@ -130,11 +130,14 @@ def test_leaves_nothing_else(demonstration: tuple[Path, str], record: dict[str, 
     assert [*folder.parent.iterdir()] == [folder]
 
 
-@pytest.mark.parametrize("name", ["ant", "pusher_v5"])
-def test_drives_the_robot_of_a_user(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(("name", "dialect"), [("ant", "alpha"), ("pusher_v5", "beta")])
+def test_drives_the_robot_of_a_user(
+    tmp_path: Path, name: str, dialect: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     model = shutil.copy(GYMNASIUM_MODELS / f"{name}.xml", tmp_path / "my-robot.xml")
     output = tmp_path / "a" / "b"
-    assert main(["demo", str(model), "--steps", "40", "--no-render", "--output", str(output)]) == 0
+    options = ["--steps", "40", "--no-render", "--output", str(output), "--dialect", dialect]
+    assert main(["demo", str(model), *options]) == 0
     record = json.loads((output / "run.json").read_bytes())
     assert record["model"]["path"] == str(model)
     assert record["options"]["timestep"] == mujoco.MjModel.from_xml_path(str(model)).opt.timestep

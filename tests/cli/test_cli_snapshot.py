@@ -93,7 +93,7 @@ def test_a_stepped_server_publishes_nothing(dialect: DialectName, capsys: pytest
     with SimulatedServer("arm", play=True, step_mode="direct", dialect=dialect) as server:
         address = f"{server.address}:{server.step_port}"
         assert main(["snapshot", address, "--camera", "arm/wrist", "--timeout", "2"]) == 2
-    assert "live mode only" in capsys.readouterr().err
+    assert "outside live mode it publishes no pictures" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

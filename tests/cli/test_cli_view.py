@@ -14,7 +14,7 @@ NO_DISPLAY = {"DISPLAY": "", "WAYLAND_DISPLAY": ""}
 def test_a_run_goes_into_a_file(tmp_path: Path) -> None:
     done = urlab(
         "view",
-        "sim://quadruped?play",
+        "sim://quadruped?play&dialect=beta",
         "--rerun",
         "--save",
         "run.rrd",

@@ -103,3 +103,22 @@ def _live() -> Any:
     from urlab_client.protocol.messages.runtime import SetMode
 
     return SetMode(mode="live")
+
+
+async def test_cameras_that_were_never_switched_on(connect: Any, serve: Any, dialect: str) -> None:
+    with serve("arm", play=True) as server:
+        client = connect(server, live_pictures=False)
+        await client.discover()
+
+        async def said() -> list[str]:
+            return [f.text for f in (await client.explain()).findings if f.subject == "cameras"]
+
+        if dialect == "alpha":
+            assert await said() == []
+            return
+        assert "not switched on arm/overview, arm/wrist" in (await said())[0]
+        await client.runtime.set_camera_streaming({"wrist": True, "overview": True})
+        diagnosis = await client.explain()
+        assert not [f for f in diagnosis.findings if f.subject == "cameras"]
+        (state,) = [f for f in diagnosis.findings if f.subject == "state stream"] or [None]
+        assert state is None or state.verdict is Verdict.OK, "the server says on which port it is"

@@ -166,6 +166,28 @@ async def test_time_passes_without_a_local_model(connect: Any, server: Any) -> N
     assert client.sim_time == pytest.approx(0.1)
 
 
+@pytest.mark.parametrize("local_model", [True, False])
+@pytest.mark.parametrize("mode", ["direct", "live"])
+async def test_time_that_passed_before_a_client_came_does_not_count(
+    connect: Any, server: Any, mode: str, local_model: bool
+) -> None:
+    first = connect(server, step_mode="direct")
+    await first.discover()
+    (art,) = first.articulations.values()
+    await art.move_to({"knee": 0.6})
+    await first.run_for(1.0)
+    await first.close()
+    client = connect(server, step_mode=mode, local_model=local_model)
+    await client.discover()
+    if mode == "live":
+        await client.runtime.set_paused(False)
+    assert 0.2 - 1e-9 <= await client.run_for(0.2) < 1.0
+    if local_model and mode == "direct":
+        again = connect(server, step_mode="direct")
+        await again.discover()
+        assert await again.articulations["kinds"].move_to({"knee": 0.0}) > 0.0, "it was elsewhere"
+
+
 async def test_waiting_ends_when_it_is_so(moving: Any) -> None:
     (art,) = moving.articulations.values()
     art.set_ctrl({"push": 1.0})

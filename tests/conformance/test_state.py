@@ -54,7 +54,7 @@ async def test_who_answers(connect: Any, serve: Any, bot: str) -> None:
         assert repr(getattr(client, "twin", client)).endswith("connected>")
         sim = repr(getattr(client, "twin", client).sim)
         assert sim.startswith("<SimNamespace tcp://127.0.0.1:")
-        assert ": start, " in sim
+        assert ", start, " in sim
         assert repr(await client.explain()).startswith("<Diagnosis ")
 
 

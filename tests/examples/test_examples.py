@@ -11,13 +11,16 @@ from pathlib import Path
 import pytest
 
 # Examples that need an extra which the test command does not install, or several seconds: the marker of their tests.
+# Examples that serve until they are told to stop, and the tests of which are elsewhere.
+SERVING = {"fastapi_backend"}
+
 MARKED = {
     "ray_rollouts": pytest.mark.ray,
     "view_rerun": pytest.mark.view,
     **dict.fromkeys(("gym_env", "record_run", "run_policy", "vector_env"), pytest.mark.long),
 }
 
-EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.py"))
+EXAMPLES = sorted(path for path in (Path(__file__).parents[2] / "examples").glob("*.py") if path.stem not in SERVING)
 
 
 @pytest.mark.parametrize(

@@ -88,6 +88,7 @@ def test_servers_batches_and_single_environments_vary_bit_for_bit_alike(
         made.append(single)
         assert single.randomise == EVERYTHING, "the server says what it varies"
         assert np.array_equal(single.reset(seed=3)[0], starts[0][0][0])
+        ours: Any = ()
         for action, (seen, rewards, *_) in zip(actions[:5], rollouts[0], strict=False):
             ours = single.step(action[0])
             assert np.array_equal(ours[0], seen[0])
@@ -181,7 +182,10 @@ def test_late_lost_and_noisy_samples_are_seen_and_rewards_are_judged_without(mad
         assert 0.007 < np.std(np.array(noisy)[1:, :8] - np.array(judged)) < 0.013
         for declared, reason in (
             (Randomisation(noise=(Noise(field="qvel", std=1.0),)), "noise on qvel, which is not observed"),
-            (Randomisation(noise=(Noise(field="qpos", articulation="leg"),)), "no articulation is called 'leg'"),
+            (
+                Randomisation(noise=(Noise(field="qpos", articulation="leg"),)),
+                "no observed articulation",
+            ),
             (Randomisation(push=(Push(body="arm/nose", force=(0, 1), every=(1, 1)),)), "no body 'arm/nose'"),
             (Randomisation(vary=(Vary(what="mass", on="arm/nose", scale=(1, 2)),)), "no body with a mass is called"),
         ):

@@ -12,6 +12,8 @@ import pytest
 
 from urlab_client.integrations.gym import (
     FixedReach,
+    Push,
+    PushPictures,
     Reach,
     SpaceMapping,
     Start,
@@ -52,7 +54,18 @@ def walkers() -> Iterator[list[str]]:
         yield [f"{server.address}:{server.step_port}" for server in (one, two)]
 
 
-@pytest.mark.parametrize(("kind", "servers"), [(Reach, "arms"), (Walk, "walkers")])
+@pytest.fixture(scope="module")
+def pushers() -> Iterator[list[str]]:
+    """Addresses of two servers with what `Push` needs."""
+    models = ("arm", "block", "floor")
+    with (
+        SimulatedServer(*models, play=True, camera_size=(96, 72)) as one,
+        SimulatedServer(*models, play=True, camera_size=(96, 72)) as two,
+    ):
+        yield [f"{server.address}:{server.step_port}" for server in (one, two)]
+
+
+@pytest.mark.parametrize(("kind", "servers"), [(Reach, "arms"), (Push, "pushers"), (Walk, "walkers")])
 def test_all_three_environments_agree_bit_for_bit(
     kind: type[Task], servers: str, made: list[Any], request: pytest.FixtureRequest
 ) -> None:
@@ -192,6 +205,45 @@ def test_an_argument_wins_over_the_task_and_what_is_judged_needs_not_be_observed
             single.close()
     with pytest.raises(ValueError, match=r"'sensors' is not observed: .*observations=\['qpos'\]"):
         SpaceMapping(whole.model, {"arm": "arm_"}, ["qpos"]).field(np.zeros(8), "arm", "sensors")
+
+
+def test_a_block_is_pushed_to_its_target_and_seen_in_pictures_alone(pushers: list[str], made: list[Any]) -> None:
+    class Ahead(Push):
+        def reset(self, rng: np.random.Generator, start: Start) -> None:
+            super().reset(rng, start)
+            start.place("block/block", [0.44, 0.0, 0.03])
+            start.goal["target"] = np.array([0.56, 0.0])
+
+    class AheadByEye(Ahead, PushPictures):
+        pass
+
+    batch = URLabBatchEnv(pushers[0], 1, task=Ahead())
+    made.append(batch)
+    behind = np.array([Ahead.BEHIND[joint] for joint in ("shoulder_lift", "elbow", "wrist_pitch")])
+    ahead = np.array([0.62, 0.3, -0.92])
+    batch.reset(seed=0)
+    rewards: list[float] = []
+    infos: dict[str, Any] = {}
+    for share in np.linspace(0.0, 1.0, 60):
+        lift, elbow, pitch = (1 - share) * behind + share * ahead
+        _, reward, _, _, infos = batch.step(np.array([[0, lift, elbow, 0, pitch, 0, 0]], dtype=np.float32))
+        rewards.append(float(reward[0]))
+    assert infos["success"].all()
+    assert rewards[-1] > 0.9 > 0.0 > rewards[0]
+
+    env = URLabEnv.connect(pushers[1], task=AheadByEye())
+    made.append(env)
+    observation, _ = env.reset(seed=0)
+    assert set(observation) == {"arm", "cameras", "task"}, "not where the block is"
+    assert set(env.action_space.spaces) == {"arm"}, "the block has no actuators"  # type: ignore[attr-defined]
+    picture = observation["cameras"]["arm/overview"].astype(int)
+    assert picture.shape == (72, 96, 3)
+    orange = (picture[..., 0] > 150) & (picture[..., 2] < 80)
+    assert 3 < orange.sum() < 300
+    with pytest.raises(ValueError, match=r"a batch observes no cameras \(arm/overview\): use servers"):
+        URLabBatchEnv(pushers[0], 1, task=PushPictures())
+    with pytest.raises(ValueError, match="'block' is not observed"):
+        env.mapping.field(observation, "block", "qpos")
 
 
 def test_what_a_task_settles_is_refused_beside_it(arms: list[str], made: list[Any]) -> None:

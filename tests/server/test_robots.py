@@ -53,7 +53,7 @@ def tilt(scene: CompiledScene, body: int) -> float:
 def test_the_models_are_found_by_name() -> None:
     models = bundled_models()
 
-    assert sorted(models) == ["arm", "ball", "floor", "pallet", "quadruped"]
+    assert sorted(models) == ["arm", "ball", "block", "floor", "pallet", "quadruped"]
     for name, path in models.items():
         assert mujoco.MjSpec.from_file(str(path)).modelname == name
 

@@ -8,12 +8,15 @@ import os
 import select
 import socket
 import struct
+import sys
 import time
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 import msgspec
+
+from urlab_client._windows import NamedEvent
 
 HEADER = struct.Struct("<IIIIQI")
 
@@ -62,17 +65,53 @@ class RawRegion:
         os.close(self.fd)
 
 
+class NamedEvents:
+    """What Windows has in place of the doorbell, for requests and replies; nothing tells of streams."""
+
+    def __init__(self, directory: Path) -> None:
+        self.asked = NamedEvent(f"Local\\URLab_{directory.name}_req_ready")
+        self.answered = NamedEvent(f"Local\\URLab_{directory.name}_rep_ready")
+
+    def send(self, ring: bytes) -> None:
+        if ring == b"q":
+            self.asked.set()
+
+    def wait(self, seconds: float) -> bytes:
+        return b"r" if self.answered.wait(seconds) else b""
+
+    def close(self) -> None:
+        self.asked.close()
+        self.answered.close()
+
+
+class Doorbell:
+    """The Unix socket."""
+
+    def __init__(self, directory: Path) -> None:
+        self.socket = socket.socket(socket.AF_UNIX)
+        self.socket.connect(os.fspath(directory / "doorbell.sock"))
+
+    def send(self, ring: bytes) -> None:
+        self.socket.send(ring)
+
+    def wait(self, seconds: float) -> bytes:
+        ready, _, _ = select.select([self.socket], (), (), seconds)
+        return self.socket.recv(4096) if ready else b""
+
+    def close(self) -> None:
+        self.socket.close()
+
+
 class RawShm:
-    """Requests over `req.shm` and `rep.shm`, with or without the doorbell."""
+    """Requests over `req.shm` and `rep.shm`, with or without being told."""
 
     def __init__(self, directory: Path, *, bell: bool) -> None:
         self.directory = directory
         self.requests = RawRegion(directory / "req.shm")
         self.replies = RawRegion(directory / "rep.shm")
-        self.bell: socket.socket | None = None
+        self.bell: Doorbell | NamedEvents | None = None
         if bell:
-            self.bell = socket.socket(socket.AF_UNIX)
-            self.bell.connect(os.fspath(directory / "doorbell.sock"))
+            self.bell = NamedEvents(directory) if sys.platform == "win32" else Doorbell(directory)
 
     def __enter__(self) -> Self:
         return self
@@ -103,7 +142,6 @@ class RawShm:
     def wait(self, seconds: float) -> bytes:
         """Rings that came."""
         if self.bell is None:
-            select.select((), (), (), seconds)
+            time.sleep(seconds)
             return b""
-        ready, _, _ = select.select([self.bell], (), (), seconds)
-        return self.bell.recv(4096) if ready else b""
+        return self.bell.wait(seconds)

@@ -17,7 +17,6 @@ from starlette.applications import Starlette
 from starlette.routing import Mount
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
-from waiting import eventually
 
 from urlab_client.aio import URLabClient
 from urlab_client.integrations.record import read_run
@@ -120,6 +119,20 @@ def test_openapi_describes_every_op_that_is_served(http: TestClient) -> None:
     assert set(document["components"]["schemas"]["BeginPieOk"]["properties"]) == {"op", "state", "compile_error"}
     named = json.dumps(document).split('"#/components/schemas/')[1:]
     assert {part.partition('"')[0] for part in named} <= set(document["components"]["schemas"])
+
+
+def test_openapi_says_where_it_is_mounted(server: SimulatedServer) -> None:
+    for proxy in ("", "/behind/proxy"):
+        outer = mounted(server, "/lab", Access(hosts=["robots.example"], tokens=False))
+        with TestClient(outer, base_url="http://robots.example", root_path=proxy) as client:
+            told = client.get(f"{proxy}/lab/api/openapi.json").json()
+        assert told["servers"] == [{"url": f"{proxy}/lab"}]
+
+
+def test_it_says_why_a_robot_does_not_move(http: TestClient) -> None:
+    http.post("/api/run", json={"running": False})
+    findings = http.get("/api/explain").json()["findings"]
+    assert any(finding["verdict"] == "problem" and "paused" in finding["text"] for finding in findings)
 
 
 def test_an_op_is_done_and_a_refusal_is_said(http: TestClient) -> None:
@@ -340,16 +353,25 @@ def test_a_model_is_taken_in_as_a_file_or_an_archive(tmp_path: Path) -> None:
                 assert said in refused.json()["error"]["message"]
 
 
-def test_live_pictures_come_as_files_too(http: TestClient) -> None:
-    http.post("/api/run", json={"running": True})
+def test_pictures_come_as_files_too_while_running_paused_and_stepped(http: TestClient) -> None:
+    def shown(kind: str) -> tuple[int, int]:
+        answer = http.get(f"/api/cameras/arm/overview.{kind}")
+        assert answer.status_code == 200, answer.text
+        assert answer.headers["content-type"] == {"jpg": "image/jpeg", "png": "image/png"}[kind]
+        return Image.open(io.BytesIO(answer.content)).size
 
-    def shown() -> bytes | None:  # the answer does not wait long for a first picture
-        answer = http.get("/api/cameras/arm/overview.jpg")
-        return answer.content if answer.status_code == 200 else None
-
-    picture = eventually(shown)
-    assert Image.open(io.BytesIO(picture)).size == (64, 48)
-    assert http.get("/api/cameras/arm/nothing.jpg").status_code == 404
+    try:
+        for prepare in (
+            lambda: http.post("/api/run", json={"running": True}),
+            lambda: http.post("/api/run", json={"running": False}),
+            lambda: http.post("/api/ops/set_mode", json={"mode": "direct"}),
+        ):
+            prepare()
+            assert shown("jpg") == shown("png") == (64, 48)
+    finally:
+        http.post("/api/ops/set_mode", json={"mode": "live"})
+    for kind in ("jpg", "png"):
+        assert http.get(f"/api/cameras/arm/nothing.{kind}").status_code == 404
 
 
 def test_the_viewer_gets_the_model_and_the_state_that_is_shown(http: TestClient) -> None:
@@ -449,3 +471,20 @@ def test_the_controls_are_lost_by_not_using_them() -> None:
     assert lease.holder is None
     lease.use(bob)
     assert lease.holder is bob
+
+
+def test_a_paused_beta_is_seen_and_driven() -> None:
+    with (
+        SimulatedServer("arm", play=True, camera_size=(64, 48), dialect="beta") as beta,
+        TestClient(site := mounted(beta, "/"), base_url="http://localhost") as http,
+    ):
+        key = http.post("/api/session", json={"token": site.state.access.invite()}).json()["key"]
+        http.headers["authorization"] = f"Bearer {key}"
+        with http.websocket_connect("ws://localhost/api/live") as live:
+            heard(live, "world", lambda message: bool(message["world"]["articulations"]))
+            with http.websocket_connect("ws://localhost/api/cameras/arm/wrist/live") as camera:
+                frame = camera.receive_bytes()  # though its stream is silent
+            assert Image.open(io.BytesIO(frame[4 + int.from_bytes(frame[:4], "little") :])).size == (64, 48)
+            assert http.post("/api/ctrl", json={"arm": {"elbow": 0.5}}).status_code == 200
+            http.post("/api/run", json={"running": True})
+            heard(live, "state", lambda state: abs(state["articulations"]["arm"]["qpos"][2]) > 0.01)

@@ -113,7 +113,10 @@ class URLabCameraView:
         buffer_bytes: int = BUFFER_BYTES,
         timeout: Timeout = DEFAULT,
     ) -> Stream[CameraSample]:
-        """Stream its pictures. The server publishes them in live mode only, the plugin without time or number.
+        """Stream its pictures, as the server publishes them.
+
+        A server of the alpha does so in live mode only, the plugin without time or number. Newer servers do in every
+        mode, each state once: nothing comes while the simulation stands still.
 
         Args:
             policy: `latest`, or `all` within the buffer.

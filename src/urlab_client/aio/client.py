@@ -10,6 +10,8 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from types import TracebackType
 from typing import NoReturn, Self, TypeVar
 
+from msgspec import structs
+
 from urlab_client.aio.address import transport_to
 from urlab_client.aio.arguments import integer
 from urlab_client.aio.client_state import ClientState
@@ -35,6 +37,7 @@ from urlab_client.aio.state.connection_monitor import ConnectionMonitor
 from urlab_client.aio.state.discovery import Discovery
 from urlab_client.aio.state.recovery import resync
 from urlab_client.aio.state.resetting import take_reset
+from urlab_client.aio.state.session_keeper import SessionKeeper
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_mode import ask_mode
 from urlab_client.aio.state.stepping import take_steps
@@ -59,6 +62,7 @@ log = logging.getLogger("urlab_client.client")
 R = TypeVar("R", bound=Reply)
 
 _REVERT_S = 1.0
+_LOOKING_ON = (StepMode.AUTO, StepMode.LIVE)
 
 
 class URLabClient(ClientState):
@@ -93,6 +97,12 @@ class URLabClient(ClientState):
             server and network those that nobody looks at; `frames()` is received all the same.
         claim_control: Take control of a robot with the first write to it, where robots have one owner. False is for
             those who look on, and for those who say `articulation.claim()`.
+        keep_session: After the first `discover()`, discover again by itself when the server has been restarted or play
+            has been started by somebody else; `events()` tells of it. A session that another client has taken over is
+            never taken back, and while a step or reset is in doubt, `resync()` comes first.
+        read_only: Look on beside the client that drives: the client opens no session, so that it takes the server over
+            from nobody, and refuses everything that would need one with `ReadOnlyClient`. `discover(handshake=…)` says
+            what there is; state, pictures and events come by the streams. For `transport="zmq"`.
         observe: Called with a `CallRecord` when a request is over, whatever became of it: op, bytes, time in the queue,
             round trip, outcome. It runs on the client's event loop, so it must be quick and must not call the client;
             what it raises is logged and changes nothing.
@@ -124,6 +134,8 @@ class URLabClient(ClientState):
         trust_server: bool = False,
         live_pictures: bool = True,
         claim_control: bool = True,
+        keep_session: bool = False,
+        read_only: bool = False,
         observe: Callable[[CallRecord], object] | None = None,
     ) -> None:
         config = ClientConfig(
@@ -145,11 +157,16 @@ class URLabClient(ClientState):
             trust_server=trust_server,
             live_pictures=live_pictures,
             claim_control=claim_control,
+            keep_session=keep_session,
+            read_only=read_only,
         )
         if encoding not in {"msgpack", "json"}:
             raise ValueError(f"encoding must be msgpack or json, not {encoding!r}")
         if shm_dir is not None and Transport(transport) is not Transport.SHM:
             raise ValueError("shm_dir is for transport='shm'")
+        alone = address.startswith("sim:") or config.transport is Transport.SHM
+        if read_only and (alone or config.step_mode not in _LOOKING_ON):
+            raise ValueError("read_only is for a server that another client drives, over transport='zmq', in no mode")
         if rcv_timeout_ms <= 0:
             raise ValueError(f"rcv_timeout_ms must be above 0, got {rcv_timeout_ms}")
         keys = client_keys(address, config.server_key, config.client_key)
@@ -160,6 +177,7 @@ class URLabClient(ClientState):
             self._transport, default_timeout=rcv_timeout_ms / 1000, json=encoding == "json", observe=observe
         )
         session.control = Control(session, wanted=claim_control)
+        session.read_only = read_only
         self._publishers = Publishers(
             lambda: self._transport.endpoint,
             self._state_port,
@@ -169,7 +187,8 @@ class URLabClient(ClientState):
             keys=keys,
             memory=memory,
         )
-        self._publishers.camera_switch = CameraSwitch(session, self._publishers.subscriptions.refresh)
+        if not read_only:
+            self._publishers.camera_switch = CameraSwitch(session, self._publishers.subscriptions.refresh)
         self._motion = Motion(
             self,
             driven=lambda: any(record.driven for record in self._state.objects.records.values()),
@@ -188,6 +207,7 @@ class URLabClient(ClientState):
             trusted=trust_server or keys is not None or is_local(address),
         )
         self._watch = ConnectionMonitor(session, state)
+        self._keeper = SessionKeeper(session, state, self._discovery)
         self._transport.on_event = self._watch.on_connection
         self._closed = False
         self._sim = SimNamespace(session, state, self._discovery)
@@ -249,7 +269,13 @@ class URLabClient(ClientState):
 
     # Operations
 
-    async def discover(self, observations: str | ObservationLevel = "standard", *, timeout: Timeout = DEFAULT) -> None:
+    async def discover(
+        self,
+        observations: str | ObservationLevel = "standard",
+        *,
+        handshake: bytes | None = None,
+        timeout: Timeout = DEFAULT,
+    ) -> None:
         """Open a session, load the model, and build the wrappers of articulations, entities and cameras.
 
         Safe to repeat: wrappers that still exist go on working. Takes the server over from any other client.
@@ -257,17 +283,29 @@ class URLabClient(ClientState):
         Args:
             observations: `minimal` (qpos, qvel), `standard` (adds ctrl, act, sensors) or `full` (adds body poses and
                 actuator forces).
+            handshake: For a client with `read_only=True`, and for no other: what `handshake()` of the client that
+                drives returns. Call this again with the new one after each start of play.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
+            ValueError: A handshake is given to a client that is not read-only, or it is none.
+            ReadOnlyClient: The client is read-only, and no handshake is given.
             URLabVersionMismatch: Client and server MuJoCo builds differ.
             ServerUnreachable: Nothing answers at the address.
             URLabConnectionError: With `transport="shm"`, the server's shared memory is not on this machine.
             AuthenticationFailed: Server and client do not accept each other's keys.
         """
         level = ObservationLevel(observations)
+        if handshake is not None:
+            if not self._config.read_only:
+                raise ValueError("discover: handshake is for a client with read_only=True, which opens no session")
+            async with self._session.turn(MetaRequest, timeout=timeout) as turn:
+                await self._discovery.look_on(turn, handshake)
+            return
         async with self._session.turn(Hello, timeout=timeout) as turn:
             await self._discovery.open(turn, level)
+        if self._config.keep_session:
+            self._keeper.start()
 
     async def step(
         self,
@@ -417,14 +455,15 @@ class URLabClient(ClientState):
             ModeLocked: The project pins a mode in which pictures come with steps only.
         """
         objects = self._state.objects
-        if cameras is not None and not isinstance(cameras, Iterable):
-            raise TypeError(f"capture takes names of cameras, got {cameras!r:.80}.")
         if isinstance(cameras, str):
             raise TypeError(f"capture takes several names; one: client.camera({cameras!r}).capture()")
         if cameras is None:
             names = {shown: name for name, shown in objects.shown_cameras(objects.camera_names()).items()}
         else:
-            names = {name: name for name in cameras}
+            try:
+                names = {name: name for name in cameras}
+            except TypeError:
+                raise TypeError(f"capture takes names of cameras, got {cameras!r:.80}.") from None
         views = [self.camera(name) for name in names.values()]
         samples = await self._publishers.capture(views, timeout) if views else []
         return dict(zip(names, samples, strict=True))
@@ -552,7 +591,8 @@ class URLabClient(ClientState):
 
         Takes at most a few seconds, does not raise for problems that it finds, and changes nothing on the server.
         """
-        return await diagnose(self._config, self._session, self._state)
+        config = structs.replace(self._config, state_port=self._state_port())
+        return await diagnose(config, self._session, self._state)
 
     async def meta(self, *, timeout: Timeout = DEFAULT) -> list[OpInfo]:
         """List the ops that the server offers; needs no session."""
@@ -571,6 +611,7 @@ class URLabClient(ClientState):
             if self._publishers.camera_switch is not None:
                 await self._publishers.camera_switch.aclose(connected=playing)
             await self._session.control.aclose(connected=playing)
+            await self._keeper.aclose()
             await self._watch.aclose()
             await asyncio.sleep(0)  # a blocking client notices only now that the server has gone meanwhile
             if promoted_from is not None and self.connected and self.manager_present:

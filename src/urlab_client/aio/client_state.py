@@ -5,14 +5,20 @@ from __future__ import annotations
 from threading import RLock
 from typing import TYPE_CHECKING, Any
 
+from msgspec.structs import replace
+
 from urlab_client.aio.articulation import URLabArticulation, URLabEntity
 from urlab_client.aio.cameras import URLabCameraView
+from urlab_client.aio.model.mirror import binary_model
 from urlab_client.aio.session import Session
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.transport.base import TransportStats
 from urlab_client.protocol.client_types import ClientConfig, ServerInfo
+from urlab_client.protocol.codec import encode_message
 from urlab_client.protocol.descriptions import ArticulationDescription, EntityDescription, SceneDescription
 from urlab_client.protocol.enums import StepMode
+from urlab_client.protocol.errors import NoSession
+from urlab_client.protocol.messages.session import NOT_SENT
 from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.names import NameMap
 from urlab_client.protocol.observer import ClientObserver
@@ -191,6 +197,23 @@ class ClientState:
                 entities=[one for one in described if isinstance(one, EntityDescription)],
                 cameras=[camera.describe() for camera in self.global_cameras.values()],
             )
+
+    def handshake(self) -> bytes:
+        """Return what a client with `read_only=True` has to know: names, limits, cameras and the model.
+
+        For another process or machine, which passes it to its own client's `discover(handshake=…)`. It describes the
+        play session of the last handshake, and does not let anybody into this client's session.
+
+        Raises:
+            NoSession: `discover()` was not called.
+        """
+        hello, mirror = self._state.hello, self._state.mirror
+        if hello is None:
+            raise NoSession("handshake: discover() was not called.")
+        with mirror.lock:
+            model = None if mirror.model is None or mirror.approximate else binary_model(mirror.model)
+        shared = replace(hello, session_id="", mjb=model, mjb_base64=NOT_SENT, shm_session_dir=None)
+        return encode_message(shared)
 
     def camera(self, name: str) -> URLabCameraView:
         """Return a camera by `<articulation>/<camera>`, or by `<camera>` where that means one of them.

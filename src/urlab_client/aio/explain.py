@@ -28,6 +28,7 @@ __all__ = ["diagnose", "watched"]
 _CONNECT_S = 2.0
 _LOOKS = 5
 _LOOK_S = 0.05
+_LISTED = 8
 
 
 class _Status(Protocol):
@@ -70,6 +71,10 @@ async def _examine(config: ClientConfig, session: Session, state: SimState) -> A
     yield Finding(
         Verdict.OK, "server", f"It answers in {1e3 * (loop.time() - before):.1f} ms and offers {len(ops)} ops."
     )
+    if config.read_only:
+        text = "This client is read-only. What keeps robots from moving, the client that drives can find out."
+        yield Finding(Verdict.NOTE, "session", text)
+        return
     hello = state.hello
     if hello is None or not session.session_id:
         yield Finding(Verdict.PROBLEM, "session", "No session is open. Call discover() first.")
@@ -87,6 +92,27 @@ async def _examine(config: ClientConfig, session: Session, state: SimState) -> A
         yield finding
     for finding in _control(config, session, state):
         yield finding
+    for finding in _cameras(session, state):
+        yield finding
+
+
+def _cameras(session: Session, state: SimState) -> Iterator[Finding]:
+    """Look at which cameras stream, on a server where they are off at first."""
+    switch = state.publishers.camera_switch
+    if switch is None or not session.features.camera_switch:
+        return
+    silent = [
+        f"{art.prefix}/{name}"
+        for art in state.objects.articulations.values()
+        for name, view in art.cameras.items()
+        if not switch.is_on(view.info)
+    ]
+    if silent:
+        more = f" and {len(silent) - _LISTED} more" if len(silent) > _LISTED else ""
+        text = f"This client has not switched on {', '.join(silent[:_LISTED])}{more}, so that they may stream nothing. "
+        yield Finding(
+            Verdict.NOTE, "cameras", text + "Iterating over their frames() does, and capture() needs no switch."
+        )
 
 
 def _control(config: ClientConfig, session: Session, state: SimState) -> Iterator[Finding]:

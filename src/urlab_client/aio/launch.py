@@ -280,6 +280,7 @@ class LaunchedTransport:
         transport.stats = self.stats
         transport.on_event = self.on_event
         transport.lost_at = self._lost_at
+        transport.refused = True
         self._watch = asyncio.create_task(self._tell_end(process, transport), name="urlab-server-end")
         self._state_port = ready.state_port
         self.scene_warnings = ready.scene_warnings

@@ -16,7 +16,7 @@ from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.model.elements import Actuator, Joint
 from urlab_client.aio.model.numbers import finite
 from urlab_client.aio.streams import Stream
-from urlab_client.protocol.client_types import Diagnosis, Verdict
+from urlab_client.protocol.client_types import Diagnosis, Resync, Verdict
 from urlab_client.protocol.enums import OutOfRange, StepMode
 from urlab_client.protocol.errors import NotSettled, URLabTimeoutError
 from urlab_client.protocol.messages.session import StepOk
@@ -41,9 +41,12 @@ class Simulation(Protocol):
     @property
     def sim_time(self) -> float: ...
     @property
+    def step_count(self) -> int: ...
+    @property
     def model(self) -> mujoco.MjModel | None: ...
     async def step(self, n_steps: int = 1) -> StepOk: ...
     def state_stream(self) -> Stream[StateSnapshot]: ...
+    async def resync(self) -> Resync: ...
     async def explain(self) -> Diagnosis: ...
 
 
@@ -131,12 +134,18 @@ class Motion:
 
     async def _until(self, done: Callable[[], bool], what: str, limit: float, slice_s: float) -> tuple[float, bool]:
         """Let time pass until something is so or the limit has come; return how much passed, and whether it is so."""
+        simulation = self._simulation
+        live = simulation.step_mode is StepMode.LIVE
+        if not live and not simulation.step_count:
+            await simulation.resync()  # where a simulation stands that ran before this client came
         if done():
             return 0.0, True
-        start = self._simulation.sim_time
+        start = simulation.sim_time
         passed = 0.0
-        async with aclosing(self._passing(what, start + limit, slice_s)) as times:
+        async with aclosing(self._passing(what, limit, slice_s)) as times:
             async for now in times:
+                if live:  # the first that is known to be new, whatever was known before
+                    start, live = now, False
                 # A reset puts the clock back: what passed since counts, too.
                 start = min(start, now)
                 passed = now - start
@@ -144,14 +153,17 @@ class Motion:
                     return passed, True
         return passed, False
 
-    async def _passing(self, what: str, end: float, slice_s: float) -> AsyncGenerator[float, None]:
+    async def _passing(self, what: str, limit: float, slice_s: float) -> AsyncGenerator[float, None]:
         simulation = self._simulation
         if simulation.step_mode is StepMode.LIVE:
+            end: float | None = None
             async with aclosing(self._watched(what)) as times:
                 async for now in times:
                     yield now
+                    end = now + limit if end is None else end
                     if now >= end:
                         return
+        end = simulation.sim_time + limit
         model = simulation.model
         timestep = 0.0 if model is None else float(model.opt.timestep)
         while (left := end - simulation.sim_time) > timestep / 2:

@@ -30,6 +30,7 @@ from urlab_client.protocol.codec import (
 from urlab_client.protocol.errors import (
     ConnectionLost,
     NoSession,
+    ReadOnlyClient,
     ServerUnreachable,
     SessionTakenOver,
     UnknownOp,
@@ -64,6 +65,7 @@ class Session:
         greeted: Whether a handshake was sent, with whatever outcome.
         features: What the server can do, as far as its answers have shown.
         control: The robots that this client owns.
+        read_only: Whether nothing may be asked that takes a session.
         on_opened: Told of each session that was opened, also by a handshake that its caller had given up.
         on_refusal: Told of each refusal before it is raised.
         confirmed: Whether the server has answered within this session since the connection was made. It may be another
@@ -84,6 +86,7 @@ class Session:
     ) -> None:
         self.session_id = ""
         self.greeted = False
+        self.read_only = False
         self.features = Features()
         self.on_opened: Callable[[HelloOk], None] | None = None
         self.on_refusal: Callable[[URLabRPCError], None] | None = None
@@ -246,11 +249,18 @@ class Session:
         return bound
 
     def check_offered(self, op: Op) -> None:
-        """Refuse an op that the server does not list.
+        """Refuse an op that the server does not list, or that a client that looks on may not send.
 
         Raises:
             UnknownOp: It does not; nothing was sent.
+            ReadOnlyClient: It may not; nothing was sent.
         """
+        if self.read_only and op.name != "meta":
+            raise ReadOnlyClient(
+                f"{op.name}: this client is read-only. Nothing was sent.",
+                op=op.name,
+                hint="It has no session: let the client that drives do it, or make one without read_only=True.",
+            )
         listed = self.features.ops
         if listed is not None and op.name not in listed and op.name not in _UNLISTED:
             raise UnknownOp("unknown_op", "this server does not offer it. Nothing was sent.", op=op.name)

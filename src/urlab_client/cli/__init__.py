@@ -29,6 +29,7 @@ logger = logging.getLogger("urlab_client.cli")
 _COMMANDS = (
     "serve",
     "console",
+    "mcp",
     "ping",
     "doctor",
     "demo",
@@ -40,6 +41,7 @@ _COMMANDS = (
     "convert",
     "plot",
     "run-policy",
+    "evaluate",
     "view",
 )
 

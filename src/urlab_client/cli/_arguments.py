@@ -19,6 +19,7 @@ __all__ = [
     "ServerArguments",
     "add_address",
     "add_cameras",
+    "add_dialect",
     "add_keys",
     "add_mjcf_options",
     "add_ports",
@@ -166,6 +167,17 @@ def add_address(parser: argparse.ArgumentParser, default: str | None = "tcp://lo
         help=f"{ADDRESSES} (default: {otherwise or '%(default)s'})",
     )
     add_mjcf_options(parser, "with sim://MODEL")
+
+
+def add_dialect(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:  # pyright: ignore[reportPrivateUsage]
+    """Add `--dialect` to a command that starts a simulated server."""
+    parser.add_argument(
+        "--dialect",
+        choices=("alpha", "beta"),
+        default="alpha",
+        metavar="NAME",
+        help="generation of the plugin to speak for: alpha (June 2026) or beta (August 2026) (default: alpha)",
+    )
 
 
 def add_mjcf_options(parser: argparse.ArgumentParser, when: str) -> None:

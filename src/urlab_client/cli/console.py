@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import socket
 import webbrowser
-from contextlib import suppress
 from pathlib import Path
 
 from urlab_client._installation import install_command
@@ -98,16 +96,18 @@ def run(arguments: ConsoleArguments) -> int:
     if arguments.host not in {"127.0.0.1", "::1", "localhost"} and not arguments.allow_host:
         raise CommandError(f"--host {arguments.host}: pass --allow-host NAME, the name under which browsers reach it")
     import_mujoco()
-    with suppress(KeyboardInterrupt):  # Ctrl-C in the moment before uvicorn listens for it
+    from urlab_client.cli._pages import ending_well  # noqa: PLC0415
+
+    with ending_well():
         asyncio.run(_serve(arguments))
     return 0
 
 
 async def _serve(arguments: ConsoleArguments) -> None:
-    import uvicorn  # noqa: PLC0415
     from prometheus_client import REGISTRY  # noqa: PLC0415
 
     from urlab_client.aio import URLabClient  # noqa: PLC0415
+    from urlab_client.cli._pages import bound, serve  # noqa: PLC0415
     from urlab_client.integrations.telemetry import PrometheusObserver  # noqa: PLC0415
     from urlab_client.web import Access, app  # noqa: PLC0415
     from urlab_client.web.access import LOOPBACK  # noqa: PLC0415
@@ -116,52 +116,14 @@ async def _serve(arguments: ConsoleArguments) -> None:
     # Each camera is streamed while somebody watches it.
     client = make_client(URLabClient, arguments.address, arguments, live_pictures=False, observe=PrometheusObserver())
     async with client:
-        with _bound(arguments.host, arguments.port) as listener:
+        with bound(arguments.host, arguments.port) as listener:
             name = arguments.allow_host[0] if arguments.allow_host else "127.0.0.1"
             link = f"http://{name}:{listener.getsockname()[1]}/?token={access.invite()}"
-            config = uvicorn.Config(
-                app(client, access=access, recordings=arguments.recordings, metrics=REGISTRY),
-                log_config=None,
-                access_log=False,
-                ws="websockets-sansio",
-                ws_max_size=1024 * 1024,
-                timeout_graceful_shutdown=1,
-                proxy_headers=False,
-                server_header=False,
-            )
 
-            class Server(uvicorn.Server):
-                async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-                    await super().startup(sockets)
-                    if self.started:  # from here on Ctrl-C ends it in good order
-                        print(
-                            f"{arguments.address} is shown at {link} (good for one browser); Ctrl-C ends it.",
-                            flush=True,
-                        )
-                        if arguments.open:
-                            webbrowser.open(link)
+            def started() -> None:
+                print(f"{arguments.address} is shown at {link} (good for one browser); Ctrl-C ends it.", flush=True)
+                if arguments.open:
+                    webbrowser.open(link)
 
-            try:
-                await Server(config).serve(sockets=[listener])
-                await asyncio.sleep(0)
-            except asyncio.CancelledError:
-                # uvicorn repeats the signal that ended it, and what asyncio makes of it must not break off the closing.
-                task = asyncio.current_task()
-                if task is None or task.uncancel():
-                    raise
-
-
-def _bound(host: str, number: int) -> socket.socket:
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    # asyncio sends small messages at once only on sockets that say they are TCP; others wait for the peer, up to 40 ms.
-    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
-    try:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind((host, number))
-        listener.listen()  # before the link is printed: whoever is quick waits, and is not refused
-    except OSError as error:
-        listener.close()
-        raise OSError(
-            error.errno, f"port {number} of {host} cannot be used: {error.strerror}; --port 0 takes any free one"
-        ) from None
-    return listener
+            site = app(client, access=access, recordings=arguments.recordings, metrics=REGISTRY)
+            await serve(site, listener, started)

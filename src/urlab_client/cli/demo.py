@@ -19,7 +19,15 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from urlab_client._extras import need
-from urlab_client.cli._arguments import Commands, ServerArguments, add_keys, add_ports, count, running_address
+from urlab_client.cli._arguments import (
+    Commands,
+    ServerArguments,
+    add_dialect,
+    add_keys,
+    add_ports,
+    count,
+    running_address,
+)
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._files import replaced
 from urlab_client.cli._mujoco import import_mujoco
@@ -32,6 +40,7 @@ if TYPE_CHECKING:
 
     from urlab_client.cli.demo_runs import DemoRun, Outcome
     from urlab_client.cli.robot_file import RobotFile
+    from urlab_client.protocol.base import DialectName
 
 __all__ = ["add_parser", "run"]
 
@@ -44,6 +53,7 @@ class DemoArguments(ServerArguments):
 
     model: str
     address: str | None
+    dialect: DialectName
     output: Path
     steps: int
     no_render: bool
@@ -81,6 +91,7 @@ def add_parser(commands: Commands) -> None:
     )
     add_ports(parser, state=False)
     add_keys(parser)
+    add_dialect(parser)
     parser.add_argument(
         "--output", type=Path, default=Path("urlab-demo"), metavar="DIR", help="where to write (default: %(default)s)"
     )
@@ -116,7 +127,7 @@ def run(arguments: DemoArguments) -> int:
     steps, fewer = arguments.steps, max(1, arguments.steps // _ASYNC_SHARE)
     console = output()
     address = arguments.address
-    place = started_server(robot) if address is None else running_server(robot, address, arguments)
+    place = started_server(robot, arguments.dialect) if address is None else running_server(robot, address, arguments)
     with _warnings_of(robot), place as server, _progress(console) as progress:
         one = drive_one(server, steps, _bar(progress, "blocking client, one robot", steps))
         two = asyncio.run(drive_two(server, fewer, _bar(progress, "async client, two robots", fewer)))

@@ -16,6 +16,7 @@ from urlab_client._mujoco import flat_model
 from urlab_client.cli._arguments import ServerArguments, make_client
 from urlab_client.cli._failure import CommandError, one_line
 from urlab_client.cli.robot_file import RobotFile
+from urlab_client.protocol.base import DialectName
 from urlab_client.server.assets.bundled_robots import bundled_models
 from urlab_client.server.simulated import SimulatedServer
 
@@ -47,9 +48,9 @@ class DemoServer:
 
 
 @contextlib.contextmanager
-def started_server(robot: RobotFile) -> Generator[DemoServer]:
+def started_server(robot: RobotFile, dialect: DialectName) -> Generator[DemoServer]:
     """Run a simulated server for as long as the block lasts."""
-    with SimulatedServer(model_roots=[robot.path.parent], mjcf_options=True) as server:
+    with SimulatedServer(model_roots=[robot.path.parent], mjcf_options=True, dialect=dialect) as server:
 
         def connect(flavour: Callable[..., C]) -> C:
             return flavour(**server.client_options(), step_mode="direct")

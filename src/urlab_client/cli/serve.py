@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, cast
 
 from urlab_client._installation import install_command
 from urlab_client._windows import read_aside
-from urlab_client.cli._arguments import Commands, count, image_size, index, port
+from urlab_client.cli._arguments import Commands, add_dialect, count, image_size, index, port
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._mujoco import import_mujoco
 from urlab_client.protocol.controller_text import ControllerText
@@ -147,13 +147,7 @@ def add_parser(commands: Commands) -> None:
         network.add_argument(
             f"--{name}-port", type=port, default=None, metavar="PORT", help=f"default {default}; 0: any free one"
         )
-    network.add_argument(
-        "--dialect",
-        choices=("alpha", "beta"),
-        default="alpha",
-        metavar="NAME",
-        help="generation of the plugin to speak for: alpha (June 2026) or beta (August 2026) (default: alpha)",
-    )
+    add_dialect(network)
     network.add_argument(
         "--instance-index",
         type=index,

@@ -34,7 +34,6 @@ __all__ = ["add_parser", "run"]
 _VIEW_MODES = ("lit", "unlit", "wireframe", "collision")
 _FORMATS = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg", ".webp": "webp"}
 _TIMEOUT_S = 5.0
-_LIVE_S = 1.0  # for a state, which a server in live mode publishes several times a second
 _CHUNK = 100  # physics steps of one request, which the server gives 5 s
 _BEYOND_M = 1e5  # farther than what a ray can meet
 
@@ -206,29 +205,13 @@ def _of_running_server(arguments: SnapshotArguments) -> NDArray[np.uint8]:
         if arguments.mode not in (None, view.mode):
             raise CommandError(f"--mode {arguments.mode}: {arguments.camera} is a camera of mode {view.mode}")
         try:
-            with view.frames() if arguments.timeout is None else view.frames(timeout=arguments.timeout) as frames:
-                if not _drawn_by_a_step(client, view, arguments.camera):
-                    next(frames)
+            if arguments.timeout is None:
+                view.capture()
+            else:
+                view.capture(timeout=arguments.timeout)
         except URLabTimeoutError as error:
             raise CommandError(f"{address}: no picture of {arguments.camera}: {error}") from None
         return _pixels(view)
-
-
-def _drawn_by_a_step(client: URLabClient, view: URLabCameraView, camera: str) -> bool:
-    """Take the picture by a step, which moves nothing in live mode, where streams are silent while physics is paused.
-
-    Returns:
-        False for a server that may be in another mode, or whose live steps bring no pictures.
-    """
-    if not client.server.features.live_pictures_in_steps:
-        return False
-    try:
-        with client.state_stream(timeout=_LIVE_S) as states:
-            next(states)  # comes in live mode alone, paused or not
-    except URLabTimeoutError:
-        return False
-    client.step(include_cameras={camera: "sync"})
-    return view.delivered
 
 
 def _camera(client: URLabClient, key: str) -> URLabCameraView:

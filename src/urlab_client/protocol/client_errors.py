@@ -14,6 +14,7 @@ __all__ = [
     "OutcomeUnknown",
     "PictureTimeout",
     "ProtocolError",
+    "ReadOnlyClient",
     "ServerUnreachable",
     "StreamOverflow",
     "URLabConnectionError",
@@ -156,6 +157,10 @@ class ProtocolError(URLabError):
     def __init__(self, message: str, *, op: str | None = None, raw: bytes = b"", hint: str | None = None) -> None:
         super().__init__(message, op=op, hint=hint)
         self.raw = raw[:256]
+
+
+class ReadOnlyClient(URLabError):
+    """The client looks on and asks the server for nothing: it was made with `read_only=True`. Nothing was sent."""
 
 
 class URLabVersionMismatch(URLabError):

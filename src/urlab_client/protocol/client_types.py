@@ -166,6 +166,8 @@ class ClientConfig(Serializable, Struct, frozen=True, kw_only=True):
     trust_server: bool = False
     live_pictures: bool = True
     claim_control: bool = True
+    keep_session: bool = False
+    read_only: bool = False
 
     def options(self) -> dict[str, Any]:
         """Return the constructor's arguments: `URLabClient(**config.options())`."""

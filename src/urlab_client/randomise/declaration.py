@@ -13,6 +13,7 @@ from msgspec import Struct
 
 __all__ = [
     "MODEL_TEXT",
+    "MODEST",
     "QUANTITIES",
     "CameraLatency",
     "Delay",
@@ -305,6 +306,17 @@ class Randomisation(_Declared, frozen=True, kw_only=True):
         except (msgspec.ValidationError, msgspec.DecodeError) as error:
             raise ValueError(f"{source}: {error}") from None
 
+
+MODEST: Final = Randomisation(
+    vary=(
+        Vary(what="friction", scale=(0.7, 1.3)),
+        Vary(what="mass", scale=(0.9, 1.1)),
+        Vary(what="damping", scale=(0.8, 1.2)),
+        Vary(what="strength", scale=(0.9, 1.1)),
+        Vary(what="position", add=(-0.05, 0.05)),
+    )
+)
+"""A little of what robots with actuated joints vary in, for whoever declares nothing of their own."""
 
 QUANTITIES: Final[tuple[Quantity, ...]] = get_args(Quantity)
 """Everything that can vary."""

@@ -68,6 +68,12 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
             server and network those that nobody looks at; `frames()` is received all the same.
         claim_control: Take control of a robot with the first write to it, where robots have one owner. False is for
             those who look on, and for those who say `articulation.claim()`.
+        keep_session: After the first `discover()`, discover again by itself when the server has been restarted or play
+            has been started by somebody else; `events()` tells of it. A session that another client has taken over is
+            never taken back, and while a step or reset is in doubt, `resync()` comes first.
+        read_only: Look on beside the client that drives: the client opens no session, so that it takes the server over
+            from nobody, and refuses everything that would need one with `ReadOnlyClient`. `discover(handshake=…)` says
+            what there is; state, pictures and events come by the streams. For `transport="zmq"`.
         observe: Called with a `CallRecord` when a request is over, whatever became of it: op, bytes, time in the queue,
             round trip, outcome. It runs on the client's event loop, so it must be quick and must not call the client;
             what it raises is logged and changes nothing.
@@ -102,6 +108,8 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
         trust_server: bool = False,
         live_pictures: bool = True,
         claim_control: bool = True,
+        keep_session: bool = False,
+        read_only: bool = False,
         observe: Callable[[CallRecord], object] | None = None,
     ) -> None:
         super().__init__(
@@ -124,6 +132,8 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
                 trust_server=trust_server,
                 live_pictures=live_pictures,
                 claim_control=claim_control,
+                keep_session=keep_session,
+                read_only=read_only,
                 observe=observe,
             )
         )
@@ -173,7 +183,13 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
         """Playing recordings back."""
         return self._wrap(ReplayNamespace, self._aio.replay)
 
-    def discover(self, observations: str | ObservationLevel = "standard", *, timeout: Timeout = DEFAULT) -> None:
+    def discover(
+        self,
+        observations: str | ObservationLevel = "standard",
+        *,
+        handshake: bytes | None = None,
+        timeout: Timeout = DEFAULT,
+    ) -> None:
         """Open a session, load the model, and build the wrappers of articulations, entities and cameras.
 
         Safe to repeat: wrappers that still exist go on working. Takes the server over from any other client.
@@ -181,15 +197,19 @@ class URLabClient(FacadeRoot, ClientState, twin=aio.URLabClient):
         Args:
             observations: `minimal` (qpos, qvel), `standard` (adds ctrl, act, sensors) or `full` (adds body poses and
                 actuator forces).
+            handshake: For a client with `read_only=True`, and for no other: what `handshake()` of the client that
+                drives returns. Call this again with the new one after each start of play.
             timeout: Seconds to wait; None waits without limit.
 
         Raises:
+            ValueError: A handshake is given to a client that is not read-only, or it is none.
+            ReadOnlyClient: The client is read-only, and no handshake is given.
             URLabVersionMismatch: Client and server MuJoCo builds differ.
             ServerUnreachable: Nothing answers at the address.
             URLabConnectionError: With `transport="shm"`, the server's shared memory is not on this machine.
             AuthenticationFailed: Server and client do not accept each other's keys.
         """
-        self._portal.call(self._aio.discover, observations, timeout=timeout)
+        self._portal.call(self._aio.discover, observations, handshake=handshake, timeout=timeout)
 
     def step(
         self,

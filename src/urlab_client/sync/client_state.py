@@ -173,6 +173,17 @@ class ClientState(Facade, twin=aio.ClientState):
         """
         return self._aio.describe()
 
+    def handshake(self) -> bytes:
+        """Return what a client with `read_only=True` has to know: names, limits, cameras and the model.
+
+        For another process or machine, which passes it to its own client's `discover(handshake=…)`. It describes the
+        play session of the last handshake, and does not let anybody into this client's session.
+
+        Raises:
+            NoSession: `discover()` was not called.
+        """
+        return self._aio.handshake()
+
     def camera(self, name: str) -> URLabCameraView:
         """Return a camera by `<articulation>/<camera>`, or by `<camera>` where that means one of them.
 

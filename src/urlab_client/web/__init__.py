@@ -15,7 +15,8 @@ except ImportError as error:
 
 from urlab_client.web.access import Access
 from urlab_client.web.application import app
+from urlab_client.web.several import apps
 
-__all__ = ["Access", "app"]
+__all__ = ["Access", "app", "apps"]
 
 del PIL, starlette

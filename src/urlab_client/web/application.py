@@ -35,6 +35,7 @@ from urlab_client.web.driving_lease import DrivingLease, NotDriving, Viewer
 from urlab_client.web.metrics import showing
 from urlab_client.web.model_upload import ModelRoutes
 from urlab_client.web.ops import encode, openapi, parse, served
+from urlab_client.web.reading_routes import ReadingRoutes
 from urlab_client.web.recording_routes import RecordingRoutes
 
 if TYPE_CHECKING:
@@ -42,11 +43,10 @@ if TYPE_CHECKING:
 
     from urlab_client.aio import URLabClient
 
-__all__ = ["app"]
+__all__ = ["app", "entrance"]
 
 _STATIC = Path(__file__).parent / "static"
 _LARGEST_BODY = 1024 * 1024
-_PICTURE_S = 5.0
 _AHEAD = 2  # states or pictures on their way to a browser that has not said that they came
 _VIEWER = "x-urlab-viewer"
 
@@ -91,6 +91,18 @@ def app(
     return application
 
 
+def entrance(access: Access) -> _Handler:
+    """Return what answers `POST /api/session`: it spends a token for a key."""
+
+    async def enter(request: Request) -> Response:
+        key = access.admit(msgspec.json.decode(await _body(request), type=_LoginRequest).token)
+        if key is None:
+            return _error(401, "bad_token", "This token is unknown, or was used before.")
+        return _json(encode({"key": key}))
+
+    return _answering(enter)
+
+
 class _RunRequest(Struct):
     running: bool
 
@@ -118,6 +130,7 @@ class _Site:
         self.console = console
         self._access = access
         self._viewers: dict[str, Viewer] = {}
+        self._reading = ReadingRoutes(console, self._viewer)
         self._recordings = RecordingRoutes(console, self._viewer)
         self._models = ModelRoutes(console, self._viewer)
 
@@ -132,6 +145,7 @@ class _Site:
             route("/api/status", self._status),
             route("/api/state", self._state),
             route("/api/log", self._log),
+            *(route(path, handler, *methods) for path, handler, methods in self._reading.routes()),
             route("/api/ops/{op}", self._op, "POST"),
             route("/api/ctrl", self._ctrl, "POST"),
             route("/api/run", self._run, "POST"),
@@ -143,8 +157,7 @@ class _Site:
             route("/api/lease", self._lease, "POST", "DELETE"),
             route("/api/connection", self._connection, "POST"),
             route("/api/invitations", self._invite, "POST"),
-            route("/api/session", self._enter, "POST"),
-            route("/api/cameras/{path:path}.jpg", self._picture),
+            Route("/api/session", entrance(self._access), methods=["POST"]),
             WebSocketRoute("/api/live", self._live),
             WebSocketRoute("/api/cameras/{path:path}/live", self._pictures),
             Mount("/static", StaticFiles(directory=_STATIC)),
@@ -172,7 +185,7 @@ class _Site:
         return FileResponse(_STATIC / "index.html")
 
     async def _openapi(self, request: Request) -> Response:
-        return _json(openapi())
+        return _json(openapi(request.scope.get("root_path", "")))
 
     async def _world(self, request: Request) -> Response:
         return _json(encode(self.console.world))
@@ -227,22 +240,6 @@ class _Site:
     async def _invite(self, request: Request) -> Response:
         token = self._access.invite()
         return _json(encode({"token": token, "path": f"{request.scope.get('root_path', '')}/?token={token}"}))
-
-    async def _enter(self, request: Request) -> Response:
-        key = self._access.admit(msgspec.json.decode(await _body(request), type=_LoginRequest).token)
-        if key is None:
-            return _error(401, "bad_token", "This token is unknown, or was used before.")
-        return _json(encode({"key": key}))
-
-    async def _picture(self, request: Request) -> Response:
-        feed = self.console.feed(request.path_params["path"])
-        if feed is None:
-            return _error(404, "unknown_camera", f"There is no camera {request.path_params['path']!r}.")
-        async with feed.watch():
-            with anyio.move_on_after(_PICTURE_S):
-                picture = await feed.after(0)
-                return Response(picture.jpeg, media_type="image/jpeg")
-        return _error(503, "no_picture", "The camera has sent no picture yet.", "Cameras send while physics runs live.")
 
     # WebSockets
 

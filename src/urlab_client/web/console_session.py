@@ -365,14 +365,15 @@ class ConsoleSession:
 
     def feed(self, path: str) -> Feed | None:
         """Return the pictures of the camera `ARTICULATION/CAMERA` (`-` for those of the scene), None without it."""
-        view = self._camera(path)
+        view = self.camera(path)
         if view is None:
             return None
         if path not in self._feeds or self._feeds[path].view is not view:
             self._feeds[path] = Feed(self.client, view)
         return self._feeds[path]
 
-    def _camera(self, path: str) -> URLabCameraView | None:
+    def camera(self, path: str) -> URLabCameraView | None:
+        """Return the camera at `ARTICULATION/CAMERA` (`-` for those of the scene), None without it."""
         owner, _, name = path.partition("/")
         if owner == "-":
             return self.client.global_cameras.get(name)

@@ -97,7 +97,9 @@ class Controls:
             URLabError: As the client raises.
         """
         op = op_of(request)
-        if op.effect is not Effect.READ and not (isinstance(request, SetPaused) and request.paused):
+        if isinstance(request, SetPaused) and request.paused:
+            self._lease.interrupt(viewer)  # everybody may stop
+        elif op.effect is not Effect.READ:
             self._lease.use(viewer)
         began = time.perf_counter()
         try:
@@ -206,6 +208,8 @@ class Controls:
         """
         if running:
             self._lease.use(viewer)
+        else:
+            self._lease.interrupt(viewer)
         if self._client.step_mode is StepMode.LIVE:
             await self.do(viewer, SetPaused(paused=not running))
         else:

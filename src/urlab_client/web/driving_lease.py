@@ -14,11 +14,13 @@ class Viewer:
     Attributes:
         key: What proves who they are; known to nobody else.
         name: What the others see.
+        yields: Whether anybody else may take the controls from them at once, as people may from an agent.
     """
 
-    def __init__(self, key: str, name: str) -> None:
+    def __init__(self, key: str, name: str, *, yields: bool = False) -> None:
         self.key = key
         self.name = name
+        self.yields = yields
 
 
 class NotDriving(Exception):
@@ -56,9 +58,14 @@ class DrivingLease:
             NotDriving: Somebody else has them.
         """
         holder = self.holder
-        if holder is not None and holder.key != viewer.key:
+        if holder is not None and holder.key != viewer.key and not holder.yields:
             raise NotDriving(f"{holder.name} has the controls for another {self.left:.0f} s, unless they act again")
         self._holder, self._until = viewer, self._clock() + self.seconds
+
+    def interrupt(self, viewer: Viewer) -> None:
+        """Take the controls from somebody who yields them; nothing happens to anybody else's."""
+        if (holder := self.holder) is not None and holder.yields:
+            self.use(viewer)
 
     def release(self, viewer: Viewer) -> None:
         """Give the controls back; nothing happens to somebody else's."""

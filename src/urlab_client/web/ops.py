@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import lru_cache
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, cast
 
@@ -117,9 +117,13 @@ def _controller(client: URLabClient, key: str) -> URLabController | None:
     return None if art is None else art.controller
 
 
-@cache
-def openapi() -> bytes:
-    """Return the OpenAPI 3.1 document of the whole HTTP API."""
+@lru_cache(maxsize=8)
+def openapi(root: str = "") -> bytes:
+    """Return the OpenAPI 3.1 document of the whole HTTP API.
+
+    Args:
+        root: The path under which the application is mounted, or a proxy shows it.
+    """
     ops = [op for op in OPS.values() if op.request not in _UNSERVED]
     replies = [_STARTED if op.reply is BeginPieOk else op.reply for op in ops]
     structs = [*(op.request for op in ops), *replies]
@@ -143,6 +147,7 @@ def openapi() -> bytes:
                 "schemas": components,
                 "securitySchemes": {"key": {"type": "http", "scheme": "bearer"}},
             },
+            "servers": [{"url": root or "/"}],
             "security": security,
             "paths": {**_PATHS, **{f"/api/ops/{op.name}": {"post": _operation(op)} for op in ops}},
         }
@@ -209,6 +214,10 @@ _PATHS: dict[str, Any] = {
     "/api/status": _path("get", "status", "Connection, play, modes, who drives."),
     "/api/state": _path("get", "state", "The newest state."),
     "/api/log": _path("get", "log", "The latest calls, errors and events."),
+    "/api/events": _path(
+        "get", "events", "Server-sent events `log`, `world` and `status`; `Last-Event-ID` goes on in the log."
+    ),
+    "/api/explain": _path("get", "explain", "Why does a robot not move? What the client finds out, in sentences."),
     "/api/ctrl": _path("post", "ctrl", "Set set-points: `{articulation: {actuator: value}}`. Needs the controls."),
     "/api/run": _path("post", "run", "Let physics run or stop it: `{running: bool}`. Everybody may stop it."),
     "/api/step": _path("post", "step_many", "Step in direct mode: `{n_steps: int}`. Needs the controls."),
@@ -237,4 +246,5 @@ _PATHS: dict[str, Any] = {
     "/api/invitations": _path("post", "invite", "Make a token for one more browser or program."),
     "/api/session": _path("post", "enter", "Spend a token for a key: `{token: str}`.", security=[]),
     "/api/cameras/{articulation}/{camera}.jpg": _path("get", "picture", "The newest picture of a camera."),
+    "/api/cameras/{articulation}/{camera}.png": _path("get", "png", "A picture without loss, taken now, in any mode."),
 }

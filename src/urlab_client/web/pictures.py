@@ -18,12 +18,13 @@ from urlab_client.protocol.messages.streams import CameraSample
 from urlab_client.protocol.picture_files import jpeg
 
 if TYPE_CHECKING:
-    from urlab_client.aio import URLabCameraView, URLabClient
+    from urlab_client.aio import Stream, URLabCameraView, URLabClient
 
 __all__ = ["EncodedPicture", "Feed"]
 
 _FASTEST_S = 1 / 30
 _LOOK_S = 0.5
+_CAPTURE_S = 5.0
 _QUALITY = 80
 
 
@@ -108,13 +109,21 @@ class Feed:
                     while True:
                         began = time.monotonic()
                         if self._client.step_mode is StepMode.LIVE:
-                            with contextlib.suppress(URLabTimeoutError):
-                                await self._take(await frames.receive(timeout=_LOOK_S))
+                            await self._take_from(frames)
                         else:
                             await self._take_from_replies()
                         await anyio.sleep(max(0.0, began + _FASTEST_S - time.monotonic()))
             except URLabError:
                 await anyio.sleep(_LOOK_S)  # the connection is being restored; the log says so
+
+    async def _take_from(self, frames: Stream[CameraSample]) -> None:
+        with contextlib.suppress(URLabTimeoutError):
+            try:
+                await self._take(await frames.receive(timeout=_LOOK_S))
+            except URLabTimeoutError:
+                # Newer servers publish nothing while physics is paused, and draw when they are asked to.
+                if self._client.server.features.live_pictures_in_steps:
+                    await self._take(await self.view.capture(timeout=_CAPTURE_S))
 
     async def _take(self, sample: CameraSample) -> None:
         await self._publish(sample.pixels, sample.recv_wall_time_ns, sample.sim_time)

@@ -102,7 +102,9 @@ class Recordings:
         if not self._client.manager_present:
             raise URLabError("There is nothing to record.", hint="Begin play first.")
         self.folder.mkdir(parents=True, exist_ok=True)
-        path = self.folder / f"{datetime.now().astimezone():%Y-%m-%d_%H.%M.%S}.mcap"
+        now = f"{datetime.now().astimezone():%Y-%m-%d_%H.%M.%S}"
+        names = (f"{now}.mcap", *(f"{now}-{number}.mcap" for number in range(2, 100)))  # several in a second
+        path = next(one for one in (self.folder / name for name in names) if not one.exists())
         recorder = record(
             self._client,
             path,

@@ -66,9 +66,10 @@ class CameraSource(PublishedSource):
         "it does not serve: the plugin serves nine."
     )
     silent = (
-        "Pictures are published in live mode only, and while the camera is switched on in the editor; in the other "
-        "modes ask for them with client.step(include_cameras=…). A server that cannot draw publishes none; before its "
-        "first picture it looks for OpenGL, which takes seconds, and its log says what it found."
+        "Older servers publish pictures in live mode only, and while the camera is switched on in the editor; newer "
+        "ones in every mode, but only while the simulation moves. capture() takes one at any time. A server that "
+        "cannot draw publishes none; before its first picture it looks for OpenGL, which takes seconds, and its log "
+        "says what it found."
     )
 
     def __init__(

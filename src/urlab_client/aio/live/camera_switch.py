@@ -81,6 +81,10 @@ class CameraSwitch:
         self._infos = {info.zmq_topic: info for info in infos}
         self._follow()
 
+    def is_on(self, info: CameraInfo) -> bool:
+        """Return whether this client has switched a camera on."""
+        return self._on.get(info.zmq_topic, _OFF) != _OFF
+
     def forget(self) -> None:
         """Note that play ended, and with it whatever cameras were told."""
         self._set.clear()

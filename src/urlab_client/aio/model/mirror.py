@@ -53,15 +53,21 @@ def model_names(model: mujoco.MjModel, kind: str) -> list[str]:
     return [pool[start : pool.index(b"\0", start)].decode() for start in addresses]
 
 
+def binary_model(model: mujoco.MjModel) -> bytes:
+    """Return a model in MuJoCo's binary format."""
+    import mujoco  # noqa: PLC0415
+
+    buffer = np.zeros(mujoco.mj_sizeModel(model), dtype=np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer.tobytes()
+
+
 @cache
 def _mjb_header() -> bytes:
     """Return the first bytes of any model this MuJoCo saves: magic, number size, layout and version."""
     import mujoco  # noqa: PLC0415
 
-    empty = mujoco.MjModel.from_xml_string("<mujoco/>")
-    buffer = np.zeros(mujoco.mj_sizeModel(empty), dtype=np.uint8)
-    mujoco.mj_saveModel(empty, None, buffer)
-    return buffer[:_HEADER_BYTES].tobytes()
+    return binary_model(mujoco.MjModel.from_xml_string("<mujoco/>"))[:_HEADER_BYTES]
 
 
 def write_options(opt: mujoco.MjOption, options: SimOptions) -> None:

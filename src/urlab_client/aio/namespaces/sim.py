@@ -62,13 +62,17 @@ class SimNamespace(Namespace):
             URLabPIEError: Play did not become ready; its message carries the compile log.
         """
         async with self._session.turn(BeginPie, timeout=timeout, each=True) as turn:
-            reply = await self._play(turn, level_path, timeout_s, on_progress)
-            state = reply.state
-            payload = reply.handshake_payload
-            result = PIEStartResult(state=state, compile_error=reply.compile_error)
-            if payload is not None:
-                await self._discovery.adopt(turn, payload)
-                result.handshake_payload = msgspec.to_builtins(payload)
+            self._state.switching_play = True
+            try:
+                reply = await self._play(turn, level_path, timeout_s, on_progress)
+                state = reply.state
+                payload = reply.handshake_payload
+                result = PIEStartResult(state=state, compile_error=reply.compile_error)
+                if payload is not None:
+                    await self._discovery.adopt(turn, payload)
+                    result.handshake_payload = msgspec.to_builtins(payload)
+            finally:
+                self._state.switching_play = False
         if raise_on_failure and not result.is_ready:
             explanation = reply.compile_error or (
                 f"no compiled model within {timeout_s:g} s; does the level have a manager (scene.ensure_manager())?"
@@ -119,7 +123,7 @@ class SimNamespace(Namespace):
         """
         loop = running_loop()
         async with self._session.turn(StopPie, timeout=timeout, each=True) as turn:
-            self._state.stopping = True
+            self._state.switching_play = True
             # On Windows, what we have mapped the server could neither remove nor make anew.
             self._state.publishers.release_regions()
             try:
@@ -133,7 +137,7 @@ class SimNamespace(Namespace):
                         )
                     await turn.aside(asyncio.sleep(_STOP_POLL_S))
             finally:
-                self._state.stopping = False
+                self._state.switching_play = False
             self._state.on_play_ended("stopped by this client")
 
     def playing(self, level_path: str | None = None, *, timeout_s: float = 30.0) -> Playing:

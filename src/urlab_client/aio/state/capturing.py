@@ -31,7 +31,7 @@ from urlab_client.protocol.errors import (
     URLabTimeoutError,
 )
 from urlab_client.protocol.layouts import BytesLike
-from urlab_client.protocol.messages.session import Step
+from urlab_client.protocol.messages.session import Meta, Step
 from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
 from urlab_client.protocol.pixels import decode_camera, picture_stamp
 
@@ -73,7 +73,8 @@ class Capturing:
             ModeLocked: The project pins a mode in which pictures come with steps only.
         """
         state = self._state
-        async with state.session.turn(Step, timeout=timeout, each=True) as turn:
+        first = Meta if state.session.read_only else Step
+        async with state.session.turn(first, timeout=timeout, each=True) as turn:
             state.require_handshake("capture")
             if state.hello is not None and not state.hello.manager_present:
                 raise NoActiveManager("no_active_manager", "no play session runs. Nothing was sent.", op="capture")
@@ -112,6 +113,8 @@ class Capturing:
     async def _is_live(self, turn: Turn) -> bool:
         """Return whether the server is in live mode for certain: else a request for pictures might be a step."""
         state = self._state
+        if state.session.read_only:
+            return False
         if not state.mode_assumed:
             return True
         if state.session.features.publishes_steps:

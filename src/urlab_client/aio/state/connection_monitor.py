@@ -133,7 +133,7 @@ class ConnectionMonitor:
 
     def _look(self) -> None:
         """Begin to find out how things stand, unless that goes on already or somebody knows better."""
-        if self._closed or self._state.stopping or not self._session.session_id:
+        if self._closed or self._state.switching_play or not self._session.session_id:
             return
         if self._task is None or self._task.done():
             self._task = asyncio.create_task(self._find_out(), name="urlab-watch")
@@ -142,7 +142,7 @@ class ConnectionMonitor:
         before = self._playing
         for pause in _PATIENCE_S:
             await asyncio.sleep(pause)
-            if self._state.stopping or before != self._playing or not self._session.transport.connected:
+            if self._state.switching_play or before != self._playing or not self._session.transport.connected:
                 return
             try:
                 reply = await self._session.probe(ListKeyframes(), timeout=_PROBE_S)

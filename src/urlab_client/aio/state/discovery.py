@@ -12,9 +12,10 @@ from urlab_client.aio.session import Turn
 from urlab_client.aio.state.handshake import examine
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_mode import promote
+from urlab_client.protocol.codec import decode_reply, op_of
 from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.errors import URLabError
-from urlab_client.protocol.messages.session import NOT_SENT, Hello, HelloOk
+from urlab_client.protocol.errors import URLabError, URLabVersionMismatch
+from urlab_client.protocol.messages.session import NOT_SENT, Hello, HelloOk, Meta
 from urlab_client.protocol.messages.streams import PlayStarted
 
 __all__ = ["Discovery"]
@@ -41,7 +42,7 @@ class Discovery:
         self._check_version = check_version
         self._promote = promote
         self._trusted = trusted
-        self._mismatch_said = False
+        self._said = ""  # what other versions of MuJoCo came to
 
     async def open(self, turn: Turn, observations: str) -> HelloOk:
         """Open a session and take over what the server says."""
@@ -50,6 +51,21 @@ class Discovery:
         state.level = state.sent_level = observations
         await self.adopt(turn, hello)
         return hello
+
+    async def look_on(self, turn: Turn, handshake: bytes) -> None:
+        """Take over what another client's `handshake()` says, without opening a session.
+
+        Raises:
+            ValueError: It is none.
+        """
+        session = self._state.session
+        try:
+            hello = decode_reply(op_of(Hello), HelloOk, handshake)
+        except URLabError as error:
+            raise ValueError(f"this is not what handshake() returns: {error}") from None
+        listed = [op.name for op in (await turn.call(Meta())).ops]
+        session.features = session.features.with_ops(listed).with_hello(hello)
+        await self.adopt(turn, hello)
 
     async def _loadable(self, turn: Turn, hello: HelloOk) -> HelloOk:
         """Return a handshake whose model this process can and may load.
@@ -62,17 +78,22 @@ class Discovery:
         if mismatch is not None:
             if self._check_version:
                 raise mismatch
-            if not self._mismatch_said:
-                self._mismatch_said = True
-                warnings.warn(
-                    f"{mismatch.args[0]} The local model is compiled here from XML and only approximates the server's.",
-                    stacklevel=2,
-                )
             if hello.mjcf_compiled is None:
                 hello = await self._hello_with_assets(turn)
+            self._warn_once(mismatch, has_xml=hello.mjcf_compiled is not None)
         if hello.mjb is not None and not self._trusted:
             hello = await self._without_binary(turn, hello)
         return hello
+
+    def _warn_once(self, mismatch: URLabVersionMismatch, *, has_xml: bool) -> None:
+        consequence = (
+            "The local model is compiled here from XML and only approximates the server's."
+            if has_xml
+            else "There is no local model, because the server does not offer it as XML."
+        )
+        if self._said != consequence:
+            self._said = consequence
+            warnings.warn(f"{mismatch.args[0]} {consequence}", stacklevel=2)
 
     async def _hello_with_assets(self, turn: Turn) -> HelloOk:
         state = self._state

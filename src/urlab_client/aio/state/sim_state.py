@@ -84,7 +84,7 @@ class SimState:
         sim_time: Simulation time of the last reply, seconds.
         on_adopted: Told of each handshake taken over, and of the end of play.
         pending: Requests whose replies were lost.
-        stopping: Whether this client is ending play, so that its end is not news.
+        switching_play: Whether this client is starting or ending play, so that neither is news.
         observers: Who looks on, such as recorders.
         step_streams: Where the pictures of steps are looked for if replies bring older ones.
     """
@@ -126,7 +126,7 @@ class SimState:
         self._live_pictures = live_pictures
         self.pending = PendingOutcomes()
         self.on_adopted: Callable[[], None] | None = None
-        self.stopping = False
+        self.switching_play = False
         self.observers: tuple[ClientObserver, ...] = ()  # replaced, never changed: from any thread
 
     @property
@@ -226,9 +226,14 @@ class SimState:
                 record.pose = None
             self._take_over(reply, parts, received, into_mirror=True)
 
+    @property
+    def _trusted(self) -> bool:
+        """Whether published states can be this session's; a client that looks on has none to lose."""
+        return self.session.confirmed or self.session.read_only
+
     def matches(self, snapshot: StateSnapshot) -> bool:
         """Whether a published state is of the world that the handshake described, as far as that can be seen."""
-        if not self.session.confirmed or snapshot.per_articulation.keys() != self.objects.records.keys():
+        if not self._trusted or snapshot.per_articulation.keys() != self.objects.records.keys():
             return False
         try:
             self._checked(snapshot, "state/full")
@@ -240,7 +245,7 @@ class SimState:
         age = self.wall_time_sec - snapshot.wall_time.sec + (self.wall_time_nsec - snapshot.wall_time.nsec) / 1e9
         if 0 < age < _OVERTAKEN_S:
             return  # sent before the last reply, arrived after it
-        if not self.session.confirmed:
+        if not self._trusted:
             return  # the connection was lost: this may be another server's
         known = self.objects.records
         if snapshot.per_articulation.keys() != known.keys():

@@ -43,11 +43,14 @@ def for_the_server(request: Q, objects: SceneObjects, model: mujoco.MjModel | No
         case SetTwist(articulation=str(name)) | SetControlSource(articulation=str(name)):
             robot = objects.articulations.get(name)
             return request if robot is None else replace(request, articulation=robot.prefix)
-        case SetMocapPose(body=body) | ReadMocapPose(body=body):
+        # MuJoCo takes the process down for a name that is not text; what is wrong with it is said later.
+        case SetMocapPose(body=str(body)) | ReadMocapPose(body=str(body)):
             return replace(request, body=_compiled("body", body, objects, model))
         case GetContacts(filter=names) if names is not None:
             meant = {
-                side: name and _compiled("body" if side.startswith("body") else "geom", name, objects, model)
+                side: _compiled("body" if side.startswith("body") else "geom", name, objects, model)
+                if isinstance(name, str) and name
+                else name
                 for side, name in asdict(names).items()
             }
             return replace(request, filter=replace(names, **meant))

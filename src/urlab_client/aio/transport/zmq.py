@@ -82,6 +82,7 @@ class ZmqTransport:
 
     Attributes:
         lost_at: Loop time at which the connection broke last.
+        refused: Whether an attempt to connect has been refused since then.
     """
 
     stats: TransportStats
@@ -111,6 +112,7 @@ class ZmqTransport:
         self._obstacle = connection_status.UNANSWERED
         self._attempts = connection_status.Attempts(0.0)
         self.lost_at = 0.0
+        self.refused = False
         self._silent_since: float | None = None
         self._retrying = False
         self.on_event: Callable[[ClientEvent], None] | None = None
@@ -403,6 +405,8 @@ class ZmqTransport:
             self._lose()
         elif obstacle is not None:
             self._obstacle = obstacle
+            if event is not zmq.Event.CONNECTED and obstacle != connection_status.UNANSWERED:
+                self.refused = True
             if event in connection_status.FAILED_HANDSHAKES and value != errno.EAGAIN:  # which says that time was up
                 self._rejections += 1
                 self._note_rejection(event, value)
@@ -431,8 +435,11 @@ class ZmqTransport:
             log.info("lost %s; reconnecting", self._endpoint)
             if self._loop is not None:
                 self.lost_at = self._loop.time()
+            self.refused = False
             self._obstacle = "the connection was lost and not restored"
             self._tell(ServerLost(endpoint=self._endpoint))
+        else:
+            self.refused = True  # a tunnel accepts connections to a server that is not there
         if self._loop is not None:
             # Also when a handshake broke off: ZeroMQ does not try again after garbage in it.
             self._retrying = False
@@ -452,7 +459,8 @@ class ZmqTransport:
         if self.stats.connects == 1 or self._loop is None:
             self._tell(ServerConnected(endpoint=self._endpoint))
         else:
-            self._tell(ServerReconnected(endpoint=self._endpoint, down_s=self._loop.time() - self.lost_at))
+            down_s = self._loop.time() - self.lost_at
+            self._tell(ServerReconnected(endpoint=self._endpoint, down_s=down_s, refused=self.refused))
 
     def _tell(self, event: ClientEvent) -> None:
         if self.on_event is not None:

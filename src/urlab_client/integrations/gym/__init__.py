@@ -5,7 +5,7 @@ Needs the extra `gym`. Importing this package registers the environments of `tas
 
 from urlab_client.integrations.gym.batch import URLabBatchEnv
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn, URLabEnv
-from urlab_client.integrations.gym.shipped_tasks import FixedReach, Reach, Run, Walk
+from urlab_client.integrations.gym.shipped_tasks import FixedReach, Push, PushPictures, Reach, Run, Walk
 from urlab_client.integrations.gym.spaces import SpaceMapping, SpaceMode
 from urlab_client.integrations.gym.starts import ResetNoise
 from urlab_client.integrations.gym.task import Start, States, Task, TaskScene
@@ -15,6 +15,8 @@ from urlab_client.integrations.gym.vector import URLabVectorEnv
 __all__ = [
     "TASKS",
     "FixedReach",
+    "Push",
+    "PushPictures",
     "Reach",
     "ResetNoise",
     "RewardFn",

@@ -64,7 +64,7 @@ class URLabBatchEnv(Vectorized):
         address: str,
         num_envs: int,
         *,
-        space_mode: SpaceMode = "flat",
+        space_mode: SpaceMode | None = None,
         observations: str | Sequence[str] | None = None,
         reward_fn: RewardFn | None = None,
         termination_fn: TerminationFn | None = None,
@@ -116,11 +116,16 @@ class URLabBatchEnv(Vectorized):
             max_episode_steps=max_episode_steps,
             keyframe=keyframe,
             reset_noise=reset_noise,
+            space_mode=space_mode,
         )
+        if settings.cameras:
+            raise ValueError(f"a batch observes no cameras ({', '.join(settings.cameras)}): use servers")
         scene = _fetch(with_model_options(address), client_defaults(client_options))
         model, prefixes, controllers, exact = scene
         declared = declared_in(model) if randomise is None else Randomisation.of(randomise)
-        mapping = SpaceMapping(model, prefixes, fields_of(settings.observations), space_mode)
+        mapping = SpaceMapping(
+            model, prefixes, fields_of(settings.observations), settings.space_mode, settings.articulations
+        )
         super().__init__(
             num_envs=num_envs,
             mapping=mapping,

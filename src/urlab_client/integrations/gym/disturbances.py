@@ -129,9 +129,9 @@ class Disturbances:
             return [("", "task")]
         if noise.field not in mapping.fields:
             raise ValueError(f"noise on {noise.field}, which is not observed: there are {', '.join(mapping.fields)}")
-        keys = [key for key in mapping.keys if fnmatch.fnmatchcase(key, noise.articulation)]
+        keys = [key for key in mapping.observed if fnmatch.fnmatchcase(key, noise.articulation)]
         if not keys:
-            raise ValueError(f"noise on {noise.field}: no articulation is called {noise.articulation!r}")
+            raise ValueError(f"noise on {noise.field}: no observed articulation is called {noise.articulation!r}")
         return [(key, noise.field) for key in keys]
 
     @property

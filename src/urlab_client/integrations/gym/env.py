@@ -65,12 +65,12 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         self,
         client: URLabClient,
         *,
-        space_mode: SpaceMode = "flat",
+        space_mode: SpaceMode | None = None,
         observations: str | Sequence[str] | None = None,
         reward_fn: RewardFn | None = None,
         termination_fn: TerminationFn | None = None,
         max_episode_steps: int | None = None,
-        cameras: Sequence[str] = (),
+        cameras: Sequence[str] | None = None,
         n_substeps: int | None = None,
         render_mode: Literal["rgb_array"] | None = None,
         render_camera: str | None = None,
@@ -84,7 +84,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
 
         Args:
             client: A client after `discover()`, during play.
-            space_mode: `flat` for one array, `dict` for dictionaries by articulation and field.
+            space_mode: `flat` for one array, the default, `dict` for dictionaries by articulation and field.
             observations: An observation level, `minimal` (qpos, qvel) or `standard` (adds ctrl, act, sensors), or a
                 sequence of those fields. Where it is None, here and below, the task decides, or `standard`.
             reward_fn: Called with the observation before, the action, the observation after, and `info`; 0 without.
@@ -120,15 +120,15 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
             max_episode_steps=max_episode_steps,
             keyframe=keyframe,
             reset_noise=reset_noise,
+            space_mode=space_mode,
+            cameras=cameras,
         )
         self.client = client
         self.render_mode = render_mode
         self._rendered = () if render_mode is None else (render_camera or first_camera(aio_of(client)),)
         self._episode = EnvEpisode(
             aio_of(client),
-            space_mode=space_mode,
             settings=settings,
-            cameras=cameras,
             rendered=self._rendered,
             task=task,
             randomise=None if randomise is None else Randomisation.of(randomise),
@@ -269,7 +269,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         states = self._episode.states()
         actions: Any = np.asarray(action)[None]
         if self.mapping.mode == "dict":
-            actions = {key: np.asarray(action[key])[None] for key in self.mapping.keys}
+            actions = {key: np.asarray(action[key])[None] for key in action}
         reward, terminated = float(task.reward(states, actions)[0]), bool(task.terminated(states)[0])
         truncated = self._max_episode_steps is not None and self._elapsed >= self._max_episode_steps
         success = task.success(states)

@@ -15,7 +15,7 @@ from urlab_client.aio.articulation import URLabArticulation
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
 from urlab_client.integrations._varied import variation_of
-from urlab_client.integrations.gym.spaces import LEVELS, Field, Observation, Space, SpaceMapping, SpaceMode, dict_space
+from urlab_client.integrations.gym.spaces import LEVELS, Field, Observation, Space, SpaceMapping, dict_space
 from urlab_client.integrations.gym.task import EpisodeSettings, Start, States, Task, TaskScene, add_observed, with_task
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.enums import CameraMode, ObservationLevel, StepMode
@@ -68,9 +68,7 @@ class EnvEpisode:
         self,
         client: URLabClient,
         *,
-        space_mode: SpaceMode,
         settings: EpisodeSettings,
-        cameras: Sequence[str],
         rendered: Sequence[str],
         task: Task | None = None,
         randomise: Randomisation | None = None,
@@ -79,9 +77,7 @@ class EnvEpisode:
 
         Args:
             client: The client.
-            space_mode: `flat` or `dict`.
             settings: What the episodes are like.
-            cameras: Cameras whose frames come with each observation, `ARTICULATION/CAMERA` or a scene-level name.
             rendered: Further cameras whose frames are to be in `frames`.
             task: What chooses the start, and adds to observations; set up here if it is not yet.
             randomise: What varies from episode to episode; what the server says that it varies, for None.
@@ -106,7 +102,10 @@ class EnvEpisode:
         self.frames: dict[str, Pixels] = {}
         self._model = model
         fields = fields_of(settings.observations)
-        self.mapping = SpaceMapping(model, compiled_prefixes(client), fields, space_mode)
+        self.mapping = SpaceMapping(
+            model, compiled_prefixes(client), fields, settings.space_mode, settings.articulations
+        )
+        cameras = settings.cameras
         self._sensors = {key: [*self.mapping.layout(key).sensors] for key in self.mapping.keys}
         minimal = set(fields) <= set(LEVELS["minimal"])
         self.observation_space = self._with_cameras(cameras)

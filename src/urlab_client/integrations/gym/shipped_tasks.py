@@ -1,4 +1,4 @@
-"""Tasks on the bundled robots: reaching a place, walking as told, and simpler ones whose goal is always the same."""
+"""Tasks on the bundled robots: reaching a place, pushing a block, walking as told; and two whose goal never varies."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from typing import Any, ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client.integrations.gym.spaces import SpaceMode
 from urlab_client.integrations.gym.starts import ResetNoise
 from urlab_client.integrations.gym.task import Start, States, Task
 from urlab_client.protocol.base import Floats
 
-__all__ = ["FixedReach", "Reach", "Run", "Walk"]
+__all__ = ["FixedReach", "Push", "PushPictures", "Reach", "Run", "Walk"]
 
 Bools = NDArray[np.bool_]
 
@@ -97,6 +98,59 @@ class Reach(Task):
 
     def _distance(self, states: States) -> Floats:
         return np.linalg.norm(states.goal["target"] - self._hand(states), axis=1)
+
+
+class Push(Task):
+    """The arm pushes a block on the floor to a place that it is told.
+
+    Observed besides positions and velocities of arm and block: the target, x and y in metres, world frame. The reward
+    is minus the block's distance from it and a fifth of the hand's distance from the block, plus 1 within `CLOSE_M`,
+    which is success.
+    """
+
+    CLOSE_M: Final = 0.04
+    BEHIND: Final = {"shoulder_lift": 0.364, "elbow": 0.792, "wrist_pitch": -1.156}
+    """Joint positions with the fingers just above the floor, between the arm's base and the block, rad."""
+
+    scene_address: ClassVar[str] = "sim://arm?model=block&model=floor"
+    n_observed: ClassVar[int] = 2
+    n_substeps: ClassVar[int] = 20
+    max_episode_steps: ClassVar[int | None] = 150
+
+    def reset(self, rng: np.random.Generator, start: Start) -> None:
+        """See `Task.reset`."""
+        for joint, position in self.BEHIND.items():
+            start.joint(f"arm/{joint}", position + rng.uniform(-0.02, 0.02))
+        turn = rng.uniform(-np.pi, np.pi)
+        upright = (np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2))
+        start.place("block/block", [rng.uniform(0.42, 0.46), rng.uniform(-0.05, 0.05), 0.03], upright)
+        start.goal["target"] = rng.uniform([0.52, -0.12], [0.6, 0.12])
+
+    def observe(self, states: States) -> Floats:
+        """See `Task.observe`."""
+        return states.goal["target"]
+
+    def reward(self, states: States, actions: Any) -> Floats:
+        """See `Task.reward`."""
+        distance = self._distance(states)
+        hand = states.site_position("arm/grip") - states.body_position("block/block")
+        return -distance - 0.2 * np.linalg.norm(hand, axis=1) + (distance < self.CLOSE_M)
+
+    def success(self, states: States) -> Bools:
+        """See `Task.success`."""
+        return self._distance(states) < self.CLOSE_M
+
+    def _distance(self, states: States) -> Floats:
+        return np.linalg.norm(states.body_position("block/block")[:, :2] - states.goal["target"], axis=1)
+
+
+class PushPictures(Push):
+    """`Push` by sight: the block is seen in pictures of the camera `arm/overview` alone. For servers."""
+
+    scene_address: ClassVar[str] = f"{Push.scene_address}&camera-size=96x72"
+    space_mode: ClassVar[SpaceMode] = "dict"
+    cameras: ClassVar[Sequence[str]] = ("arm/overview",)
+    articulations: ClassVar[Sequence[str] | None] = ("arm",)
 
 
 class Walk(Task):

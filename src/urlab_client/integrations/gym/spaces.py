@@ -43,12 +43,14 @@ class SpaceMapping:
     """How the articulations of a scene map to an action space and an observation space.
 
     Actions are the set-points in `ctrl_array`, float32 as Gymnasium's own MuJoCo environments have them; their bounds
-    are the actuators' `ctrlrange`, infinite without one. Observations are float64 and unbounded: joints may overshoot
+    are the actuators' `ctrlrange`, infinite without one. An articulation without actuators, such as a block to push,
+    has none. Observations are float64 and unbounded: joints may overshoot
     their ranges. Articulations come in the order of their keys in `client.articulations`, fields in the order asked
     for. The flat spaces are the concatenation of the dictionaries' entries in that order.
 
     Attributes:
         keys: Articulation keys, in order.
+        observed: Those of them that are observed.
         fields: Observed fields, in order.
         mode: `flat` or `dict`.
         action_space: `Box(n,)`, or `Dict` of one `Box` per articulation.
@@ -56,7 +58,12 @@ class SpaceMapping:
     """
 
     def __init__(
-        self, model: mujoco.MjModel, prefixes: Mapping[str, str], fields: Sequence[Field], mode: SpaceMode = "flat"
+        self,
+        model: mujoco.MjModel,
+        prefixes: Mapping[str, str],
+        fields: Sequence[Field],
+        mode: SpaceMode = "flat",
+        observed: Sequence[str] | None = None,
     ) -> None:
         """Map articulations of a compiled scene.
 
@@ -65,9 +72,10 @@ class SpaceMapping:
             prefixes: Keys of the articulations, and what the names of their elements in the model begin with.
             fields: What to observe.
             mode: `flat` or `dict`.
+            observed: Keys of the articulations that are observed; all for None.
 
         Raises:
-            ValueError: An unknown field or mode, or nothing to observe.
+            ValueError: An unknown field, mode or articulation, or nothing to observe.
         """
         unknown = [field for field in fields if field not in FIELDS]
         if unknown or not fields:
@@ -75,6 +83,11 @@ class SpaceMapping:
         if mode not in get_args(SpaceMode):
             raise ValueError(f"space_mode must be 'flat' or 'dict', not {mode!r}")
         self.keys = tuple(prefixes)
+        self.observed = self.keys if observed is None else tuple(observed)
+        if missing := set(self.observed) - set(self.keys):
+            raise ValueError(
+                f"no articulation {', '.join(sorted(missing))} to observe; there are: {', '.join(self.keys)}"
+            )
         self.fields = tuple(fields)
         self.mode: SpaceMode = mode
         layouts = articulation_layouts(model, prefixes)
@@ -82,6 +95,7 @@ class SpaceMapping:
         self._where = self._slices()
         ends = list(itertools.accumulate(len(part.low) for part in self._parts.values()))
         self._n_actions = ends[-1]
+        self._driven = tuple(key for key, part in self._parts.items() if len(part.low))
         self._actions = {key: slice(a, b) for key, a, b in zip(self._parts, [0, *ends], ends, strict=False)}
         self.action_space = self._make_action_space()
         self.observation_space = self._make_observation_space()
@@ -105,14 +119,15 @@ class SpaceMapping:
             ValueError: The action has another shape, or holds NaN or infinity.
         """
         if self.mode == "dict":
-            if set(action) != set(self.keys):
-                raise ValueError(f"the action needs one entry for each of {', '.join(self.keys)}, not {sorted(action)}")
-            found = {key: np.asarray(action[key], dtype=np.float64) for key in self.keys}
+            if set(action) != set(self._driven):
+                wanted = ", ".join(self._driven)
+                raise ValueError(f"the action needs one entry for each of {wanted}, not {sorted(action)}")
+            found = {key: np.asarray(action[key], dtype=np.float64) for key in self._driven}
         else:
             whole = np.asarray(action, dtype=np.float64)
             if whole.ndim == 0 or whole.shape[-1] != self._n_actions:
                 raise ValueError(f"the action has shape {whole.shape}; its last axis must be {self._n_actions} long")
-            found = {key: whole[..., where] for key, where in self._actions.items()}
+            found = {key: whole[..., where] for key, where in self._actions.items() if key in self._driven}
         for key, values in found.items():
             n_ctrl = len(self._parts[key].low)
             if values.ndim == 0 or values.shape[-1] != n_ctrl:
@@ -124,8 +139,8 @@ class SpaceMapping:
     def observe(self, read: Callable[[str, Field], Floats]) -> Observation:
         """Assemble an observation from `read(key, field)`, which returns arrays of shape (…, n)."""
         if self.mode == "dict":
-            return {key: {field: np.array(read(key, field)) for field in self.fields} for key in self.keys}
-        return np.concatenate([read(key, field) for key in self.keys for field in self.fields], axis=-1)
+            return {key: {field: np.array(read(key, field)) for field in self.fields} for key in self.observed}
+        return np.concatenate([read(key, field) for key in self.observed for field in self.fields], axis=-1)
 
     def field(self, observation: Observation, key: str, field: Field) -> Floats:
         """Return the view of one field in an observation of either mode, shape (…, n).
@@ -133,12 +148,14 @@ class SpaceMapping:
         Reward and termination functions written with this and `[..., i]` serve single and vector environments.
 
         Raises:
-            ValueError: The field is not observed.
+            ValueError: The field, or the articulation, is not observed.
         """
         if field not in self.fields:
             raise ValueError(
                 f"{field!r} is not observed: the environment was made with observations={list(self.fields)!r}"
             )
+        if key not in self.observed:
+            raise ValueError(f"{key!r} is not observed; there are: {', '.join(self.observed)}")
         if self.mode == "dict":
             return observation[key][field]
         return observation[..., self._where[key, field]]
@@ -146,7 +163,8 @@ class SpaceMapping:
     def _slices(self) -> dict[tuple[str, Field], slice]:
         where: dict[tuple[str, Field], slice] = {}
         at = 0
-        for key, part in self._parts.items():
+        for key in self.observed:
+            part = self._parts[key]
             for field in self.fields:
                 where[key, field] = slice(at, at + part.widths[field])
                 at += part.widths[field]
@@ -154,17 +172,19 @@ class SpaceMapping:
 
     def _make_action_space(self) -> Space:
         if self.mode == "dict":
-            return dict_space({key: _bounded(part.low, part.high) for key, part in self._parts.items()})
+            parts = {key: self._parts[key] for key in self._driven}
+            return dict_space({key: _bounded(part.low, part.high) for key, part in parts.items()})
         parts = self._parts.values()
         return _bounded(np.concatenate([part.low for part in parts]), np.concatenate([part.high for part in parts]))
 
     def _make_observation_space(self) -> Space:
+        seen = {key: self._parts[key] for key in self.observed}
         if self.mode == "flat":
-            return _unbounded(sum(part.widths[field] for part in self._parts.values() for field in self.fields))
+            return _unbounded(sum(part.widths[field] for part in seen.values() for field in self.fields))
         return dict_space(
             {
                 key: dict_space({field: _unbounded(part.widths[field]) for field in self.fields})
-                for key, part in self._parts.items()
+                for key, part in seen.items()
             }
         )
 

@@ -13,7 +13,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from urlab_client.aio.model.mirror import model_names
-from urlab_client.integrations.gym.spaces import Observation, Space, SpaceMapping, dict_space
+from urlab_client.integrations.gym.spaces import Observation, Space, SpaceMapping, SpaceMode, dict_space
 from urlab_client.integrations.gym.starts import ResetNoise, noise_of
 from urlab_client.protocol.base import Floats
 
@@ -271,6 +271,9 @@ class EpisodeSettings:
         max_episode_steps: Actions per episode, or None.
         keyframe: Where episodes start; the initial state for None.
         reset_noise: Largest deviation of joints from there.
+        space_mode: `flat` or `dict`.
+        cameras: Cameras whose pictures are observed.
+        articulations: Articulations that are observed; all for None.
     """
 
     observations: str | Sequence[str]
@@ -278,6 +281,9 @@ class EpisodeSettings:
     max_episode_steps: int | None
     keyframe: str | None
     reset_noise: ResetNoise
+    space_mode: SpaceMode
+    cameras: Sequence[str]
+    articulations: Sequence[str] | None
 
     @classmethod
     def of(
@@ -289,6 +295,8 @@ class EpisodeSettings:
         max_episode_steps: int | None,
         keyframe: str | None,
         reset_noise: float | ResetNoise | None,
+        space_mode: SpaceMode | None,
+        cameras: Sequence[str] | None = None,
     ) -> EpisodeSettings:
         """Return the settings in force; None asks for those of the task, or the defaults.
 
@@ -302,6 +310,9 @@ class EpisodeSettings:
             max_episode_steps=defaults.max_episode_steps if max_episode_steps is None else max_episode_steps,
             keyframe=defaults.keyframe if keyframe is None else keyframe,
             reset_noise=noise_of(defaults.reset_noise if reset_noise is None else reset_noise),
+            space_mode=defaults.space_mode if space_mode is None else space_mode,
+            cameras=tuple(defaults.cameras if cameras is None else cameras),
+            articulations=defaults.articulations,
         )
         if settings.n_substeps < 1:
             raise ValueError(f"n_substeps must be at least 1, not {settings.n_substeps}")
@@ -310,7 +321,7 @@ class EpisodeSettings:
         return settings
 
 
-_NO_TASK: Final = EpisodeSettings("standard", 1, None, None, ResetNoise())
+_NO_TASK: Final = EpisodeSettings("standard", 1, None, None, ResetNoise(), "flat", (), None)
 
 
 class Task:
@@ -329,6 +340,9 @@ class Task:
         max_episode_steps: Actions per episode, or None.
         keyframe: Where episodes start before `reset` changes that; the initial state for None.
         reset_noise: Largest deviation of joints from there, before `reset` changes that; see `URLabEnv`.
+        space_mode: `flat` or `dict`.
+        cameras: Cameras whose pictures are observed, which takes servers and `dict`.
+        articulations: Articulations whose fields are observed; all for None.
         scene: The scene, from `setup` on.
     """
 
@@ -339,6 +353,9 @@ class Task:
     max_episode_steps: ClassVar[int | None] = 200
     keyframe: ClassVar[str | None] = None
     reset_noise: ClassVar[float | ResetNoise] = 0.0
+    space_mode: ClassVar[SpaceMode] = "flat"
+    cameras: ClassVar[Sequence[str]] = ()
+    articulations: ClassVar[Sequence[str] | None] = None
     scene: TaskScene
 
     def setup(self, scene: TaskScene) -> None:

@@ -8,7 +8,7 @@ import gymnasium
 
 from urlab_client.integrations.gym.batch import URLabBatchEnv
 from urlab_client.integrations.gym.env import URLabEnv
-from urlab_client.integrations.gym.shipped_tasks import FixedReach, Reach, Run, Walk
+from urlab_client.integrations.gym.shipped_tasks import FixedReach, Push, PushPictures, Reach, Run, Walk
 from urlab_client.integrations.gym.task import Task
 from urlab_client.integrations.gym.vector import URLabVectorEnv
 
@@ -17,6 +17,8 @@ __all__ = ["TASKS", "make", "make_vec", "register"]
 TASKS: Final[dict[str, type[Task]]] = {
     "urlab/Arm-v0": FixedReach,
     "urlab/Quadruped-v0": Run,
+    "urlab/Push-v0": Push,
+    "urlab/PushPictures-v0": PushPictures,
     "urlab/Reach-v0": Reach,
     "urlab/Walk-v0": Walk,
 }

@@ -147,12 +147,12 @@ class URLabVectorEnv(Vectorized):
         addresses: str | Sequence[str],
         num_envs: int | None = None,
         *,
-        space_mode: SpaceMode = "flat",
+        space_mode: SpaceMode | None = None,
         observations: str | Sequence[str] | None = None,
         reward_fn: RewardFn | None = None,
         termination_fn: TerminationFn | None = None,
         max_episode_steps: int | None = None,
-        cameras: Sequence[str] = (),
+        cameras: Sequence[str] | None = None,
         n_substeps: int | None = None,
         reset_noise: float | ResetNoise | None = None,
         keyframe: str | None = None,
@@ -213,15 +213,15 @@ class URLabVectorEnv(Vectorized):
             max_episode_steps=max_episode_steps,
             keyframe=keyframe,
             reset_noise=reset_noise,
+            space_mode=space_mode,
+            cameras=cameras,
         )
         declared = None if randomise is None else Randomisation.of(randomise)
         if declared is not None:
             text = declared.to_json()
             addresses = [with_option(a, "randomise", text) if a.startswith(SCHEME) else a for a in addresses]
         episode_options = {
-            "space_mode": space_mode,
             "settings": settings,
-            "cameras": tuple(cameras),
             "task": task,
             "randomise": declared,
         }

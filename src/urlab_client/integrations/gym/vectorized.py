@@ -180,6 +180,11 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
             infos = self._same_step_reset(infos)
         return self._told(), rewards, terminated, truncated, infos
 
+    @property
+    def max_episode_steps(self) -> int | None:
+        """Actions after which an episode is truncated, or None."""
+        return self._max_episode_steps
+
     def episode_seeds(self) -> NDArray[np.int64]:
         """Return the seed of each environment's episode, which decides what varies; -1 where nothing does."""
         found = np.full(self.num_envs, -1, dtype=np.int64)

@@ -3,6 +3,15 @@
 Running a network needs the extra `onnx`; declarations, mappings and policies of your own callables do not.
 """
 
+from urlab_client.integrations.policy.evaluation import (
+    Estimate,
+    Evaluation,
+    Outcome,
+    bootstrap_mean,
+    evaluate_in,
+    evaluate_on,
+    wilson,
+)
 from urlab_client.integrations.policy.mapping import PolicyMapping, PolicyMismatch, RobotState
 from urlab_client.integrations.policy.network import Network, OnnxNetwork
 from urlab_client.integrations.policy.policy import Policy, load
@@ -10,8 +19,11 @@ from urlab_client.integrations.policy.runner import PolicyRun, require, run, run
 from urlab_client.integrations.policy.spec import PolicyFileError, PolicySpec, parse_spec, read_spec
 
 __all__ = [
+    "Estimate",
+    "Evaluation",
     "Network",
     "OnnxNetwork",
+    "Outcome",
     "Policy",
     "PolicyFileError",
     "PolicyMapping",
@@ -19,10 +31,14 @@ __all__ = [
     "PolicyRun",
     "PolicySpec",
     "RobotState",
+    "bootstrap_mean",
+    "evaluate_in",
+    "evaluate_on",
     "load",
     "parse_spec",
     "read_spec",
     "require",
     "run",
     "run_blocking",
+    "wilson",
 ]

@@ -156,6 +156,8 @@ async def run(
     *,
     articulation: str | None = None,
     seconds: float = 10.0,
+    seed: int | None = None,
+    until_fall: bool = False,
     on_action: OnAction | None = None,
 ) -> PolicyRun:
     """Let a policy drive its robot for some simulated seconds.
@@ -169,6 +171,8 @@ async def run(
         policy: The policy.
         articulation: Key, actor id or class name of the robot, if it is not the one that is declared.
         seconds: Simulated seconds.
+        seed: Seed of the first reset, which decides what a server varies.
+        until_fall: End with the first fall.
         on_action: Called after each action.
 
     Raises:
@@ -183,7 +187,7 @@ async def run(
         before = {name: {key: controller.params[name][key] for key in wanted[name]} for name in wanted}
         await controller.configure(timeout=DEFAULT, **wanted)
     try:
-        return await _PolicyLoop(client, robot, policy, on_action).until(seconds)
+        return await _PolicyLoop(client, robot, policy, on_action).until(seconds, seed, until_fall=until_fall)
     finally:
         if controller is not None and client.connected:
             with contextlib.suppress(URLabError):  # a courtesy: play may be over
@@ -223,11 +227,11 @@ class _PolicyLoop:
         self._heading: Floats = np.array([1.0, 0.0])
         self._travelled = (0.0, 0.0)
 
-    async def until(self, seconds: float) -> PolicyRun:
-        """Run for some simulated seconds."""
+    async def until(self, seconds: float, seed: int | None, *, until_fall: bool) -> PolicyRun:
+        """Run for some simulated seconds, or until the first fall."""
         loop = asyncio.get_running_loop()
         client, result, period = self._client, self._result, self._policy.spec.period
-        await self._restart()
+        await self._restart(seed)
         if self._live:
             await client.runtime.set_paused(False)
         started = loop.time()
@@ -242,13 +246,15 @@ class _PolicyLoop:
                 self._on_action(result)
             if self._mapping.fallen(RobotState.of(self._robot)):
                 result.falls += 1
+                if until_fall:
+                    break
                 await self._restart()
         return result
 
-    async def _restart(self) -> None:
+    async def _restart(self, seed: int | None = None) -> None:
         """Put the simulation at its start; the policy forgets."""
         self._travelled = (self._result.distance, self._result.forward)
-        await self._client.reset(self._policy.spec.keyframe)
+        await self._client.reset(self._policy.spec.keyframe, seed)
         self._policy.reset()
         self._velocity = np.zeros(2)
         self._last_time = self._began = self._client.sim_time

@@ -208,6 +208,9 @@ class ServerReconnected(ClientEvent, tag="reconnected", kw_only=True, omit_defau
 
     endpoint: Annotated[str, doc("Where the server is.")]
     down_s: Annotated[float, doc("Seconds without a connection.")]
+    refused: Annotated[
+        bool, doc("Whether connections were refused meanwhile: no server was there, as while one restarts.")
+    ] = False
 
 
 class ServerSilent(ClientEvent, tag="silent", kw_only=True, omit_defaults=True):

@@ -21,7 +21,7 @@ def bundled_root() -> Path:
 
 
 def bundled_models() -> dict[str, Path]:
-    """Return the bundled MJCF files by name, sorted: `arm`, `ball`, `floor`, `pallet`, `quadruped`."""
+    """Return the bundled MJCF files by name, sorted: `arm`, `ball`, `block`, `floor`, `pallet`, `quadruped`."""
     return {file.stem: file for file in sorted(bundled_root().glob("*.xml"))}
 
 

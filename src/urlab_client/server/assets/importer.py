@@ -104,7 +104,7 @@ def build_snapshot(file: Path, snapshot: Path, limits: Limits) -> tuple[Compiled
     return compiled, model
 
 
-_hook_lock = threading.Lock()
+_hook_lock = threading.RLock()  # blocks may be nested: the inner one collects
 
 
 @contextlib.contextmanager

@@ -124,7 +124,10 @@ def _remove_left_behind(base: Path) -> None:
 def _remove(instance: Path) -> None:
     """Remove what servers make; a directory with anything else in it stays."""
     live = instance / LIVE_DIRECTORY
-    for file in (*live.glob("*.shm"), *live.glob(".*.shm"), live / doorbell.FILE, instance / LOCK_FILE):
+    files = [live / doorbell.FILE, instance / LOCK_FILE]
+    with contextlib.suppress(OSError):  # servers that start at once may remove the same one
+        files += [file for file in live.iterdir() if file.name.endswith(".shm")]
+    for file in files:
         with contextlib.suppress(OSError):
             file.unlink()
     for directory in (live, instance):

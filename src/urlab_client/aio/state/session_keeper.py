@@ -1,0 +1,144 @@
+"""A session that lasts: `keep_session=True`.
+
+After a restart of the server, and with each new play session, the client discovers again by itself. It never takes a
+session back: the server has one, whoever said `hello` last has it, and no request tells who that is. What shows is
+whether the server was gone. So only a session that was lost with the connection is opened again, if nothing listened at
+the address meanwhile and the world has not simply gone on.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import Final
+
+from urlab_client.aio.session import Session
+from urlab_client.aio.state.discovery import Discovery
+from urlab_client.aio.state.sim_state import SimState
+from urlab_client.aio.streams import Stream
+from urlab_client.protocol.errors import ClientClosed, URLabConnectionError, URLabError, URLabTimeoutError
+from urlab_client.protocol.messages.runtime import ListKeyframes
+from urlab_client.protocol.messages.session import Hello
+from urlab_client.protocol.messages.streams import (
+    ClientEvent,
+    PlayStarted,
+    ServerLost,
+    ServerReconnected,
+    SessionLost,
+    StreamPolicy,
+)
+
+__all__ = ["SessionKeeper"]
+
+log = logging.getLogger("urlab_client.client")
+
+_LOOK_S: Final = 5.0  # how often it is made sure that the session is still this client's
+_PROBE_S: Final = 2.0
+_WORLD_S: Final = 0.5  # a world that goes on publishes ten times a second, where it publishes at all
+_PAUSES_S: Final = (0.0, 0.2, 0.5, 1.0, 2.0)  # between attempts, the last one again and again
+
+
+class SessionKeeper:
+    """Keeps the session of one client, in one task.
+
+    Args:
+        session: The client's session.
+        state: The client's state.
+        discovery: Opens sessions.
+    """
+
+    def __init__(self, session: Session, state: SimState, discovery: Discovery) -> None:
+        self._session = session
+        self._state = state
+        self._discovery = discovery
+        self._task: asyncio.Task[None] | None = None
+        self._was_down = False  # since the session was accepted last
+        self._time = 0.0  # of the simulation, when the connection was lost
+        self._given_up = ""  # a session that another client has ended
+
+    def start(self) -> None:
+        """Keep the session that is open now, and those after it; on the event loop. Idempotent."""
+        if self._task is None or self._task.done():
+            kinds = (ServerLost, ServerReconnected, SessionLost, PlayStarted)
+            events = self._state.publishers.events.stream(kinds, 100)
+            self._task = asyncio.create_task(self._run(events), name="urlab-keeper")
+
+    async def aclose(self) -> None:
+        """Keep it no longer. Idempotent."""
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.wait((self._task,))
+
+    async def _run(self, events: Stream[ClientEvent]) -> None:
+        while True:
+            try:
+                await self._act_on(await events.receive(timeout=_LOOK_S))
+            except URLabTimeoutError:
+                await self._look()
+            except ClientClosed:
+                return
+
+    async def _act_on(self, event: ClientEvent) -> None:
+        match event:
+            case ServerLost():
+                self._was_down = False
+                self._time = self._state.sim_time
+            case ServerReconnected():
+                self._was_down = event.refused
+            case SessionLost():
+                if event.session_id == self._session.session_id:
+                    await self._on_lost(event.session_id)
+            case PlayStarted(articulations=[]):
+                await self._open("somebody else has started play")
+            case _:
+                pass
+
+    async def _look(self) -> None:
+        """Notice a session that has been taken over, before the server restarts and it looks as if that were why."""
+        session = self._session
+        if session.session_id not in ("", self._given_up) and session.transport.connected:
+            try:
+                await session.probe(ListKeyframes(), timeout=_PROBE_S)
+            except URLabError as error:  # the events tell what it means
+                log.debug("looking after the session: %s", error)
+
+    async def _on_lost(self, session_id: str) -> None:
+        if session_id == self._given_up:
+            return
+        if self._session.confirmed or not self._was_down or await self._world_goes_on():
+            self._given_up = session_id
+            log.warning("another client has taken the session over; it is not taken back")
+            return
+        await self._open("the server has been restarted")
+
+    async def _world_goes_on(self) -> bool:
+        """Return whether the simulation is where this client left it, or further: then no server was restarted."""
+        if self._time <= 0.0:
+            return False
+        snapshots = Stream(self._state.publishers.state(), policy=StreamPolicy.LATEST)
+        try:
+            async with snapshots:
+                return (await snapshots.receive(timeout=_WORLD_S)).time >= self._time
+        except URLabTimeoutError:
+            return False
+
+    async def _open(self, why: str) -> None:
+        """Open a session, as soon as the server lets one be opened, unless the user does so or has to say more."""
+        session, state = self._session, self._state
+        lost = session.session_id
+        attempt = 0
+        while session.session_id == lost and not state.pending:
+            await asyncio.sleep(_PAUSES_S[min(attempt, len(_PAUSES_S) - 1)])
+            attempt += 1
+            try:
+                async with session.turn(Hello) as turn:
+                    if session.session_id == lost:
+                        log.info("discovering again, because %s", why)
+                        await self._discovery.open(turn, state.level)
+            except (URLabConnectionError, URLabTimeoutError) as error:
+                if isinstance(error, ClientClosed):
+                    raise
+                log.info("the session cannot be opened yet: %s", error)
+            except URLabError as error:
+                log.warning("the session could not be opened again: %s", error)
+                return

@@ -1,0 +1,226 @@
+"""`urlab evaluate`: how good a policy is, over many seeded episodes."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import logging
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+from urllib.parse import urlencode
+
+import msgspec
+
+from urlab_client.aio.launch import with_model_options, with_option
+from urlab_client.cli._arguments import Commands, count, seconds
+from urlab_client.cli._failure import CommandError
+from urlab_client.cli._mujoco import import_mujoco
+from urlab_client.cli._output import output, progress_bar
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from urlab_client.integrations.policy import Evaluation, Outcome
+    from urlab_client.randomise import Randomisation
+
+__all__ = ["add_parser", "run"]
+
+logger = logging.getLogger("urlab_client.cli")
+
+_MODEST: Final = ""
+_MOST_COPIES: Final = 64
+
+
+class EvaluateArguments(argparse.Namespace):
+    """What the command line says."""
+
+    policy: Path
+    task: str | None
+    robot: str | None
+    declaration: Path | None
+    episodes: int
+    seconds: float | None
+    seed: int
+    randomise: str | None
+    confidence: float
+    json: bool
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command to the parser."""
+    parser = commands.add_parser(
+        "evaluate",
+        help="measure how good a policy is, with confidence intervals",
+        description="Run a policy for many episodes, each with a seed of its own, and print its success rate with "
+        "Wilson's score interval, and its return with a bootstrap interval. With --task the network maps observations "
+        "of a registered task to actions, as learning libraries export it. Without, a TOML file beside it declares "
+        "what it sees, as for run-policy, and a success is an episode without a fall. Needs the extra "
+        "'urlab-client[onnx]', and with --task 'urlab-client[gym]'.",
+        examples=(
+            ("urlab evaluate reach.onnx --task urlab/Reach-v0 --episodes 100", "on a task, in a batch"),
+            ("urlab evaluate walk.onnx --randomise", "walk.toml beside it; masses, friction and others vary a little"),
+            (
+                "urlab evaluate walk.onnx --randomise go.toml --json",
+                "as a file declares; all episodes as JSON",
+            ),
+        ),
+    )
+    parser.add_argument("policy", type=Path, metavar="POLICY", help="the network, a .onnx file")
+    parser.add_argument("--task", metavar="ID", help="a registered task, such as urlab/Reach-v0")
+    parser.add_argument(
+        "--declaration", type=Path, metavar="FILE", help="the .toml file (default: that beside POLICY, of its name)"
+    )
+    parser.add_argument(
+        "--robot", metavar="ROBOT", help="an MJCF file or the name of a bundled robot (default: the declaration's)"
+    )
+    parser.add_argument("--episodes", type=count, default=100, metavar="N", help="default: %(default)s")
+    parser.add_argument(
+        "--seconds", type=seconds, metavar="S", help="simulated seconds of an episode, without --task (default: 10)"
+    )
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the evaluation (default: 0)")
+    parser.add_argument(
+        "--randomise",
+        nargs="?",
+        const=_MODEST,
+        metavar="FILE",
+        help="vary the robot from episode to episode as a TOML file declares; without FILE friction by 30 %%, damping "
+        "by 20 %%, masses and strengths by 10 %%, joints at the start by 0.05",
+    )
+    parser.add_argument(
+        "--confidence", type=float, default=0.95, metavar="P", help="coverage of the intervals (default: %(default)s)"
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON, with the outcome and seed of each episode")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: EvaluateArguments) -> int:
+    """Evaluate the policy; return 0.
+
+    Raises:
+        CommandError: An option cannot be used.
+        MissingExtra: A library is missing.
+        URLabError: A file is wrong, or the policy does not fit.
+    """
+    import_mujoco()
+    if not 0 < arguments.confidence < 1:
+        raise CommandError(f"--confidence must be between 0 and 1, not {arguments.confidence:g}")
+    if arguments.seed < 0:
+        raise CommandError(f"--seed must be at least 0, not {arguments.seed}")
+    declared = _declared(arguments.randomise)
+    with progress_bar(arguments.policy.name, arguments.episodes) as progress:
+        done = 0
+
+        def show(_: Outcome) -> None:
+            nonlocal done
+            done += 1
+            progress(done)
+
+        if arguments.task is None:
+            found = asyncio.run(_on_robot(arguments, declared, show))
+        else:
+            found = _in_task(arguments, arguments.task, declared, show)
+    if arguments.json:
+        sys.stdout.write(f"{msgspec.json.encode(found).decode()}\n")
+    else:
+        _print(arguments, found)
+    return 0
+
+
+def _declared(given: str | None) -> Randomisation | None:
+    from urlab_client.randomise.declaration import MODEST, Randomisation  # noqa: PLC0415
+
+    if given is None or given == _MODEST:
+        return None if given is None else MODEST
+    try:
+        return Randomisation.of(given)
+    except (OSError, ValueError) as error:
+        raise CommandError(f"--randomise: {error}") from None
+
+
+def _in_task(
+    arguments: EvaluateArguments, task: str, declared: Randomisation | None, show: Callable[[Outcome], None]
+) -> Evaluation:
+    for name in ("robot", "declaration", "seconds"):
+        if getattr(arguments, name) is not None:
+            raise CommandError(f"--{name} does not go with --task, which settles it")
+    from gymnasium.vector import AutoresetMode  # noqa: PLC0415
+
+    from urlab_client.integrations.gym import TASKS, URLabBatchEnv  # noqa: PLC0415
+    from urlab_client.integrations.policy import OnnxNetwork, PolicyFileError, evaluate_in  # noqa: PLC0415
+
+    if task not in TASKS:
+        raise CommandError(f"--task: there is no {task!r}; there are: {', '.join(TASKS)}")
+    kind = TASKS[task]
+    if kind.cameras:
+        raise CommandError(f"--task: {task} observes pictures, which a batch has none of")
+    network = OnnxNetwork(arguments.policy)
+    copies = min(arguments.episodes, _MOST_COPIES)
+    disabled = AutoresetMode.DISABLED
+    env = URLabBatchEnv(kind.scene_address, copies, task=kind(), randomise=declared, autoreset_mode=disabled)
+    try:
+        wanted = {"inputs": env.single_observation_space.shape, "outputs": env.single_action_space.shape}
+        for name, shape in wanted.items():
+            if getattr(network, name) not in (None, (shape or (0,))[0]):
+                raise PolicyFileError(
+                    f"{network.path} has {getattr(network, name)} {name}, but {task} has {(shape or (0,))[0]}."
+                )
+        return evaluate_in(
+            env,
+            network,
+            episodes=arguments.episodes,
+            seed=arguments.seed,
+            confidence=arguments.confidence,
+            on_episode=show,
+        )
+    finally:
+        env.close()
+
+
+async def _on_robot(
+    arguments: EvaluateArguments, declared: Randomisation | None, show: Callable[[Outcome], None]
+) -> Evaluation:
+    from urlab_client.aio import URLabClient  # noqa: PLC0415
+    from urlab_client.integrations.policy import evaluate_on, load  # noqa: PLC0415
+
+    policy = load(arguments.policy, arguments.declaration)
+    model = arguments.robot or policy.spec.robot
+    actor = Path(model).stem
+    options = {"controller": f"{actor}=pd"} if policy.spec.action.via == "controller" else {}
+    address = with_model_options(f"sim://{model}{'?' if options else ''}{urlencode(options)}")
+    if declared is None:
+        logger.warning("nothing varies, so all episodes are the same; --randomise varies the robot")
+    else:
+        address = with_option(address, "randomise", declared.to_json())
+    async with URLabClient(address, step_mode="direct", mujoco_version_check=False) as client:
+        await client.discover()
+        return await evaluate_on(
+            client,
+            policy,
+            articulation=actor,
+            episodes=arguments.episodes,
+            seconds=arguments.seconds or 10.0,
+            seed=arguments.seed,
+            confidence=arguments.confidence,
+            on_episode=show,
+        )
+
+
+def _print(arguments: EvaluateArguments, found: Evaluation) -> None:
+    from rich import box  # noqa: PLC0415
+    from rich.table import Table  # noqa: PLC0415
+
+    table = Table(
+        title=f"{arguments.policy.name}, {len(found.outcomes)} episodes, seed {arguments.seed}",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+        show_edge=False,
+    )
+    table.add_column("")
+    for heading in ("mean", f"{found.confidence:.0%} interval"):
+        table.add_column(heading, justify="right")
+    if (rate := found.success_rate) is not None:
+        table.add_row("success rate", f"{rate.value:.1%}", f"{rate.low:.1%} to {rate.high:.1%}")
+    for name, estimate in (("return", found.mean_return), ("actions", found.mean_actions)):
+        table.add_row(name, f"{estimate.value:.2f}", f"{estimate.low:.2f} to {estimate.high:.2f}")
+    output().print(table)

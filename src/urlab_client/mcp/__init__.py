@@ -1,0 +1,13 @@
+"""Tools for agents over the Model Context Protocol: a server on the async client and the console's controls.
+
+Needs the extra `mcp`. `urlab mcp` runs it; `Agent` is for programs that bring their own client or transport.
+"""
+
+from urlab_client._extras import need
+
+need("mcp", "mcap", "PIL", "starlette", "uvicorn", extra="mcp")
+
+from urlab_client.mcp.agent import Agent  # noqa: E402 - its libraries may be missing
+from urlab_client.mcp.driving import Limits  # noqa: E402
+
+__all__ = ["Agent", "Limits"]

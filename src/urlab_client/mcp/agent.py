@@ -1,0 +1,198 @@
+"""The MCP server: the tools and resources that one agent gets."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import time
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import msgspec
+from mcp.server import Server
+from mcp.server.context import ServerRequestContext
+from mcp.shared.exceptions import MCPError
+from mcp.types import (
+    INVALID_PARAMS,
+    CallToolRequestParams,
+    CallToolResult,
+    ImageContent,
+    ListResourcesResult,
+    ListToolsResult,
+    PaginatedRequestParams,
+    ReadResourceRequestParams,
+    ReadResourceResult,
+    Resource,
+    TextContent,
+    TextResourceContents,
+)
+
+from urlab_client.mcp.declaration import Declared, Needs, declared
+from urlab_client.mcp.driving import Limits, Stopped
+from urlab_client.mcp.editing import Tools
+from urlab_client.mcp.results import Result
+from urlab_client.protocol.errors import URLabError
+from urlab_client.web.console_session import ConsoleSession
+from urlab_client.web.driving_lease import NotDriving
+from urlab_client.web.ops import encode
+
+if TYPE_CHECKING:
+    from starlette.applications import Starlette
+
+__all__ = ["Agent"]
+
+_MODEL, _LOG = "urlab://model", "urlab://log"
+
+_INSTRUCTIONS = """\
+Tools to look at and drive robots in a MuJoCo simulation. Call look first: it lists robots, joints, actuators, cameras,
+units and limits. Angles are in radians, lengths in metres, the z axis points up. In mode direct time passes only while
+run or move_to work; in mode live it passes by itself unless it is paused. When something does not move, call explain.
+A person may watch and take the controls at any time; then wait. One call may take {sim:g} s of simulation time and
+{wall:g} s on the wall.{missing}"""
+
+
+class Agent:
+    """An MCP server whose tools act on a console's session.
+
+    Args:
+        console: The console application of `urlab_client.web.app()`, or its session.
+        limits: What the agent may do.
+        models: MJCF files that the agent may import, by the names that it sees.
+
+    Attributes:
+        server: The server of the MCP SDK, for a transport of your choice. Serve it while the console's lifespan runs.
+    """
+
+    def __init__(
+        self,
+        console: Starlette | ConsoleSession,
+        limits: Limits | None = None,
+        *,
+        models: Mapping[str, Path] | None = None,
+    ) -> None:
+        session: ConsoleSession = console if isinstance(console, ConsoleSession) else console.state.console
+        self.limits = limits or Limits()
+        self._tools = Tools(session, self.limits, models or {})
+        self._declared = declared(Tools)
+        allowed = {Needs.READ: True, Needs.DRIVE: self.limits.drive, Needs.EDIT: self.limits.edit}
+        self._offered = {name: one for name, one in self._declared.items() if allowed[one.needs]}
+        missing = [need.value for need, given in allowed.items() if not given]
+        self.server: Server[Any] = Server(
+            "urlab",
+            version=version("urlab-client"),
+            title="URLab",
+            instructions=_INSTRUCTIONS.format(
+                sim=self.limits.sim_seconds,
+                wall=self.limits.wall_seconds,
+                missing=f" Not allowed: {', '.join(missing)}." if missing else "",
+            ),
+            on_list_tools=self._list_tools,
+            on_call_tool=self._call_tool,
+            on_list_resources=self._list_resources,
+            on_read_resource=self._read_resource,
+        )
+
+    @property
+    def idle(self) -> bool:
+        """Whether no call drives at the moment."""
+        return self._tools.driving.idle
+
+    async def _list_tools(
+        self, context: ServerRequestContext[Any], params: PaginatedRequestParams | None
+    ) -> ListToolsResult:
+        return ListToolsResult(tools=[one.described for one in self._offered.values()])
+
+    async def _call_tool(self, context: ServerRequestContext[Any], params: CallToolRequestParams) -> CallToolResult:
+        console, viewer = self._tools.console, self._tools.driving.viewer
+        began = time.perf_counter()
+        try:
+            found = self._tool(params.name)
+            arguments = found.parse(params.arguments or {})
+            await self._tools.connected()
+            if found.takes_progress:
+                arguments["progress"] = context.session.report_progress
+            answer = _answer(await getattr(self._tools, found.name)(**arguments))
+        except (URLabError, NotDriving, Stopped, ValueError, TypeError, LookupError, OSError) as error:
+            text = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
+            console.note("error", viewer.name, params.name, text)
+            return CallToolResult(content=[TextContent(text=text)], is_error=True)
+        if found.needs is not Needs.READ:
+            milliseconds = 1e3 * (time.perf_counter() - began)
+            console.note("call", viewer.name, params.name, json.dumps(params.arguments or {}), milliseconds)
+        return answer
+
+    def _tool(self, name: str) -> Declared:
+        found = self._declared.get(name)
+        if found is None:
+            raise LookupError(f"There is no tool {name!r}. There are: {', '.join(self._offered)}.")
+        if name not in self._offered:
+            raise LookupError(
+                f"{name} is not allowed here. Ask whoever started `urlab mcp` to start it with {found.needs.value}."
+            )
+        return found
+
+    async def _list_resources(
+        self, context: ServerRequestContext[Any], params: PaginatedRequestParams | None
+    ) -> ListResourcesResult:
+        return ListResourcesResult(
+            resources=[
+                Resource(
+                    uri=_MODEL,
+                    name="model",
+                    description="Robots, joints, actuators, sensors, cameras, units and limits, as they are now.",
+                    mime_type="application/json",
+                ),
+                Resource(
+                    uri=_LOG,
+                    name="log",
+                    description="Calls, errors and events, of people, too; the newest last.",
+                    mime_type="application/json",
+                ),
+            ]
+        )
+
+    async def _read_resource(
+        self, context: ServerRequestContext[Any], params: ReadResourceRequestParams
+    ) -> ReadResourceResult:
+        uri = str(params.uri)
+        match uri:
+            case "urlab://model":
+                text = encode(self._tools.client.describe()).decode()
+            case "urlab://log":
+                text = encode(list(self._tools.console.entries)).decode()
+            case _:
+                raise MCPError(INVALID_PARAMS, f"There is no resource {uri!r}, only {_MODEL} and {_LOG}.")
+        return ReadResourceResult(contents=[TextResourceContents(uri=uri, text=text, mime_type="application/json")])
+
+
+def _answer(result: Result | tuple[Result, bytes]) -> CallToolResult:
+    """Return a result with its structure, its text, and its picture if there is one.
+
+    Raises:
+        ValueError: A number in it is not finite.
+    """
+    shown, jpeg = result if isinstance(result, tuple) else (result, None)
+    structure = _short(msgspec.to_builtins(shown))
+    text = json.dumps(structure)
+    content: list[TextContent | ImageContent] = [TextContent(text=text)]
+    if jpeg is not None:
+        content.append(ImageContent(data=base64.b64encode(jpeg).decode(), mime_type="image/jpeg"))
+    return CallToolResult(content=list(content), structured_content=structure)
+
+
+def _short(value: Any) -> Any:
+    """Return what a result is made of with six digits of each number, which is what agents need of them."""
+    match value:
+        case float() if math.isfinite(value):
+            return float(f"{value:.6g}")
+        case float():
+            raise ValueError("The simulation has diverged: some values are not finite. Call reset.")
+        case dict():
+            return {key: _short(part) for key, part in cast("dict[str, Any]", value).items()}
+        case list() | tuple():
+            return [_short(part) for part in cast("list[Any]", value)]
+        case _:
+            return value

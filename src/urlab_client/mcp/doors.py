@@ -1,0 +1,110 @@
+"""How agents reach the server: standard input and output, or HTTP with a token."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hmac
+import os
+import sys
+import threading
+from collections.abc import AsyncGenerator
+from typing import Any, cast
+
+from mcp.server.stdio import stdio_server
+from mcp.server.transport_security import TransportSecuritySettings
+from starlette.applications import Starlette
+from starlette.datastructures import Headers
+from starlette.responses import JSONResponse
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from urlab_client.mcp.agent import Agent
+from urlab_client.web.access import Access
+
+__all__ = ["http_application", "serve_stdio"]
+
+_PATH = "/mcp"
+_CHUNK_BYTES = 65536
+
+
+async def serve_stdio(agent: Agent) -> None:
+    """Serve one agent on standard input and output until its input ends."""
+    lines = cast("Any", _Lines(sys.stdin.fileno()))  # the SDK iterates over it, and does nothing else
+    async with stdio_server(stdin=lines) as (reader, writer):
+        await agent.server.run(reader, writer, agent.server.create_initialization_options())
+
+
+class _Lines:
+    """Lines of text from a file.
+
+    Nothing interrupts a thread that reads. This one ends with the process, so that Ctrl-C ends the server at once.
+    """
+
+    def __init__(self, file: int) -> None:
+        self._file = file
+        self._loop = asyncio.get_running_loop()
+        self._lines: asyncio.Queue[str | None] = asyncio.Queue()
+        threading.Thread(target=self._read, name="urlab-mcp-stdin", daemon=True).start()
+
+    def _read(self) -> None:
+        rest = b""
+        with contextlib.suppress(RuntimeError, OSError):  # the loop has ended
+            while chunk := os.read(self._file, _CHUNK_BYTES):
+                *lines, rest = (rest + chunk).split(b"\n")
+                for line in lines:
+                    self._loop.call_soon_threadsafe(self._lines.put_nowait, line.decode("utf-8", "replace"))
+            self._loop.call_soon_threadsafe(self._lines.put_nowait, None)
+
+    async def __aiter__(self) -> AsyncGenerator[str]:
+        while (line := await self._lines.get()) is not None:
+            yield line
+
+
+def http_application(agent: Agent, console: ASGIApp | None, token: str, access: Access) -> Starlette:
+    """Make an application with the agent's server at `/mcp`, and the console at all other paths.
+
+    Args:
+        agent: The agent.
+        console: The console, if it is shown. Its lifespan is the caller's.
+        token: What agents bring as `Authorization: Bearer TOKEN`. Not a key of the console, which allows more.
+        access: Under which host names agents come.
+    """
+    inner = agent.server.streamable_http_app(
+        streamable_http_path=_PATH,
+        transport_security=TransportSecuritySettings(enable_dns_rebinding_protection=False),  # `access` looks at that
+    )
+    guarded = _Guarded(inner, token, access)
+
+    async def dispatch(scope: Scope, receive: Receive, send: Send) -> None:
+        target = guarded if console is None or scope["path"] == _PATH else console
+        await target(scope, receive, send)
+
+    @contextlib.asynccontextmanager
+    async def lifespan(_: Starlette) -> AsyncGenerator[None]:
+        async with inner.router.lifespan_context(inner):
+            yield
+
+    application = Starlette(lifespan=lifespan)
+    application.router.default = dispatch
+    return application
+
+
+class _Guarded:
+    def __init__(self, application: ASGIApp, token: str, access: Access) -> None:
+        self._application = application
+        self._token = f"bearer {token}".encode()
+        self._access = access
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        refused = self._access.refusal(scope) if scope["type"] == "http" else (403, "bad_request", "This is HTTP only.")
+        scheme, _, value = Headers(scope=scope).get("authorization", "").partition(" ")
+        if refused is None and not hmac.compare_digest(f"{scheme.lower()} {value.strip()}".encode(), self._token):
+            refused = 401, "bad_token", "Send the token that `urlab mcp` printed: `Authorization: Bearer TOKEN`."
+        if refused is None:
+            await self._application(scope, receive, send)
+        elif scope["type"] == "websocket":
+            await receive()
+            await send({"type": "websocket.close", "code": 4403, "reason": refused[2]})
+        else:
+            status, code, text = refused
+            await JSONResponse({"error": {"code": code, "message": text}}, status)(scope, receive, send)

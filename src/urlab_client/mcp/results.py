@@ -1,0 +1,160 @@
+"""What the tools return. The output schemas that agents see are made of these structs."""
+
+from __future__ import annotations
+
+from msgspec import Struct
+
+from urlab_client.protocol.client_types import Finding
+from urlab_client.protocol.descriptions import Pose, SceneDescription
+from urlab_client.protocol.types import Contact
+from urlab_client.web.console_session import LogEntry
+
+__all__ = ["Contacts", "Done", "Edited", "Explained", "Log", "Picture", "Recorded", "Result", "RobotState", "World"]
+
+
+class Result(Struct, kw_only=True):
+    """When the result was made.
+
+    Attributes:
+        sim_time: Simulation time, seconds.
+        step: Physics steps since the session began or the last reset.
+        mode: `direct`: time passes only while a tool lets it; `live`: time passes by itself unless paused.
+    """
+
+    sim_time: float = 0.0
+    step: int = 0
+    mode: str = ""
+
+
+class World(Result, kw_only=True):
+    """Everything there is.
+
+    Attributes:
+        scene: Robots with joints, actuators, sensors and cameras, and other bodies.
+        blueprints: What `spawn` can place.
+        models: What `import_model` can turn into a blueprint.
+        driver: Who has the controls, or None.
+    """
+
+    scene: SceneDescription
+    blueprints: list[str]
+    models: list[str]
+    driver: str | None
+
+
+class RobotState(Result, kw_only=True):
+    """One robot at one moment.
+
+    Attributes:
+        robot: Its name.
+        pose: Pose of its root, or None where that is not known.
+        joints: Position of each joint that has a single one: rad or m.
+        velocities: Their velocities: rad/s or m/s.
+        set_points: What its actuators are told.
+        sensors: Readings by name.
+    """
+
+    robot: str
+    pose: Pose | None
+    joints: dict[str, float]
+    velocities: dict[str, float]
+    set_points: dict[str, float]
+    sensors: dict[str, list[float]]
+
+
+class Done(Result, kw_only=True):
+    """What became of a call that changed something.
+
+    Attributes:
+        done: In words.
+        passed: Simulation time that passed, seconds.
+    """
+
+    done: str
+    passed: float = 0.0
+
+
+class Picture(Result, kw_only=True):
+    """What comes beside an image.
+
+    Attributes:
+        camera: `ROBOT/CAMERA`, or a camera of the scene.
+        kind: `real`, `depth` (near is bright), `semantic` or `instance`.
+        width: Pixels, after making it smaller.
+        height: Pixels.
+    """
+
+    camera: str
+    kind: str
+    width: int
+    height: int
+
+
+class Contacts(Result, kw_only=True):
+    """Bodies that touch.
+
+    Attributes:
+        contacts: Forces are in N and N m in the contact's frame, the first along its normal.
+        truncated: Whether there are more.
+    """
+
+    contacts: list[Contact]
+    truncated: bool
+
+
+class Explained(Result, kw_only=True):
+    """Why a robot does not move.
+
+    Attributes:
+        problems: How many findings have the verdict `problem`.
+        findings: From the connection to the set-points.
+    """
+
+    problems: int
+    findings: list[Finding]
+
+
+class Log(Result, kw_only=True):
+    """Calls, errors and events.
+
+    Attributes:
+        entries: Newest last; `at` is Unix time.
+        next: Pass it as `since` to go on from here.
+    """
+
+    entries: list[LogEntry]
+    next: int
+
+
+class Recorded(Result, kw_only=True):
+    """A recording. What is in it is known when it has ended.
+
+    Attributes:
+        file: Name of the MCAP file in the folder for recordings.
+        running: Whether it goes on.
+        seconds: Its length, simulation time.
+        robots: Robots in it.
+        cameras: Cameras in it.
+        lost: States and pictures that came too fast to be written.
+    """
+
+    file: str
+    running: bool
+    seconds: float = 0.0
+    robots: list[str] = []
+    cameras: list[str] = []
+    lost: int = 0
+
+
+class Edited(Result, kw_only=True):
+    """A scene after an edit; play began anew.
+
+    Attributes:
+        done: In words.
+        robots: Robots there are now.
+        bodies: Other bodies there are now.
+    """
+
+    done: str
+    robots: list[str]
+    bodies: list[str]

@@ -1,0 +1,99 @@
+"""Evaluations: intervals against published values, outcomes against episodes run one by one, and the command."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+
+from urlab_client.cli import main
+from urlab_client.integrations.gym import Reach, URLabBatchEnv, URLabEnv
+from urlab_client.integrations.policy import bootstrap_mean, evaluate_in, wilson
+from urlab_client.randomise import Noise, Randomisation, Vary
+from urlab_client.server import SimulatedServer
+
+NETWORK = Path(__file__).parents[2] / "examples/policies/quadruped.onnx"
+
+
+@pytest.mark.parametrize(
+    ("successes", "n", "low", "high"),
+    [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718)],
+)
+def test_the_score_interval_is_the_published_one(successes: int, n: int, low: float, high: float) -> None:
+    """R. G. Newcombe, Statistics in Medicine 17 (1998), table I, method 3."""
+    found = wilson(successes, n)
+    assert (round(found.low, 4), round(found.high, 4)) == (low, high)
+    assert found.value == successes / n
+    assert wilson(successes, n, 0.99).high > found.high
+
+
+def test_a_bootstrap_interval_covers_the_mean_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(3)
+    values = rng.normal(5.0, 2.0, 400).tolist()
+    found = bootstrap_mean(values)
+    assert found.value == pytest.approx(np.mean(values))
+    assert found.high - found.low == pytest.approx(2 * 1.96 * np.std(values) / 20, rel=0.05)
+    assert bootstrap_mean(values) == found
+    assert bootstrap_mean([3.0]) == bootstrap_mean([3.0, 3.0])
+
+
+def test_outcomes_are_those_of_single_episodes_whatever_the_batch() -> None:
+    varied = Randomisation(
+        vary=(Vary(what="mass", scale=(0.5, 2.0)),), noise=(Noise(field="qpos", std=0.01, bias=0.02),)
+    )
+
+    def network(observation: Any) -> Any:
+        return 2.0 * observation[:7] + observation[-3:].sum()
+
+    with SimulatedServer("arm", play=True, randomise=varied) as server:
+        address = f"{server.address}:{server.step_port}"
+        options: Any = {"task": Reach(), "max_episode_steps": 4, "autoreset_mode": AutoresetMode.DISABLED}
+        found: list[Any] = []
+        for size in (2, 5):
+            batch = URLabBatchEnv(address, size, **{**options, "task": Reach()})
+            seen: list[Any] = []
+            found.append(evaluate_in(batch, network, episodes=5, seed=9, on_episode=seen.append))
+            assert {outcome.seed for outcome in seen} == {outcome.seed for outcome in found[-1].outcomes}
+            assert evaluate_in(batch, network, episodes=3, seed=9).outcomes == found[-1].outcomes[:3]
+        assert found[0] == found[1]
+        with pytest.raises(ValueError, match="the network returned 2 numbers, but an action has 7"):
+            evaluate_in(batch, lambda _: np.zeros(2), episodes=1)
+        endless = URLabBatchEnv(address, 1, autoreset_mode=AutoresetMode.DISABLED)
+        with pytest.raises(ValueError, match="needs a batch with"):
+            evaluate_in(endless, network, episodes=1)
+        env = URLabEnv.connect(address, task=Reach(), max_episode_steps=4)
+        space: Any = env.action_space
+        for outcome in found[0].outcomes[:2]:
+            observation, _ = env.reset(seed=outcome.seed)
+            total, over, info = 0.0, False, dict[str, Any]()
+            while not over:
+                action = np.clip(network(observation), space.low, space.high).astype(np.float32)
+                observation, reward, _, over, info = env.step(action)
+                total += reward
+            assert (total, info["success"], 4) == (outcome.total, outcome.success, outcome.actions)
+        env.close()
+    assert found[0].success_rate == wilson(sum(outcome.success for outcome in found[0].outcomes), 5)
+
+
+def test_the_command_states_rates_and_every_episode(capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["evaluate", str(NETWORK), "--robot=quadruped", "--seconds=0.2", "--randomise", "--episodes=3", "--json"]
+    assert main(command) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert len({outcome["total"] for outcome in said["outcomes"]}) == 3, "the robot varies"
+    assert said["success_rate"]["value"] == 1.0
+    assert said["mean_actions"]["value"] == 10
+    for arguments, reason in (
+        (["--task", "urlab/Swim-v0"], "there is no 'urlab/Swim-v0'; there are: urlab/Arm-v0"),
+        (["--task", "urlab/Reach-v0"], "quadruped.onnx has 38 inputs, but urlab/Reach-v0 has 22"),
+        (["--task", "urlab/PushPictures-v0"], "urlab/PushPictures-v0 observes pictures"),
+        (["--task", "urlab/Reach-v0", "--seconds", "3"], "--seconds does not go with --task"),
+        (["--randomise", "nope.toml"], "--randomise: "),
+        (["--confidence", "95"], "--confidence must be between 0 and 1"),
+        (["--seed", "-1"], "--seed must be at least 0"),
+    ):
+        assert main(["evaluate", str(NETWORK), "--episodes=1", *arguments]) == 2
+        assert reason in capsys.readouterr().err

@@ -1,0 +1,280 @@
+"""An agent that knows only what the tools say: its loop, its limits, and people who take over."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import math
+from collections.abc import AsyncGenerator, Iterator
+from pathlib import Path
+
+import anyio
+import pytest
+from agents import ALL, Desk, desk, text_of
+from jsonschema import Draft202012Validator
+from mcp.shared.exceptions import MCPError
+from PIL import Image
+from waiting import until
+
+from urlab_client.integrations.record import read_run
+from urlab_client.mcp import Limits
+from urlab_client.server import SimulatedServer
+from urlab_client.server.assets.bundled_robots import bundled_models
+from urlab_client.web.driving_lease import Viewer
+
+PERSON = Viewer("a person's key", "Ann")
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[SimulatedServer]:
+    with SimulatedServer("arm", play=True, camera_size=(64, 48)) as running:
+        yield running
+
+
+@pytest.fixture
+async def direct(server: SimulatedServer) -> AsyncGenerator[Desk]:
+    # In a task of its own: pytest ends fixtures in another than it began them in, which cancel scopes do not bear.
+    ready, over = asyncio.get_running_loop().create_future(), asyncio.Event()
+
+    async def host() -> None:
+        async with desk(server) as one:
+            await one.call("reset")
+            ready.set_result(one)
+            await over.wait()
+
+    task = asyncio.create_task(host())
+    await asyncio.wait((task, ready), return_when=asyncio.FIRST_COMPLETED)
+    yield task.result() if task.done() else ready.result()
+    over.set()
+    await task
+
+
+async def test_an_agent_finds_out_why_nothing_moves_mends_it_and_records(tmp_path: Path) -> None:
+    with SimulatedServer("arm", play=True, camera_size=(64, 48)) as server:
+        async with desk(server, step_mode="live", recordings=tmp_path) as one:
+            robot = (await one.call("look"))["scene"]["articulations"][0]
+            elbow = next(joint for joint in robot["joints"] if joint["name"] == "elbow")
+            assert (elbow["unit"], elbow["kind"]) == ("rad", "hinge")
+            target = round(elbow["limits"][0] / 2, 2)
+            order = {"robot": robot["name"], "joints": {"elbow": target}}
+            assert "stood still" in await one.refused("move_to", **order)
+            found = await one.call("explain")
+            assert found["problems"] == 1
+            assert any("paused" in finding["text"] for finding in found["findings"])
+            await one.call("play", action="resume")
+            assert "settled" in (await one.call("move_to", **order))["done"]
+
+            camera = f"{robot['name']}/{robot['cameras'][0]['name']}"
+            picture = await one.mcp.call_tool("picture", {"camera": camera, "size": 32})
+            assert picture.structured_content is not None
+            assert (picture.structured_content["width"], picture.structured_content["height"]) == (32, 24)
+
+            await one.call("record", action="start")
+            await one.call("move_to", robot=robot["name"], joints={"elbow": 0.0})
+            episode = await one.call("record", action="stop")
+    assert (episode["robots"], episode["lost"]) == (["arm"], 0)
+    assert len(read_run(tmp_path / episode["file"]).table()) > 10
+
+
+async def test_tools_say_what_they_take_give_and_do(direct: Desk) -> None:
+    tools = {tool.name: tool for tool in (await direct.mcp.list_tools()).tools}
+    for tool in tools.values():
+        assert tool.description
+        assert tool.output_schema is not None
+        for schema in (tool.input_schema, tool.output_schema):
+            assert schema["type"] == "object"
+            Draft202012Validator.check_schema(schema)
+        assert {"sim_time", "step", "mode"} < set(tool.output_schema["properties"])
+        assert all(field.get("description") for field in tool.output_schema["properties"].values()), tool.name
+    hints = {name: tool.annotations for name, tool in tools.items()}
+    assert all(hint is not None and hint.open_world_hint is False for hint in hints.values())
+    assert {name for name, hint in hints.items() if hint and hint.read_only_hint} == {
+        "look", "state", "picture", "contacts", "explain", "log",
+    }  # fmt: skip
+    assert {name for name, hint in hints.items() if hint and hint.destructive_hint} == {"reset", "play", "remove"}
+
+
+async def test_without_leave_an_agent_only_looks(server: SimulatedServer) -> None:
+    async with desk(server, Limits()) as one:
+        names = {tool.name for tool in (await one.mcp.list_tools()).tools}
+        assert names == {"look", "state", "picture", "contacts", "explain", "log"}
+        before = await one.call("state", robot="arm")
+        assert "--allow-drive" in await one.refused("run", seconds=1.0)
+        assert "--allow-edit" in await one.refused("remove", actor="arm")
+        assert await one.call("state", robot="arm") == before
+        assert "--allow-drive, --allow-edit" in (one.mcp.instructions or "")
+
+
+async def test_what_an_agent_gets_wrong_is_said_and_nothing_is_done(direct: Desk) -> None:
+    for tool, arguments, words in (
+        ("nothing", {}, ["no tool 'nothing'", "move_to"]),
+        ("state", {"robot": "arn"}, ["'arm'"]),
+        ("state", {}, ["robot"]),
+        ("run", {}, ["seconds", "steps"]),
+        ("run", {"seconds": 11}, ["up to 10 s", "Call again"]),
+        ("run", {"seconds": -1}, ["seconds"]),
+        ("run", {"steps": 10**6}, ["up to 10 s"]),
+        ("run", {"second": 1}, ["second", "It takes: seconds, steps"]),
+        ("move_to", {"robot": "arm", "joints": {"elbow": 9}}, ["2.61799 rad"]),
+        ("move_to", {"robot": "arm", "joints": {"elbo": 0}}, ["'elbow'"]),
+        ("move_to", {"robot": "arm", "joints": {"elbow": "high"}}, ["float"]),
+        ("move_to", {"robot": "arm", "joints": {"elbow": "nan"}}, ["finite"]),
+        ("move_to", {"robot": "arm", "joints": {}}, ["joints"]),
+        ("set_actuators", {"robot": "arm", "set_points": {"elbow": 99}}, ["got 99"]),
+        ("reset", {"keyframe": "nowhere"}, ["nowhere"]),
+        ("reset", {"joints": {"arm": {"elbow": 9}}}, ["got 9"]),
+        ("play", {"action": "pause"}, ["direct", "run"]),
+        ("record", {"action": "stop"}, ["no recording runs"]),
+        ("import_model", {"model": "/etc/passwd"}, ["no model"]),
+        ("spawn", {"blueprint": "../arm", "actor_id": "b", "position": [0, 0, 0]}, ["no blueprint"]),
+        ("spawn", {"blueprint": "arm", "actor_id": "b", "position": [0, 0]}, ["position"]),
+        ("remove", {"actor": "nobody"}, ["There are: arm"]),
+        ("picture", {"camera": "arm/nothing"}, ["nothing"]),
+    ):
+        said = await direct.refused(tool, **arguments)
+        assert all(word in said for word in words), said
+    after = await direct.call("state", robot="arm")
+    assert (after["step"], set(after["set_points"].values())) == (0, {0.0})
+
+
+async def test_arguments_in_the_form_of_text_are_understood(direct: Desk) -> None:
+    await direct.call("set_actuators", robot="arm", set_points='{"elbow": 0.25}')
+    assert (await direct.call("state", robot="arm"))["set_points"]["elbow"] == 0.25
+    assert (await direct.call("run", steps="20"))["step"] == 20
+
+
+async def test_a_diverged_simulation_is_said(direct: Desk) -> None:
+    direct.client.articulations["arm"].ctrl_array[0] = math.nan
+    assert "diverged" in await direct.refused("state", robot="arm")
+    direct.client.articulations["arm"].ctrl_array = [0.0] * 7
+
+
+async def test_progress_is_told_and_a_cancelled_run_leaves_the_robot_at_rest(direct: Desk) -> None:
+    told: list[tuple[float, float | None]] = []
+    with anyio.CancelScope() as scope:
+
+        async def progress(done: float, total: float | None, message: str | None) -> None:
+            told.append((done, total))
+            scope.cancel()
+
+        # So slow that there is something to cancel, whatever the machine.
+        await direct.client.runtime.set_sim_options(timestep=1e-5)
+        await direct.mcp.call_tool("run", {"seconds": 10}, progress_callback=progress)
+    assert 0 <= told[0][0] < 10 == told[0][1]
+    await until(lambda: direct.agent.idle)
+    await direct.client.runtime.set_sim_options(timestep=0.002)
+    at = (await direct.call("state", robot="arm"))["step"]
+    assert (await direct.call("run", steps=5))["step"] == at + 5
+
+
+async def test_a_cancelled_call_pauses_what_runs_by_itself() -> None:
+    with SimulatedServer("arm", play=True, unpaused=True) as server:
+        async with desk(server, step_mode="live") as one:
+            with anyio.CancelScope() as scope:
+
+                async def progress(done: float, total: float | None, message: str | None) -> None:
+                    scope.cancel()
+
+                await one.mcp.call_tool("run", {"seconds": 10}, progress_callback=progress)
+            await until(lambda: one.agent.idle)
+            assert any("paused" in finding["text"] for finding in (await one.call("explain"))["findings"])
+
+
+async def test_a_call_that_takes_too_long_is_broken_off() -> None:
+    with SimulatedServer("arm", play=True, unpaused=True) as server:
+        async with desk(server, Limits(drive=True, wall_seconds=0.3), step_mode="live") as one:
+            said = await one.refused("run", seconds=10)
+            assert "longer than 0.3 s" in said
+            assert (await one.call("explain"))["problems"] == 1, "it is paused"
+
+
+async def test_a_person_takes_over_and_the_agent_waits(direct: Desk) -> None:
+    lease = direct.console.lease
+    await direct.client.runtime.set_sim_options(timestep=1e-5)
+    running = asyncio.create_task(direct.refused("run", seconds=10))
+    await until(lambda: not direct.agent.idle)
+    await direct.console.controls.run(PERSON, running=False)
+    assert "Ann took the controls" in await running
+    assert lease.holder is PERSON
+    assert "Ann has the controls" in await direct.refused("reset")
+    assert (await direct.call("look"))["driver"] == "Ann"
+    lease.release(PERSON)
+    await direct.client.runtime.set_sim_options(timestep=0.002)
+    await direct.call("reset")
+    entries = (await direct.call("log", since=0))["entries"]
+    assert {("Ann", "stop"), ("the agent", "reset")} <= {(entry["who"], entry["what"]) for entry in entries}
+
+
+async def test_the_log_goes_on_from_the_last_call(direct: Desk) -> None:
+    first = await direct.call("log")
+    assert (await direct.call("log"))["entries"] == []
+    await direct.call("run", steps=1)
+    news = await direct.call("log")
+    assert [(entry["who"], entry["what"]) for entry in news["entries"]] == [("the agent", "run")]
+    assert news["next"] > first["next"]
+
+
+async def test_a_scene_is_edited_by_names(tmp_path: Path) -> None:
+    files = {**bundled_models(), "box": tmp_path / "box.xml"}
+    with SimulatedServer("arm", play=True, model_roots=[tmp_path], saved_dir=tmp_path) as server:
+        async with desk(server, models=files) as one:
+            (tmp_path / "box.xml").write_text(
+                '<mujoco><worldbody><body name="box"><freejoint/><geom size=".1" type="box" size=".1 .1 .1"/></body>'
+                "</worldbody></mujoco>".replace(' size=".1" type', " type")
+            )
+            assert "box" in (await one.call("look"))["models"]
+            await one.call("import_model", model="box")
+            placed = await one.call("spawn", blueprint="box", actor_id="b1", position=[1, 0, 2], yaw=90)
+            assert placed["robots"] == ["arm", "box"]
+            again = await one.refused("spawn", blueprint="box", actor_id="b1", position=[0, 0, 2])
+            assert "move moves it" in again
+            await one.call("move", actor="b1", position=[1, 1, 3])
+            pose = (await one.call("state", robot="box"))["pose"]
+            assert pose["position"] == [1, 1, 3]
+            assert (await one.call("remove", actor="box"))["robots"] == ["arm"]
+            await one.call("play", action="stop")
+            assert "play with action='start'" in await one.refused("state", robot="arm")
+            await one.call("play", action="start")
+            await one.call("state", robot="arm")
+
+
+async def test_a_person_sees_what_an_agent_records(server: SimulatedServer, tmp_path: Path) -> None:
+    async with desk(server, recordings=tmp_path) as one:
+        await one.call("run", steps=1)
+        first = await one.call("record", action="start", cameras=True)
+        assert one.console.recordings.running is not None
+        assert "runs already" in await one.refused("record", action="start")
+        await one.call("run", seconds=0.1)
+        assert (await one.call("record", action="stop"))["cameras"] == ["arm/overview", "arm/wrist"]
+        second = await one.call("record", action="start")
+        await one.call("run", seconds=0.1)
+    # What is not stopped is finished when the console closes.
+    assert [len(read_run(tmp_path / made["file"]).table()) for made in (first, second)] == [5, 5]
+
+
+async def test_resources(direct: Desk) -> None:
+    listed = (await direct.mcp.list_resources()).resources
+    assert {resource.name for resource in listed} == {"model", "log"}
+    model = (await direct.mcp.read_resource("urlab://model")).contents[0]
+    assert '"shoulder_lift"' in str(getattr(model, "text", ""))
+    with pytest.raises(MCPError, match="urlab://model"):
+        await direct.mcp.read_resource("urlab://nothing")
+
+
+async def test_pictures_are_not_larger_than_they_may_be(direct: Desk) -> None:
+    result = await direct.mcp.call_tool("picture", {"camera": "arm/overview", "size": 32})
+    assert not result.is_error, text_of(result)
+    data = getattr(result.content[1], "data", "")
+    import base64
+
+    assert Image.open(io.BytesIO(base64.b64decode(data))).size == (32, 24)
+    assert (result.structured_content or {})["step"] == 0
+    assert "1024" in await direct.refused("picture", camera="arm/overview", size=4096)
+
+
+async def test_the_limits_bind_agents_alone(server: SimulatedServer) -> None:
+    async with desk(server, ALL) as one:
+        holder = one.console.lease
+        holder.use(PERSON)
+        assert "Ann has the controls" in await one.refused("run", steps=1)
+        assert await one.call("explain")

@@ -1,0 +1,135 @@
+"""How agents come in: a command on standard input and output, or HTTP with a token."""
+
+from __future__ import annotations
+
+import importlib.util
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import httpx2
+import pytest
+from agents import ALL, text_of
+from http_served import served
+from mcp.client.stdio import StdioServerParameters, stdio_client
+from mcp.client.streamable_http import streamable_http_client
+from ports import free_port
+from waiting import DEADLINE_S
+
+from mcp import Client
+from urlab_client._installation import install_command
+from urlab_client.aio import URLabClient
+from urlab_client.cli import main
+from urlab_client.mcp import Agent
+from urlab_client.mcp.doors import http_application
+from urlab_client.server import SimulatedServer
+from urlab_client.web import Access, app
+
+TOKEN = "what only the agent's host knows"
+
+
+async def test_an_agent_starts_the_command_and_drives(tmp_path: Path) -> None:
+    parameters = StdioServerParameters(
+        command=sys.executable, args=["-m", "urlab_client", "mcp", "sim://arm", "--allow-drive"], cwd=tmp_path
+    )
+    with (tmp_path / "stderr").open("w+") as stderr:
+        async with Client(stdio_client(parameters, errlog=stderr), read_timeout_seconds=DEADLINE_S) as agent:
+            moved = await agent.call_tool("move_to", {"robot": "arm", "joints": {"elbow": 0.5}})
+            assert not moved.is_error, text_of(moved)
+            assert "--allow-edit" in text_of(await agent.call_tool("remove", {"actor": "arm"}))
+        stderr.seek(0)
+        lines = stderr.read().splitlines()
+    # The console's link is for a person: agents do not see it.
+    assert [line.split(":")[0] for line in lines] == ["Console"]
+    assert "?token=" in lines[0]
+
+
+@pytest.mark.long
+def test_the_command_ends_with_its_input(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "urlab_client", "mcp", "sim://arm", "--no-console"],
+        cwd=tmp_path,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        timeout=DEADLINE_S,
+        check=False,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, b"", b"")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("command", [["console"], ["mcp"], ["mcp", "--http"]], ids=" ".join)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_command_that_serves_pages_in_good_order(
+    command: list[str], number: signal.Signals, tmp_path: Path
+) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-m", "urlab_client", *command, "sim://arm", "--port", str(free_port())],
+        cwd=tmp_path,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    ) as process:
+        assert process.stdout is not None
+        while "Ctrl-C ends it" not in process.stdout.readline():
+            pass
+        process.send_signal(number)
+        assert process.wait(DEADLINE_S) == 0
+        assert process.stdout.read() == ""
+
+
+async def test_over_http_a_token_is_needed_which_is_not_the_console_s() -> None:
+    with SimulatedServer("arm", play=True) as server:
+        async with URLabClient(**server.client_options(), step_mode="direct") as client:
+            access = Access()
+            site = app(client, access=access)
+            agent = Agent(site, ALL)
+            application = http_application(agent, site, TOKEN, Access(tokens=False))
+            async with site.router.lifespan_context(site), served(application) as http:
+                assert (await http.post("/mcp")).json()["error"]["code"] == "bad_token"
+                bearer = {"authorization": f"Bearer {TOKEN}"}
+                for name, value in (("host", "evil.example"), ("origin", "http://evil.example")):
+                    refused = await http.post("/mcp", headers={**bearer, name: value})
+                    assert (refused.status_code, refused.json()["error"]["code"]) == (403, f"bad_{name}")
+                assert (await http.get("/api/world", headers=bearer)).status_code == 401
+                key = access.admit(access.invite())
+                assert (await http.get("/api/world", headers={"authorization": f"Bearer {key}"})).status_code == 200
+                assert (await http.post("/mcp", headers={"authorization": f"Bearer {key}"})).status_code == 401
+
+                told: list[float] = []
+
+                async def progress(done: float, total: float | None, message: str | None) -> None:
+                    told.append(done)
+
+                async with (
+                    httpx2.AsyncClient(headers=bearer, timeout=DEADLINE_S) as own,
+                    Client(streamable_http_client(f"{http.base_url}/mcp", http_client=own)) as mcp,
+                ):
+                    moved = await mcp.call_tool("move_to", {"robot": "arm", "joints": {"elbow": 0.5}})
+                    assert not moved.is_error, text_of(moved)
+                    await client.runtime.set_sim_options(timestep=1e-4)
+                    ran = await mcp.call_tool("run", {"seconds": 1}, progress_callback=progress)
+                    assert not ran.is_error, text_of(ran)
+                    assert told == sorted(told)
+                    assert "urlab://log" in {str(one.uri) for one in (await mcp.list_resources()).resources}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [(["--host", "0.0.0.0"], "--allow-host NAME"), (["--models", "nowhere"], "there is no such folder")],
+)
+def test_what_cannot_be_honoured_is_said(arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["mcp", "sim://arm", *arguments]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_without_the_sdk_the_extra_is_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "mcp" else find(name))
+    monkeypatch.delitem(sys.modules, "urlab_client.mcp")
+    assert main(["mcp"]) == 2
+    assert install_command("mcp") in capsys.readouterr().err
