@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from jsonschema import Draft202012Validator
 from PIL import Image
 from starlette.applications import Starlette
 from starlette.routing import Mount
@@ -119,6 +120,41 @@ def test_openapi_describes_every_op_that_is_served(http: TestClient) -> None:
     assert set(document["components"]["schemas"]["BeginPieOk"]["properties"]) == {"op", "state", "compile_error"}
     named = json.dumps(document).split('"#/components/schemas/')[1:]
     assert {part.partition('"')[0] for part in named} <= set(document["components"]["schemas"])
+
+
+def test_asyncapi_describes_every_message_of_the_websockets(http: TestClient) -> None:
+    document = http.get("/api/asyncapi.json").json()
+    assert document["servers"]["console"]["host"] == "localhost"
+    components = document["components"]
+
+    def check(kind: str, message: Any) -> None:
+        validator = Draft202012Validator({**components["messages"][kind]["payload"], "components": components})
+        validator.validate(message)
+
+    named = json.dumps(document).split('"#/')[1:]
+    for reference in (part.partition('"')[0].split("/") for part in named):
+        found = document
+        for key in reference:
+            found = found[key]
+    http.post("/api/run", json={"running": True})
+    http.delete("/api/lease")
+    seen: set[str] = set()
+    with http.websocket_connect("ws://localhost/api/live") as live:
+        for said in ({"type": "ping", "at": 1.0}, {"type": "name", "name": "Ann"}, {"type": "ctrl", "values": {}},
+                     {"type": "ack"}):  # fmt: skip
+            check(said["type"], said)
+            live.send_json(said)
+        live.send_json({"type": "shout"})
+        while seen != {"you", "world", "state", "status", "log", "refused", "pong"}:
+            message = live.receive_json()
+            check(message["type"], message)
+            seen.add(message["type"])
+            if message["type"] == "refused":
+                assert "shout" in message["error"]["message"]
+    with http.websocket_connect("ws://localhost/api/cameras/arm/wrist/live") as camera:
+        frame = camera.receive_bytes()
+    head = json.loads(frame[4 : 4 + int.from_bytes(frame[:4], "little")])
+    Draft202012Validator(components["schemas"]["PictureHead"]).validate(head)
 
 
 def test_openapi_says_where_it_is_mounted(server: SimulatedServer) -> None:

@@ -32,6 +32,7 @@ from urlab_client.web import mujoco_viewer
 from urlab_client.web.access import Access, Guarded
 from urlab_client.web.console_session import Audience, ConsoleSession
 from urlab_client.web.driving_lease import DrivingLease, NotDriving, Viewer
+from urlab_client.web.messages import Ack, Ctrl, FromViewer, Log, Name, Ping, Pong, Refused, You
 from urlab_client.web.metrics import showing
 from urlab_client.web.model_upload import ModelRoutes
 from urlab_client.web.ops import encode, openapi, parse, served
@@ -113,16 +114,6 @@ class _StepRequest(Struct):
 
 class _LoginRequest(Struct):
     token: str
-
-
-class _Message(Struct):
-    """What a browser says over its WebSocket."""
-
-    type: str
-    seq: int = 0
-    at: float = 0.0
-    name: str = ""
-    values: dict[str, dict[str, float]] = {}
 
 
 class _Site:
@@ -252,7 +243,7 @@ class _Site:
         self.console.audience.add(one)
         self.console.tell()
         try:
-            await socket.send_json({"type": "you", "viewer": viewer.key, "name": viewer.name})
+            await socket.send_text(encode(You(viewer.key, viewer.name)).decode())
             async with anyio.create_task_group() as tasks:
                 tasks.start_soon(self._send, socket, one, flow)
                 with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # gone, maybe while it is answered
@@ -281,7 +272,7 @@ class _Site:
                 news = [entry for entry in console.entries if entry.n > line]
                 if news:
                     line = news[-1].n
-                    await socket.send_text(encode({"type": "log", "entries": news}).decode())
+                    await socket.send_text(encode(Log(news)).decode())
                 if (
                     console.state_json is not None
                     and state != console.state_seq
@@ -296,22 +287,20 @@ class _Site:
         while True:
             text = await _said(socket)
             try:
-                message = msgspec.json.decode(text, type=_Message)
-                match message.type:
-                    case "ack":
+                message: FromViewer = msgspec.json.decode(text, type=FromViewer)
+                match message:
+                    case Ack():
                         flow.acknowledged += 1
                         one.changed.set()
-                    case "ping":
-                        await socket.send_json({"type": "pong", "at": message.at, "now": _now_ms()})
-                    case "name":
-                        one.viewer.name = " ".join(message.name.split())[:24] or one.viewer.name
+                    case Ping(at=at):
+                        await socket.send_text(encode(Pong(at, _now_ms())).decode())
+                    case Name(name=name):
+                        one.viewer.name = " ".join(name.split())[:24] or one.viewer.name
                         self.console.tell()
-                    case "ctrl":
-                        self.console.controls.set_points(one.viewer, message.values)
-                    case _:
-                        raise ValueError(f"there is no message of type {message.type!r}")  # noqa: TRY301 - answered
+                    case Ctrl(values=values):
+                        self.console.controls.set_points(one.viewer, values)
             except (NotDriving, ValueError, KeyError, RecursionError, msgspec.MsgspecError) as error:
-                await socket.send_text(encode({"type": "refused", "error": _explain(error)[1]}).decode())
+                await socket.send_text(encode(Refused(_explain(error)[1])).decode())
 
     async def _pictures(self, socket: WebSocket) -> None:
         feed = self.console.feed(socket.path_params["path"])

@@ -23,7 +23,7 @@ from urlab_client.server.limits import Limits
 
 __all__ = ["Compiled", "build_snapshot", "mujoco_messages", "named_kinds", "one_line"]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 DEFAULT_MODEL_NAMES: Final = frozenset({"", "MuJoCo Model"})
 """What MuJoCo calls a model whose file gives no name."""

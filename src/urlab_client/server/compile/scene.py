@@ -33,7 +33,7 @@ from urlab_client.server.limits import Limits
 
 __all__ = ["CompiledScene", "compile_scene", "saved_model"]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 _DEFAULT_LIMITS: Final = Limits()
 
