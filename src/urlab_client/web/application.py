@@ -34,6 +34,7 @@ from urlab_client.web.console_session import Audience, ConsoleSession
 from urlab_client.web.driving_lease import DrivingLease, NotDriving, Viewer
 from urlab_client.web.messages import Ack, Ctrl, FromViewer, Log, Name, Ping, Pong, Refused, You
 from urlab_client.web.metrics import showing
+from urlab_client.web.model_upload import ModelRoutes
 from urlab_client.web.ops import encode, openapi, parse, served
 from urlab_client.web.reading_routes import ReadingRoutes
 from urlab_client.web.recording_routes import RecordingRoutes
@@ -122,6 +123,7 @@ class _Site:
         self._viewers: dict[str, Viewer] = {}
         self._reading = ReadingRoutes(console, self._viewer)
         self._recordings = RecordingRoutes(console, self._viewer)
+        self._models = ModelRoutes(console, self._viewer)
 
     def routes(self) -> list[Route | WebSocketRoute | Mount]:
         def route(path: str, handler: _Handler, *methods: str) -> Route:
@@ -139,7 +141,10 @@ class _Site:
             route("/api/ctrl", self._ctrl, "POST"),
             route("/api/run", self._run, "POST"),
             route("/api/step", self._step, "POST"),
-            *(route(path, handler, *methods) for path, handler, methods in self._recordings.routes()),
+            *(
+                route(path, handler, *methods)
+                for path, handler, methods in (*self._recordings.routes(), *self._models.routes())
+            ),
             route("/api/lease", self._lease, "POST", "DELETE"),
             route("/api/connection", self._connection, "POST"),
             route("/api/invitations", self._invite, "POST"),

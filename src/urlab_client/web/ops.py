@@ -222,6 +222,9 @@ _PATHS: dict[str, Any] = {
     "/api/ctrl": _path("post", "ctrl", "Set set-points: `{articulation: {actuator: value}}`. Needs the controls."),
     "/api/run": _path("post", "run", "Let physics run or stop it: `{running: bool}`. Everybody may stop it."),
     "/api/step": _path("post", "step_many", "Step in direct mode: `{n_steps: int}`. Needs the controls."),
+    "/api/models/{name}": _path(
+        "put", "import_model", "Make a blueprint of a model: the bytes of an .xml or .zip file. Needs the controls."
+    ),
     "/api/recording": {
         **_path("post", "record", "Record into an MCAP file: `{cameras: bool}`. Needs the controls."),
         **_path("delete", "stop_recording", "End the recording, and describe it. Needs the controls."),
