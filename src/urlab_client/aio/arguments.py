@@ -6,9 +6,25 @@ import operator
 from collections.abc import Collection, Iterable, Mapping
 from typing import TypeVar
 
-__all__ = ["collection", "integer", "mapping", "numbers", "text"]
+__all__ = ["collection", "integer", "mapping", "numbers", "require", "text"]
 
 V = TypeVar("V")
+
+
+def require(what: str, value: object, kind: type, takes: str) -> None:
+    """Refuse what is of another kind.
+
+    Args:
+        what: The method and, if it has several, the parameter.
+        value: What it was given.
+        kind: What it must be an instance of.
+        takes: The same in words.
+
+    Raises:
+        TypeError: It is not.
+    """
+    if not isinstance(value, kind):
+        raise TypeError(f"{what} takes {takes}, got {value!r:.80}.")
 
 
 def mapping(what: str, value: Mapping[str, V], of: str) -> Mapping[str, V]:
@@ -22,8 +38,7 @@ def mapping(what: str, value: Mapping[str, V], of: str) -> Mapping[str, V]:
     Raises:
         TypeError: It is not a mapping.
     """
-    if not isinstance(value, Mapping):
-        raise TypeError(f"{what} takes a dictionary of {of}, got {value!r:.80}.")
+    require(what, value, Mapping, f"a dictionary of {of}")
     return value
 
 
@@ -33,8 +48,10 @@ def collection(what: str, values: Collection[V]) -> Collection[V]:
     Raises:
         TypeError: It is one value, or a text, which would be taken for its letters.
     """
-    if isinstance(values, str) or not isinstance(values, Collection):
-        raise TypeError(f"{what} takes a collection, such as ({values!r:.80},), not one of its items.")
+    takes = "a collection of several, such as a tuple or a list"
+    require(what, values, Collection, takes)
+    if isinstance(values, str):
+        raise TypeError(f"{what} takes {takes}, got {values!r:.80}.")
     return values
 
 
@@ -74,6 +91,5 @@ def text(what: str, value: str) -> str:
     Raises:
         TypeError: It is not a text.
     """
-    if not isinstance(value, str):
-        raise TypeError(f"{what} takes a text, got {value!r:.80}.")
+    require(what, value, str, "a text")
     return value

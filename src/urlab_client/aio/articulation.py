@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Sized
 from typing import Any
 
 import numpy as np
 
-from urlab_client.aio.arguments import mapping
+from urlab_client.aio.arguments import mapping, require
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.control import CLAIM_S
 from urlab_client.aio.controllers import URLabController, make_controller
@@ -16,7 +16,7 @@ from urlab_client.aio.live.publishers import Publishers
 from urlab_client.aio.model.articulation_state import MirroredArticulation, MirroredEntity
 from urlab_client.aio.model.elements import Actuator, ArticulationElements, Body, Joint, Sensor, make_elements
 from urlab_client.aio.model.layout import ArticulationLayout
-from urlab_client.aio.model.numbers import finite, finite_array, is_array
+from urlab_client.aio.model.numbers import finite, finite_array
 from urlab_client.aio.motion import Motion
 from urlab_client.aio.session import Session
 from urlab_client.protocol.base import Floats
@@ -508,8 +508,7 @@ class URLabArticulation(URLabEntity):
 def _wrench(force: Sequence[float], torque: Sequence[float]) -> list[float]:
     values: list[float] = []
     for what, vector in (("force", force), ("torque", torque)):
-        if not is_array(vector):
-            raise TypeError(f"apply_xfrc: {what} takes 3 numbers, got {vector!r:.80}.")
+        require(f"apply_xfrc: {what}", vector, Sized, "3 numbers")
         if len(vector) != 3:
             raise ValueError(f"apply_xfrc: {what} takes 3 numbers, got {len(vector)}.")
         values += [finite(f"apply_xfrc: {what}[{i}]", v) for i, v in enumerate(vector)]

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Generic, Protocol, Self, SupportsFloat, TypeVar
 
+from urlab_client.aio.arguments import require
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.stream_buffer import BufferedMessage, StreamBuffer
@@ -385,8 +386,10 @@ class Stream(Generic[T]):
         kept = StreamBuffer(StreamPolicy(policy), buffer, buffer_bytes)
         if max_rate is not None and kept.policy is not StreamPolicy.LATEST:
             raise ValueError(f"max_rate is for policy 'latest', which leaves out items; {kept.policy!r} keeps them")
-        if max_rate is not None and not (isinstance(max_rate, SupportsFloat) and 0 < float(max_rate) < math.inf):
-            raise ValueError(f"max_rate must be a number above 0, got {max_rate!r:.80}")
+        if max_rate is not None:
+            require("max_rate", max_rate, SupportsFloat, "a number above 0")
+            if not 0 < float(max_rate) < math.inf:
+                raise ValueError(f"max_rate must be a number above 0, got {max_rate}")
         self._handler = _StreamHandler(
             source, kept, tolerant=tolerant, timeout=timeout, default_timeout=default_timeout, max_rate=max_rate
         )

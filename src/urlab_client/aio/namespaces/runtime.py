@@ -8,7 +8,7 @@ from typing import Any, TypeVar, cast
 import msgspec
 import numpy as np
 
-from urlab_client.aio.arguments import mapping
+from urlab_client.aio.arguments import mapping, require
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.jobs import OnProgress
 from urlab_client.aio.model.numbers import finite, is_array
@@ -319,8 +319,7 @@ class RuntimeNamespace(RuntimeOps):
 def _transports(name: str, wanted: bool | CameraTransports) -> CameraTransports:
     if isinstance(wanted, bool):
         return CameraTransports(zmq=wanted, shm=wanted)
-    if not isinstance(wanted, CameraTransports):
-        raise TypeError(f"set_camera_streaming: camera {name!r} takes a bool or CameraTransports, got {wanted!r:.80}.")
+    require(f"set_camera_streaming: camera {name!r}", wanted, CameraTransports, "a bool or CameraTransports")
     if wanted.zmq is None and wanted.shm is None:
         return CameraTransports(zmq=True, shm=True)
     return CameraTransports(zmq=bool(wanted.zmq), shm=bool(wanted.shm))

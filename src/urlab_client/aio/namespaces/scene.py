@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import anyio
 
+from urlab_client.aio.arguments import require
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.model.numbers import finite
 from urlab_client.aio.model.upload import flatten, upload
@@ -412,9 +413,10 @@ class SceneNamespace(SceneOps):
             ValueError: Two assets share an actor id; nothing was done. Or two MJCF files would have to be uploaded.
             URLabRPCError: From the op that failed; what was placed before it stays.
         """
-        wanted = list(assets) if isinstance(assets, Iterable) else [assets]
-        if strange := [asset for asset in wanted if not isinstance(asset, URLabAsset)]:
-            raise TypeError(f"apply_scene takes URLabAsset objects, got {strange[0]!r:.80}.")
+        require("apply_scene: assets", assets, Iterable, "a list of URLabAsset")
+        wanted = list(assets)
+        for asset in wanted:
+            require("apply_scene: assets", asset, URLabAsset, "a list of URLabAsset")
         ids = [asset.actor_id for asset in wanted]
         twice = sorted({i for i in ids if ids.count(i) > 1})
         if twice:
@@ -465,8 +467,7 @@ class SceneNamespace(SceneOps):
 def _class_path(blueprint: URLabBlueprint | str) -> str:
     if isinstance(blueprint, str):
         return blueprint
-    if not isinstance(blueprint, URLabBlueprint):
-        raise TypeError(f"blueprint takes what import_xml() returns, or a class path, got {blueprint!r:.80}.")
+    require("blueprint", blueprint, URLabBlueprint, "what import_xml() returns, or a class path")
     return blueprint.class_path
 
 
