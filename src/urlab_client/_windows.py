@@ -57,7 +57,7 @@ class NamedEvent:
                 self._handle = self._kernel.CreateEventW(None, 0, 0, name)
             else:
                 self._handle = self._kernel.OpenEventW(_SYNCHRONIZE | _EVENT_MODIFY_STATE, 0, name)
-        self.exists = bool(self._handle)
+        self.exists: bool = bool(self._handle)
 
     def set(self) -> None:
         """Wake who waits for it."""

@@ -35,7 +35,7 @@ def test_every_option_of_serve_has_a_row() -> None:
 def test_the_default_ports_are_right() -> None:
     documented = {row[0].strip("`").split()[0]: row[1] for row in table("Options")}
     for action in serve_options():
-        if action.dest.endswith("_port"):
+        if action.dest.endswith("_port") and "default" in (action.help or ""):
             assert documented[action.option_strings[0]] == re.findall(r"default (\d+)", action.help or "")[0]
 
 

@@ -50,7 +50,7 @@ from urlab_client.aio.namespaces.viewport import ViewportNamespace
 from urlab_client.aio.streams import Stream
 from urlab_client.protocol.messages.scene import CurrentLevel, CurrentLevelOk
 from urlab_client.protocol.messages.session import ArticulationState, OpInfo, ResetOk, StepOk
-from urlab_client.protocol.messages.streams import CameraSample, ClientEvent, PlayEnded
+from urlab_client.protocol.messages.streams import CameraSample, ClientEvent, PlayEnded, StateSnapshot
 from urlab_client.protocol.names import NameMap
 
 Floats = NDArray[np.float64]
@@ -143,6 +143,12 @@ async def running(client: URLabClient) -> None:
     assert_type(await client.camera("eye").capture(), CameraSample)
     assert_type(await client.capture(["eye"]), dict[str, CameraSample])
     assert_type(client.events(kinds=["lost", PlayEnded]), Stream[ClientEvent])
+    assert_type(client.state_stream(max_rate=60), Stream[StateSnapshot])
+    assert_type(await client.discover(handshake=client.handshake()), None)
+    async with client.sim.playing() as started:
+        assert_type(started, PIEStartResult)
+    async with client.scene.edit() as nothing:
+        assert_type(nothing, None)
     assert_type(await client.viewport.get_camera(timeout=None), CameraPose)
 
 

@@ -40,7 +40,7 @@ from urlab_client import (
 )
 from urlab_client.protocol.messages.scene import CurrentLevel, CurrentLevelOk
 from urlab_client.protocol.messages.session import ArticulationState, OpInfo, ResetOk, StepOk
-from urlab_client.protocol.messages.streams import CameraSample, ClientEvent, PlayEnded
+from urlab_client.protocol.messages.streams import CameraSample, ClientEvent, PlayEnded, StateSnapshot
 from urlab_client.protocol.names import NameMap
 from urlab_client.sync.namespaces.debug import DebugNamespace
 from urlab_client.sync.namespaces.outliner import OutlinerNamespace
@@ -141,6 +141,12 @@ def running(client: URLabClient) -> None:
     assert_type(client.camera("eye").capture(), CameraSample)
     assert_type(client.capture(["eye"]), dict[str, CameraSample])
     assert_type(client.events(kinds=["lost", PlayEnded]), Stream[ClientEvent])
+    assert_type(client.state_stream(max_rate=60), Stream[StateSnapshot])
+    assert_type(client.discover(handshake=client.handshake()), None)
+    with client.sim.playing() as started:
+        assert_type(started, PIEStartResult)
+    with client.scene.edit() as nothing:
+        assert_type(nothing, None)
     assert_type(client.viewport.get_camera(timeout=None), CameraPose)
 
 

@@ -36,7 +36,7 @@ def console(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[subproce
         ready = json.loads(line)
         ours = [f"--step-port={ready['step_port']}", f"--state-port={ready['state_port']}", "--port=0"]
         process, said = stack.enter_context(command("console", ready["address"], *ours))
-        flags = (*SOLID, "--window-size=1000,700")
+        flags = (*SOLID, "--window-size=1000,1000")
         yield process, stack.enter_context(opened(tmp_path_factory.mktemp("page"), link_in(said), flags))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import zipfile
 from collections.abc import AsyncGenerator, Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -118,6 +119,43 @@ def test_openapi_describes_every_op_that_is_served(http: TestClient) -> None:
     assert set(document["components"]["schemas"]["BeginPieOk"]["properties"]) == {"op", "state", "compile_error"}
     named = json.dumps(document).split('"#/components/schemas/')[1:]
     assert {part.partition('"')[0] for part in named} <= set(document["components"]["schemas"])
+
+
+def test_asyncapi_describes_every_message_of_the_websockets(http: TestClient) -> None:
+    from jsonschema import Draft202012Validator
+
+    document = http.get("/api/asyncapi.json").json()
+    assert document["servers"]["console"]["host"] == "localhost"
+    components = document["components"]
+
+    def check(kind: str, message: Any) -> None:
+        validator = Draft202012Validator({**components["messages"][kind]["payload"], "components": components})
+        validator.validate(message)
+
+    named = json.dumps(document).split('"#/')[1:]
+    for reference in (part.partition('"')[0].split("/") for part in named):
+        found = document
+        for key in reference:
+            found = found[key]
+    http.post("/api/run", json={"running": True})
+    http.delete("/api/lease")
+    seen: set[str] = set()
+    with http.websocket_connect("ws://localhost/api/live") as live:
+        for said in ({"type": "ping", "at": 1.0}, {"type": "name", "name": "Ann"}, {"type": "ctrl", "values": {}},
+                     {"type": "ack"}):  # fmt: skip
+            check(said["type"], said)
+            live.send_json(said)
+        live.send_json({"type": "shout"})
+        while seen != {"you", "world", "state", "status", "log", "refused", "pong"}:
+            message = live.receive_json()
+            check(message["type"], message)
+            seen.add(message["type"])
+            if message["type"] == "refused":
+                assert "shout" in message["error"]["message"]
+    with http.websocket_connect("ws://localhost/api/cameras/arm/wrist/live") as camera:
+        frame = camera.receive_bytes()
+    head = json.loads(frame[4 : 4 + int.from_bytes(frame[:4], "little")])
+    Draft202012Validator(components["schemas"]["PictureHead"]).validate(head)
 
 
 def test_openapi_says_where_it_is_mounted(server: SimulatedServer) -> None:
@@ -313,6 +351,43 @@ def test_a_recording_is_made_converted_replayed_in_seconds_and_removed(
         assert http.get("/api/recordings").json()["recordings"] == []
     finally:
         http.post("/api/ops/set_mode", json={"mode": "live"})
+
+
+def test_a_model_is_taken_in_as_a_file_or_an_archive(tmp_path: Path) -> None:
+    mjcf = "<mujoco><worldbody><body name='b'><joint name='j'/><geom {}/></body></worldbody></mujoco>"
+    tetrahedron = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    with_mesh = mjcf.replace("<worldbody>", "<asset><mesh file='m/t.obj'/></asset><worldbody>").format(
+        "type='mesh' mesh='t'"
+    )
+
+    def packed(**files: str) -> bytes:
+        buffer = io.BytesIO()
+        with zipfile.ZipFile(buffer, "w") as archive:
+            for name, content in files.items():
+                archive.writestr(name.replace("__", "/").replace("_dot_", "."), content)
+        return buffer.getvalue()
+
+    with SimulatedServer(dialect="beta") as server:
+        site = mounted(server, "/", Access(hosts=["localhost"], tokens=False), tmp_path)
+        with TestClient(site, base_url="http://localhost") as http:
+            with http.websocket_connect("ws://localhost/api/live") as live:
+                heard(live, "status", lambda status: status["link"]["state"] == "connected")
+            plain = http.put("/api/models/stick.xml", content=mjcf.format("size='.1'"))
+            assert plain.status_code == 200, plain.text
+            archive = packed(robot__robot_dot_xml=with_mesh, robot__m__t_dot_obj=tetrahedron)
+            made = http.put("/api/models/robot.zip", content=archive).json()
+            answer = http.post("/api/ops/spawn_actor", json={"blueprint": made["blueprint"], "actor_id": "it"})
+            assert answer.status_code == 200, answer.text
+            for name, content, said in (
+                ("robot.zip", packed(a_dot_xml="", b_dot_xml=""), "one .xml file"),
+                ("robot.zip", packed(**{"..__a_dot_xml": ""}), "outside its own folder"),
+                ("robot.zip", b"nonsense", "not a ZIP archive"),
+                ("robot.urdf", b"<robot/>", "not the name of a model"),
+                ("robot.xml", b"<mujoco><nonsense/></mujoco>", "nonsense"),
+            ):
+                refused = http.put(f"/api/models/{name}", content=content)
+                assert refused.status_code in {400, 409, 502}
+                assert said in refused.json()["error"]["message"]
 
 
 def test_pictures_come_as_files_too_while_running_paused_and_stepped(http: TestClient) -> None:

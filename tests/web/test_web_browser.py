@@ -21,7 +21,8 @@ from selenium.webdriver.support.ui import WebDriverWait
 pytestmark = pytest.mark.browser
 
 TOO_WIDE = """[...document.querySelectorAll('main *, header *')]
-  .filter((one) => !one.closest('.frame, .entries, .actors') && one.getBoundingClientRect().right > innerWidth + 1)
+  .filter((one) => !one.closest('.frame, .entries, .actors, .recordings'))
+  .filter((one) => one.getBoundingClientRect().right > innerWidth + 1)
   .map((one) => one.outerHTML.slice(0, 80))"""
 
 
@@ -71,7 +72,7 @@ def test_the_stop_button_stops_and_space_goes_on(page: Page) -> None:
     page.click("#stop")
     page.until(f"!({RUNNING})")
     page.slide(0.9)
-    page.until("document.querySelector('#log').innerText.includes('set_paused')")
+    page.until("document.querySelector('#log').innerText.includes('set paused')")
     assert not page.look(page.elbow_is(0.9))
     page.driver.execute_script("document.dispatchEvent(new KeyboardEvent('keydown', {key: ' ', bubbles: true}))")
     page.driver.execute_script("document.body.dispatchEvent(new KeyboardEvent('keydown', {key: ' ', bubbles: true}))")
@@ -158,7 +159,7 @@ def test_actors_are_spawned_moved_and_removed_and_nobody_loses_what_they_type(pa
     page.until("document.querySelector('[data-actor=third]') !== null")
     assert x == page.driver.switch_to.active_element
     assert x.get_attribute("value") == "1.5"
-    page.find("[data-actor=second] button[title^=Move]").click()
+    page.find("[data-actor=second] [aria-label='Move second']").click()
     page.asked("api/ops/list_actors", lambda _: where("second")[0] == 1.5, {})
     for actor in ("second", "third"):
         remove = page.find(f"[data-actor={actor}] button[title^=Remove]")
@@ -250,6 +251,81 @@ def test_it_fits_a_phone(page: Page) -> None:
             stop = page.look("document.querySelector('#stop').getBoundingClientRect().toJSON()")
             assert 0 <= stop["top"] <= stop["bottom"] <= PHONE["height"]
             assert stop["height"] >= 44
+
+
+def test_the_joint_panel_takes_numbers_and_goes_to_zero_and_home(page: Page) -> None:
+    row = "[data-robot=arm] [data-actuator=elbow]"
+    page.driver.execute_script("document.querySelector('[data-robot=arm]').scrollIntoView()")
+    box = page.find("[data-robot=arm] [data-set-point=elbow]")
+    box.send_keys(Keys.CONTROL, "a")
+    box.send_keys("0.7", Keys.ENTER)
+    page.until(page.elbow_is(0.7))
+    assert page.look("document.querySelector('[data-robot=arm] [data-value=elbow]').textContent.endsWith(' rad')")
+    limits = page.look(f"document.querySelector('{row}').parentElement.innerText.split(/\\s+/)")
+    assert limits == ["\u22121.4", "2.62"]
+    box.send_keys(Keys.CONTROL, "a")
+    box.send_keys("99", Keys.ENTER)
+    page.until(f"document.querySelector('{row}').value > 2.5")  # as far as its limit
+    page.click('[data-robot=arm] [aria-label="elbow to zero"]')
+    page.until(page.elbow_is(0.0))
+    page.click('[data-robot=arm] [aria-label="All home"]')
+    homes = {one["name"]: one["home"] for one in page.ask("api/world")["articulations"][0]["actuators"]}
+    page.until(page.elbow_is(homes["elbow"]))
+
+
+def test_curves_can_be_added_read_hidden_and_held(page: Page) -> None:
+    curve = "document.querySelector('[data-sensor=\"arm/qpos/rad\"]')"
+    page.driver.execute_script(
+        "const add = document.querySelector('#add-curve'); add.value = 'arm/qpos/rad';"
+        "add.dispatchEvent(new Event('change', {bubbles: true}))"
+    )
+    page.until(f"{curve} !== null")
+    page.driver.execute_script(f"{curve}.scrollIntoView({{block: 'center'}})")
+    page.until(f"/\\d/.test({curve}.querySelector('.signal .num').textContent)")
+    assert page.look(f"{curve}.querySelector('.tag').textContent") == "rad"
+    signal = page.look(f"{curve}.querySelector('.signal')")
+    signal.click()
+    assert signal.get_attribute("aria-pressed") == "false"
+    page.click("#pause-curves")
+    read = f"{curve}.querySelector('.signal:nth-child(3) .num').textContent"
+    page.until(f"!document.querySelector('#scroll-back').hidden && {read} !== ''")
+    held = page.look(read)
+    page.slide(0.5)
+    page.until(page.elbow_is(0.5))
+    assert page.look(read) == held
+    page.click("#pause-curves")
+    page.until(f"{read} !== '{held}'")
+    page.click('[data-sensor="arm/qpos/rad"] .tiny')
+    page.until(f"{curve} === null")
+
+
+def test_the_log_is_for_people_and_every_control_has_a_name_and_a_size(page: Page) -> None:
+    shown = page.look("document.querySelector('#log').innerText")
+    assert "session_id" not in shown
+    assert "The console is connected to the server." in shown
+    assert page.look("document.querySelectorAll('h1').length") == 1
+    unnamed = page.look(
+        "[...document.querySelectorAll('button, input, select')].filter(one => !one.hidden && one.type !== 'file' && "
+        "!(one.getAttribute('aria-label') || one.textContent.trim() || one.labels?.length)).map(one => one.outerHTML)"
+    )
+    assert unnamed == []
+    small = page.look(
+        "[...document.querySelectorAll('button, select, input[type=number]')].filter(one => one.offsetParent && "
+        "(one.offsetHeight < 24 || one.offsetWidth < 24)).map(one => one.outerHTML)"
+    )
+    assert small == []
+
+
+def test_the_controls_are_a_sheet_on_a_phone(page: Page) -> None:
+    with page.phone():
+        visible = "getComputedStyle(document.querySelector('#sheet')).visibility === 'visible'"
+        page.until(f"!({visible})")
+        page.click("#sheet-toggle")
+        page.until(visible)
+        assert page.look("document.querySelector('#sheet').contains(document.querySelector('#mode'))")
+        page.click("#sheet-toggle")
+        page.until(f"!({visible})")
+    page.until("document.querySelector('header').contains(document.querySelector('#mode'))")
 
 
 def test_a_second_viewer_drives_only_when_the_first_lets_go(page: Page, tmp_path: Path) -> None:

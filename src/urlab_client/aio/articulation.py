@@ -355,10 +355,8 @@ class URLabArticulation(URLabEntity):
             ValueError: A value is NaN, infinite, or, with `error`, out of range; nothing was set.
         """
         rule = OutOfRange(out_of_range)
-        found = [
-            (self.actuators[name], value)
-            for name, value in mapping("set_ctrl", values, "actuator names to numbers").items()
-        ]
+        given = mapping("set_ctrl", values, "actuator names to numbers")
+        found = [(self.actuators[name], value) for name, value in given.items()]
         checked = [actuator.checked(value, rule) for actuator, value in found]
         if checked:
             self._record.drive()

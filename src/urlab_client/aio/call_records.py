@@ -17,7 +17,7 @@ from urlab_client.protocol.errors import URLabConnectionError, URLabRPCError, UR
 
 __all__ = ["CallRecords", "Observe"]
 
-log = logging.getLogger("urlab_client.session")
+log: logging.Logger = logging.getLogger("urlab_client.session")
 
 T = TypeVar("T")
 

@@ -35,7 +35,7 @@ class URLabCameraView:
         self.delivered = True
         self._publishers = publishers
         # Fed by the client. Not declared above, so that the façade has none.
-        self.pictures = LatestPicture(publishers.camera(self, asked=False))
+        self.pictures: LatestPicture = LatestPicture(publishers.camera(self, asked=False))
 
     @property
     def latest_frame(self) -> Pixels | None:

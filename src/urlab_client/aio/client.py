@@ -57,7 +57,7 @@ from urlab_client.protocol.topics import TopicKind
 
 __all__ = ["URLabClient"]
 
-log = logging.getLogger("urlab_client.client")
+log: logging.Logger = logging.getLogger("urlab_client.client")
 
 R = TypeVar("R", bound=Reply)
 

@@ -27,7 +27,7 @@ from urlab_client.protocol.messages.session import Step
 
 __all__ = ["CLAIM_S", "Control", "process_owner"]
 
-log = logging.getLogger("urlab_client.control")
+log: logging.Logger = logging.getLogger("urlab_client.control")
 
 R = TypeVar("R", bound=Reply)
 
@@ -95,7 +95,7 @@ class Control:
 
     def __init__(self, session: ControlledSession, *, wanted: bool = True) -> None:
         self.resolve: Callable[[str], str | None] = lambda name: name
-        self.owner = process_owner()
+        self.owner: str = process_owner()
         self._session = session
         self._wanted = wanted
         self._held: dict[str, _Claim] = {}

@@ -25,7 +25,7 @@ from urlab_client.protocol.types import JobStatus
 
 __all__ = ["OnProgress", "finish"]
 
-log = logging.getLogger("urlab_client.session")
+log: logging.Logger = logging.getLogger("urlab_client.session")
 
 R = TypeVar("R", bound=Reply)
 

@@ -43,7 +43,7 @@ __all__ = [
     "with_start_timeout",
 ]
 
-log = logging.getLogger("urlab_client.launch")
+log: logging.Logger = logging.getLogger("urlab_client.launch")
 
 SCHEME = "sim://"
 _START_S = 60.0
@@ -133,7 +133,7 @@ class LaunchedTransport:
     """
 
     def __init__(self, address: str, *, shm: bool = False) -> None:
-        self.stats = TransportStats()
+        self.stats: TransportStats = TransportStats()
         self._address = address
         self._arguments = serve_arguments(address)
         self._start_s = start_seconds(address)

@@ -44,7 +44,7 @@ from urlab_client.protocol.messages.session import Hello, HelloOk, Meta, StateRe
 
 __all__ = ["Session", "Turn"]
 
-log = logging.getLogger("urlab_client.session")
+log: logging.Logger = logging.getLogger("urlab_client.session")
 
 R = TypeVar("R", bound=Reply)
 _HELLO = op_of(Hello)
@@ -84,23 +84,23 @@ class Session:
         json: bool = False,
         observe: Observe | None = None,
     ) -> None:
-        self.session_id = ""
-        self.greeted = False
-        self.read_only = False
-        self.features = Features()
+        self.session_id: str = ""
+        self.greeted: bool = False
+        self.read_only: bool = False
+        self.features: Features = Features()
         self.on_opened: Callable[[HelloOk], None] | None = None
         self.on_refusal: Callable[[URLabRPCError], None] | None = None
-        self.confirmed = False
+        self.confirmed: bool = False
         self._transport = transport
         self._call_records = None if observe is None else CallRecords(observe, transport)
         self._way = self._call_records or transport
         self._default_timeout = default_timeout
         self._json = json
-        self.control = Control(self)
-        self.line = Mutex()
-        self.turns = Mutex()
-        self.editing = Mutex()
-        self.scene = Mutex()
+        self.control: Control = Control(self)
+        self.line: Mutex = Mutex()
+        self.turns: Mutex = Mutex()
+        self.editing: Mutex = Mutex()
+        self.scene: Mutex = Mutex()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._queued = 0
         self._aside: asyncio.Task[Reply] | None = None

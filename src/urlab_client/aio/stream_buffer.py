@@ -29,15 +29,15 @@ class BufferedMessage:
     __slots__ = ("dropped", "gap", "item", "malformed", "payload", "seq", "size", "topic", "wall_ns")
 
     def __init__(self, topic: bytes, payload: Any, size: int, wall_ns: int, seq: int) -> None:
-        self.topic = topic
-        self.payload = payload
-        self.size = size
-        self.wall_ns = wall_ns
-        self.seq = seq
-        self.dropped = 0
+        self.topic: bytes = topic
+        self.payload: Any = payload
+        self.size: int = size
+        self.wall_ns: int = wall_ns
+        self.seq: int = seq
+        self.dropped: int = 0
         self.gap: str | None = None
         self.item: Any = None
-        self.malformed = False
+        self.malformed: bool = False
 
 
 class StreamBuffer:
@@ -75,10 +75,10 @@ class StreamBuffer:
         self._carried = 0
         self._carried_gap: str | None = None
         self._overflowed = 0
-        self.received = 0
-        self.received_bytes = 0
-        self.dropped = 0
-        self.size = 0
+        self.received: int = 0
+        self.received_bytes: int = 0
+        self.dropped: int = 0
+        self.size: int = 0
         self.newest: BufferedMessage | None = None
 
     def __len__(self) -> int:

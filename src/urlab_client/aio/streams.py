@@ -28,7 +28,7 @@ from urlab_client.protocol.messages.streams import StreamItem, StreamPolicy, Str
 
 __all__ = ["BUFFER_BYTES", "BUFFER_ITEMS", "Stream"]
 
-log = logging.getLogger("urlab_client.streams")
+log: logging.Logger = logging.getLogger("urlab_client.streams")
 
 T = TypeVar("T", bound=StreamItem)
 T_co = TypeVar("T_co", bound=StreamItem, covariant=True)

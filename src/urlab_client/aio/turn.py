@@ -125,11 +125,11 @@ class Turn:
         Raises:
             URLabError: As `Session.call`.
         """
-        session, op = self._session, op_of(request)
+        session, op, limits = self._session, self._op, self._asked
         self._before = session.transport.stats.sent
-        session.check_offered(op)
-        limits = self._asked
-        if limits is None or op is not self._op or takes is not None:
+        if limits is None or takes is not None or type(request) is not op.request:
+            op = op_of(request)
+            session.check_offered(op)
             limits = self._limits(op, takes)
         self._asked = None
         self._first = False
@@ -165,7 +165,7 @@ class Turn:
         self._ready = True
 
     def _give_line(self) -> None:
-        self._left = self.sent
+        self._left = self._session.transport.stats.sent > self._before
         self._ready = False
         self._session.line.release()
         if self._op.needs is Needs.EDITOR:

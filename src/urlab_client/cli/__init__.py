@@ -24,7 +24,7 @@ from urlab_client.protocol.errors import URLabError
 
 __all__ = ["main"]
 
-logger = logging.getLogger("urlab_client.cli")
+logger: logging.Logger = logging.getLogger("urlab_client.cli")
 
 _COMMANDS = (
     "serve",

@@ -29,7 +29,7 @@ __all__ = ["add_parser", "run"]
 
 _UNHEALTHY = 1
 
-logger = logging.getLogger("urlab_client.cli")
+logger: logging.Logger = logging.getLogger("urlab_client.cli")
 
 
 class DoctorArguments(ServerArguments):

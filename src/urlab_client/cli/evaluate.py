@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = ["add_parser", "run"]
 
-logger = logging.getLogger("urlab_client.cli")
+logger: logging.Logger = logging.getLogger("urlab_client.cli")
 
 _MODEST: Final = ""
 _MOST_COPIES: Final = 64

@@ -178,7 +178,7 @@ class LeasePool:
         if not _ray.is_initialized():
             raise URLabError("Ray is not initialised.", hint="Call ray.init() first.")
         self.name = name
-        self.size = len(addresses)
+        self.size: int = len(addresses)
         self._ttl = ttl
         here = import_module("ray.util.scheduling_strategies").NodeAffinitySchedulingStrategy(
             _ray.get_runtime_context().get_node_id(), soft=False

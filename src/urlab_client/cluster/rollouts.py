@@ -22,7 +22,7 @@ from urlab_client.protocol.errors import URLabError
 
 __all__ = ["Rollouts", "rollouts"]
 
-log = logging.getLogger("urlab_client.cluster")
+log: logging.Logger = logging.getLogger("urlab_client.cluster")
 
 _ray: Any = import_module("ray")  # Any: Ray's hints leave every remote call unknown
 _SLICE_S: Final = 0.2  # how soon a cancelled reader and an overdue episode are noticed

@@ -7,7 +7,7 @@ from msgspec import Struct
 from urlab_client.protocol.client_types import Finding
 from urlab_client.protocol.descriptions import Pose, SceneDescription
 from urlab_client.protocol.types import Contact
-from urlab_client.web.console_session import LogEntry
+from urlab_client.web.messages import LogEntry
 
 __all__ = ["Contacts", "Done", "Edited", "Explained", "Log", "Picture", "Recorded", "Result", "RobotState", "World"]
 

@@ -91,7 +91,7 @@ def _packer(count: int) -> Callable[..., None]:
 def from_wire_array(kind: type, value: Any) -> Any:
     """Decoding hook: a list of numbers becomes a float64 array of shape (n,)."""
     if type(value) is list:
-        numbers = cast("list[Any]", value)
+        numbers: list[Any] = value  # pyright: ignore[reportUnknownVariableType]  # `cast` is a call, for each array
         if len(numbers) <= _SHORT:
             # Twice as fast as what follows, and it takes only numbers: whatever else there is falls through.
             packed = np.empty(len(numbers))

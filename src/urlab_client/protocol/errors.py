@@ -212,7 +212,7 @@ class NoSession(SessionTakenOver, advice="Call discover() first."):
 
     def __init__(self, message: str, *, op: str | None = None, hint: str | None = None) -> None:
         super().__init__("session_expired", message, op=op, hint=hint)
-        self.args = (f"{op}: {message}" if op else message,)  # the code would say something else
+        self.args: tuple[Any, ...] = (f"{op}: {message}" if op else message,)  # the code would say something else
 
 
 class BadRequest(URLabRPCError, code="bad_request"):

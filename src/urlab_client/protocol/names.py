@@ -8,7 +8,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from typing import Any, NoReturn, TypeVar, cast, overload
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar, cast, overload
 
 __all__ = ["NameMap", "UnknownName", "compiled_names", "did_you_mean", "owner_of", "split_prefix"]
 
@@ -167,8 +167,8 @@ class NameMap(dict[str, T]):
     def _refuse(self, *args: Any, **kwargs: Any) -> NoReturn:
         raise TypeError(f"this map of {self.kind} names is read-only; dict(map) makes a copy to change")
 
-    # Any call is refused, so the parameters of the overridden methods do not matter.
-    __setitem__ = __delitem__ = __ior__ = update = setdefault = pop = popitem = clear = _refuse  # pyright: ignore[reportAssignmentType, reportIncompatibleMethodOverride]
+    if not TYPE_CHECKING:  # any call is refused, whatever the parameters of the overridden method
+        __setitem__ = __delitem__ = __ior__ = update = setdefault = pop = popitem = clear = _refuse
 
 
 def owner_of(name: str, prefixes: AbstractSet[str]) -> str | None:

@@ -191,7 +191,7 @@ class Region:
     def __init__(self, buffer: bytearray | memoryview, stride: int, n_buffers: int, fence: Fence) -> None:
         self.stride = stride
         self.n_buffers = n_buffers
-        self.max_payload = stride - SIZE_PREFIX
+        self.max_payload: int = stride - SIZE_PREFIX
         self._fence = fence
         self._bytes = memoryview(buffer)
         # Single aligned moves; putting a number together from bytes could mix an old half with a new one.

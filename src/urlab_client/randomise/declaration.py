@@ -263,6 +263,16 @@ class Randomisation(_Declared, frozen=True, kw_only=True):
     delay: Delay = Delay()
     camera: tuple[CameraLatency, ...] = ()
 
+    @property
+    def disturbs_observations(self) -> bool:
+        """Whether what is seen differs from what is."""
+        return bool(self.noise) or steps_range(self.delay.observation)[1] > 0 or self.delay.drop > 0
+
+    @property
+    def delays_actions(self) -> bool:
+        """Whether actions have effect later."""
+        return steps_range(self.delay.action)[1] > 0
+
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
         """Read a TOML file.

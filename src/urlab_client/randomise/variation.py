@@ -100,8 +100,8 @@ class Variation:
         self._model = model
         self._elements = [elements_of(vary, model, controlled) for vary in declaration.vary]
         model_entries = [vary for vary in declaration.vary if vary.what not in START]
-        self.fields = tuple(sorted({name for vary in model_entries for name in FIELDS[vary.what]}))
-        self.derives = not DERIVED_FROM.isdisjoint(self.fields)
+        self.fields: tuple[str, ...] = tuple(sorted({name for vary in model_entries for name in FIELDS[vary.what]}))
+        self.derives: bool = not DERIVED_FROM.isdisjoint(self.fields)
         self._nominal = {name: np.array(field_of(model, name)) for name in self.fields}
 
     def draw(self, seed: int) -> EpisodeDraws:

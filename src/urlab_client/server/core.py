@@ -47,7 +47,7 @@ from urlab_client.server.system.health import Health
 
 __all__ = ["PhysicsConfig", "ServerCore"]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 
 @dataclass(frozen=True, kw_only=True)

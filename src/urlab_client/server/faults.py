@@ -15,7 +15,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Any, Final, Self, get_type_hints
+from typing import Any, ClassVar, Final, Self, get_type_hints
 
 import msgspec
 import zmq
@@ -37,7 +37,7 @@ __all__ = [
     "Refuse",
 ]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 _KINDS: Final = "a Delay, Drop, Cut, Corrupt or Refuse"
 
@@ -181,9 +181,9 @@ class ActiveFault:
     def __init__(self, faults: Faults, fault: Fault, seed: str) -> None:
         """Begin to count; `Faults.add` makes these."""
         self.fault = fault
-        self.seen = 0
-        self.applied = 0
-        self.random = random.Random(seed)  # noqa: S311 - reproducible on purpose
+        self.seen: int = 0
+        self.applied: int = 0
+        self.random: random.Random = random.Random(seed)  # noqa: S311 - reproducible on purpose
         self._faults = faults
 
     def __repr__(self) -> str:
@@ -420,7 +420,7 @@ class Injector:
 class FaultyEndpoint(RpcEndpoint):
     """A request socket that may leave a request unanswered, which a REP socket cannot."""
 
-    kind = zmq.ROUTER
+    kind: ClassVar[int] = zmq.ROUTER
 
     def __init__(self, injector: Injector, answer: Callable[[bytes], bytes], **options: Any) -> None:
         """Bind the socket.

@@ -48,7 +48,7 @@ from urlab_client.server.transport.shared_memory import MAX_REPLY_BYTES, SharedM
 
 __all__ = ["OpenServer", "ServerConfig", "ServerPorts"]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 
 CLOSE_S: Final = 1.0
@@ -94,8 +94,8 @@ class OpenServer:
     """Everything an open server holds. Knows nothing of the `SimulatedServer`, which can so be collected."""
 
     def __init__(self, config: ServerConfig) -> None:
-        self.host = numeric_host(config.host)
-        self.curve_keys = None if config.curve is None else CurveKeys(config.curve)
+        self.host: str = numeric_host(config.host)
+        self.curve_keys: CurveKeys | None = None if config.curve is None else CurveKeys(config.curve)
         if self.curve_keys is None and not config.insecure_no_auth and not is_loopback(self.host):
             raise UnprotectedServer(
                 f"{config.host} ({self.host}) can be reached from other machines, and a client can read and write "
@@ -103,7 +103,7 @@ class OpenServer:
                 hint="Protect the server with CURVE keys (--server-key and --allow-client, or curve=…), "
                 "or say --insecure-no-auth (insecure_no_auth=True).",
             )
-        self.health = Health()
+        self.health: Health = Health()
         self.request_callbacks: list[Callable[[ServedRequest], None]] = []
         self._cameras: CameraStreams | None = None
         self._streams: StreamServer | None = None

@@ -25,9 +25,9 @@ class ServerSession:
     __slots__ = ("id", "json", "level")
 
     def __init__(self) -> None:
-        self.id = ""
-        self.json = False
-        self.level = ObservationLevel.STANDARD
+        self.id: str = ""
+        self.json: bool = False
+        self.level: ObservationLevel = ObservationLevel.STANDARD
 
     def open(self, *, observations: str | None, encoding: str | None) -> str:
         """Start a new session, which ends the previous one, and return its id.

@@ -14,9 +14,12 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from typing import Any
+from contextvars import Context
+from typing import Any, TypeVarTuple
 
 __all__ = ["CallerLoop"]
+
+Ts = TypeVarTuple("Ts")
 
 # Rounds of callbacks in a row after which sockets are looked at, though there are more callbacks to run.
 _ROUNDS = 4
@@ -28,6 +31,8 @@ _READABLE = getattr(select, "EPOLLIN", None)
 _NEEDED = (
     "_asyncgen_finalizer_hook",
     "_asyncgen_firstiter_hook",
+    "_closed",
+    "_debug",
     "_process_events",
     "_ready",
     "_run_once",
@@ -43,6 +48,8 @@ class CallerLoop(asyncio.SelectorEventLoop):
 
     _asyncgen_finalizer_hook: Any
     _asyncgen_firstiter_hook: Any
+    _closed: bool
+    _debug: bool
     _process_events: Any
     _ready: deque[Any]
     _run_once: Any
@@ -52,10 +59,21 @@ class CallerLoop(asyncio.SelectorEventLoop):
     _thread_id: int | None
 
     def __init__(self) -> None:
+        self._as_known = False  # while asyncio's own loop is being made
         super().__init__()
         self._as_known = all(hasattr(self, name) for name in _NEEDED)
         nothing: Mapping[int, Any] = {}
         self._poll, self._keys = _parts(self._selector) if self._as_known else (None, nothing)
+
+    def call_soon(
+        self, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
+    ) -> asyncio.Handle:
+        """See `asyncio.AbstractEventLoop.call_soon`."""
+        if not self._as_known or self._closed or self._debug:  # there is more to be done, or to be refused
+            return super().call_soon(callback, *args, context=context)
+        handle = asyncio.Handle(callback, args, self, context)
+        self._ready.append(handle)
+        return handle
 
     def run_until_stopped(self) -> None:
         """Do what `run_forever` does. For whoever stops it soon."""

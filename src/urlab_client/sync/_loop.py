@@ -261,7 +261,7 @@ class CallerDrivenLoop:
         if self._ended:
             job.wait(_CLAIM_SLICE)
             return
-        if not self._claim(job, deadline):
+        if not self._turn.acquire(blocking=False) and not self._claim(job, deadline):
             return
         try:
             if self._ended:

@@ -48,9 +48,9 @@ class Access:
     """
 
     def __init__(self, *, hosts: Collection[str] = LOOPBACK, tokens: bool = True) -> None:
-        self.hosts = frozenset(hosts)
+        self.hosts: frozenset[str] = frozenset(hosts)
         self.tokens = tokens
-        self.cookie = f"urlab_{secrets.token_hex(4)}"  # cookies of a host go to all its ports
+        self.cookie: str = f"urlab_{secrets.token_hex(4)}"  # cookies of a host go to all its ports
         self._tokens: set[str] = set()
         self._keys: set[str] = set()
 

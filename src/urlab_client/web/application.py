@@ -32,7 +32,9 @@ from urlab_client.web import mujoco_viewer
 from urlab_client.web.access import Access, Guarded
 from urlab_client.web.console_session import Audience, ConsoleSession
 from urlab_client.web.driving_lease import DrivingLease, NotDriving, Viewer
+from urlab_client.web.messages import Ack, Ctrl, FromViewer, Log, Name, Ping, Pong, Refused, You
 from urlab_client.web.metrics import showing
+from urlab_client.web.model_upload import ModelRoutes
 from urlab_client.web.ops import encode, openapi, parse, served
 from urlab_client.web.reading_routes import ReadingRoutes
 from urlab_client.web.recording_routes import RecordingRoutes
@@ -114,16 +116,6 @@ class _LoginRequest(Struct):
     token: str
 
 
-class _Message(Struct):
-    """What a browser says over its WebSocket."""
-
-    type: str
-    seq: int = 0
-    at: float = 0.0
-    name: str = ""
-    values: dict[str, dict[str, float]] = {}
-
-
 class _Site:
     def __init__(self, console: ConsoleSession, access: Access) -> None:
         self.console = console
@@ -131,6 +123,7 @@ class _Site:
         self._viewers: dict[str, Viewer] = {}
         self._reading = ReadingRoutes(console, self._viewer)
         self._recordings = RecordingRoutes(console, self._viewer)
+        self._models = ModelRoutes(console, self._viewer)
 
     def routes(self) -> list[Route | WebSocketRoute | Mount]:
         def route(path: str, handler: _Handler, *methods: str) -> Route:
@@ -148,7 +141,10 @@ class _Site:
             route("/api/ctrl", self._ctrl, "POST"),
             route("/api/run", self._run, "POST"),
             route("/api/step", self._step, "POST"),
-            *(route(path, handler, *methods) for path, handler, methods in self._recordings.routes()),
+            *(
+                route(path, handler, *methods)
+                for path, handler, methods in (*self._recordings.routes(), *self._models.routes())
+            ),
             route("/api/lease", self._lease, "POST", "DELETE"),
             route("/api/connection", self._connection, "POST"),
             route("/api/invitations", self._invite, "POST"),
@@ -247,7 +243,7 @@ class _Site:
         self.console.audience.add(one)
         self.console.tell()
         try:
-            await socket.send_json({"type": "you", "viewer": viewer.key, "name": viewer.name})
+            await socket.send_text(encode(You(viewer.key, viewer.name)).decode())
             async with anyio.create_task_group() as tasks:
                 tasks.start_soon(self._send, socket, one, flow)
                 with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # gone, maybe while it is answered
@@ -276,7 +272,7 @@ class _Site:
                 news = [entry for entry in console.entries if entry.n > line]
                 if news:
                     line = news[-1].n
-                    await socket.send_text(encode({"type": "log", "entries": news}).decode())
+                    await socket.send_text(encode(Log(news)).decode())
                 if (
                     console.state_json is not None
                     and state != console.state_seq
@@ -291,22 +287,20 @@ class _Site:
         while True:
             text = await _said(socket)
             try:
-                message = msgspec.json.decode(text, type=_Message)
-                match message.type:
-                    case "ack":
+                message: FromViewer = msgspec.json.decode(text, type=FromViewer)
+                match message:
+                    case Ack():
                         flow.acknowledged += 1
                         one.changed.set()
-                    case "ping":
-                        await socket.send_json({"type": "pong", "at": message.at, "now": _now_ms()})
-                    case "name":
-                        one.viewer.name = " ".join(message.name.split())[:24] or one.viewer.name
+                    case Ping(at=at):
+                        await socket.send_text(encode(Pong(at, _now_ms())).decode())
+                    case Name(name=name):
+                        one.viewer.name = " ".join(name.split())[:24] or one.viewer.name
                         self.console.tell()
-                    case "ctrl":
-                        self.console.controls.set_points(one.viewer, message.values)
-                    case _:
-                        raise ValueError(f"there is no message of type {message.type!r}")  # noqa: TRY301 - answered
+                    case Ctrl(values=values):
+                        self.console.controls.set_points(one.viewer, values)
             except (NotDriving, ValueError, KeyError, RecursionError, msgspec.MsgspecError) as error:
-                await socket.send_text(encode({"type": "refused", "error": _explain(error)[1]}).decode())
+                await socket.send_text(encode(Refused(_explain(error)[1])).decode())
 
     async def _pictures(self, socket: WebSocket) -> None:
         feed = self.console.feed(socket.path_params["path"])

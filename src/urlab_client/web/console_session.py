@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import anyio
 import numpy as np
-from msgspec import Struct, structs
+from msgspec import structs
 
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import ClientClosed, URLabError, URLabTimeoutError
@@ -35,6 +35,7 @@ from urlab_client.protocol.messages.streams import (
 from urlab_client.web.controls import Controls
 from urlab_client.web.description import WorldDescription, describe
 from urlab_client.web.driving_lease import DrivingLease, Viewer
+from urlab_client.web.messages import ArticulationSample, EntitySample, Link, LogEntry, State, Status, World
 from urlab_client.web.mujoco_viewer import MujocoViewer
 from urlab_client.web.ops import encode
 from urlab_client.web.pictures import Feed
@@ -44,9 +45,9 @@ from urlab_client.web.replay import Replay
 if TYPE_CHECKING:
     from urlab_client.aio import URLabCameraView, URLabClient
 
-__all__ = ["Audience", "ConsoleSession", "Link", "LogEntry"]
+__all__ = ["Audience", "ConsoleSession"]
 
-log = logging.getLogger("urlab_client.web")
+log: logging.Logger = logging.getLogger("urlab_client.web")
 
 _PERIOD_S = 1 / 60
 _RETRY_S = 1.0
@@ -55,26 +56,6 @@ _CONNECT_S = 3.0
 _KEPT = 300
 _DIGITS = 5
 _MOVING_S = 0.4  # a paused server repeats its state ten times a second
-
-
-class Link(Struct):
-    """The connection to the server: `connecting`, `connected`, `lost`, `silent` or `taken_over`, and why."""
-
-    state: str
-    reason: str = ""
-    since: float = 0.0
-
-
-class LogEntry(Struct):
-    """One line of the log. `kind` is `call`, `error` or `event`; `at` is Unix time in seconds."""
-
-    n: int
-    at: float
-    kind: str
-    who: str
-    what: str
-    text: str
-    ms: float | None = None
 
 
 class Audience:
@@ -87,7 +68,7 @@ class Audience:
 
     def __init__(self, viewer: Viewer) -> None:
         self.viewer = viewer
-        self.changed = asyncio.Event()
+        self.changed: asyncio.Event = asyncio.Event()
 
 
 class ConsoleSession:
@@ -102,18 +83,18 @@ class ConsoleSession:
     def __init__(self, client: URLabClient, lease: DrivingLease, recordings: Path) -> None:
         self.client = client
         self.lease = lease
-        self.link = Link("connecting", since=time.time())
-        self.world = WorldDescription()
-        self.world_json = encode({"type": "world", "world": self.world})
+        self.link: Link = Link("connecting", since=time.time())
+        self.world: WorldDescription = WorldDescription()
+        self.world_json: bytes = encode(World(self.world))
         self.state_json: bytes | None = None
-        self.state_seq = 0
+        self.state_seq: int = 0
         self.entries: deque[LogEntry] = deque(maxlen=_KEPT)
         self.audience: set[Audience] = set()
         self.snapshot: StateSnapshot | None = None
-        self.mujoco_viewer = MujocoViewer(client)
-        self.controls = Controls(self)
-        self.recordings = Recordings(client, recordings)
-        self.replay = Replay(self)
+        self.mujoco_viewer: MujocoViewer = MujocoViewer(client)
+        self.controls: Controls = Controls(self)
+        self.recordings: Recordings = Recordings(client, recordings)
+        self.replay: Replay = Replay(self)
         self._bells: set[asyncio.Event] = set()
         self._n = 0
         self._want: str | None = "discover"
@@ -230,7 +211,7 @@ class ConsoleSession:
     def redescribe(self) -> None:
         """Describe the world anew: something in it is another."""
         self.world = describe(self.client, self.world.version + 1, self.mujoco_viewer.missing)
-        self.world_json = encode({"type": "world", "world": self.world})
+        self.world_json = encode(World(self.world))
         self.tell()
 
     # State
@@ -274,24 +255,23 @@ class ConsoleSession:
         # The server's own clock where it can be the same as ours; else what we know, when it got here.
         made = wall if 0 <= received - wall < 10 else received
         self.state_json = encode(
-            {
-                "type": "state",
-                "seq": self.state_seq,
-                "time": snapshot.time,
-                "step": snapshot.step,
-                "made": made * 1e3,
-                "articulations": {
-                    key: {
-                        "qpos": _rounded(state.qpos),
-                        "qvel": _rounded(state.qvel),
-                        "ctrl": _rounded(state.ctrl),
-                        "sensors": {name: _rounded(value) for name, value in (state.sensors or {}).items()},
-                        "targets": targets.get(key),
-                    }
+            State(
+                seq=self.state_seq,
+                time=snapshot.time,
+                step=snapshot.step,
+                made=made * 1e3,
+                articulations={
+                    key: ArticulationSample(
+                        qpos=_rounded(state.qpos),
+                        qvel=_rounded(state.qvel),
+                        ctrl=None if state.ctrl is None else _rounded(state.ctrl),
+                        sensors={name: _rounded(value) for name, value in (state.sensors or {}).items()},
+                        targets=targets.get(key),
+                    )
                     for key, state in snapshot.per_articulation.items()
                 },
-                "entities": {name: {"xpos": _rounded(pose.xpos)} for name, pose in snapshot.entities.items()},
-            }
+                entities={name: EntitySample(_rounded(pose.xpos)) for name, pose in snapshot.entities.items()},
+            )
         )
         self.tell()
 
@@ -304,29 +284,28 @@ class ConsoleSession:
         """Whether simulation time advances."""
         return self.link.state == "connected" and time.monotonic() - self._moved_at < _MOVING_S
 
-    def status(self, viewer: Viewer) -> dict[str, Any]:
+    def status(self, viewer: Viewer) -> Status:
         """Return what one viewer is told besides the state."""
         holder = self.lease.holder
-        return {
-            "type": "status",
-            "link": self.link,
-            "address": self.client.address,
-            "playing": self.client.manager_present,
-            "moving": self.replay.rate > 0 if self.replay.open else self.moving,
-            "running": self.controls.running if self.client.step_mode is not StepMode.LIVE else self.moving,
-            "rate": self.replay.rate if self.replay.open else round(self._rate, 3) if self.moving else 0.0,
-            "mode": self.client.step_mode,
-            "speed": self.controls.speed,
-            "source": self.controls.source,
-            "recording": self.recordings.running,
-            "replay": self.replay.view,
-            "twists": self.controls.twists,
-            "viewers": len(self.audience),
-            "driver": None if holder is None else holder.name,
-            "mine": holder is not None and holder.key == viewer.key,
-            "lease_left": round(self.lease.left, 1),
-            "lease": self.lease.seconds,
-        }
+        return Status(
+            link=self.link,
+            address=self.client.address,
+            playing=self.client.manager_present,
+            moving=self.replay.rate > 0 if self.replay.open else self.moving,
+            running=self.controls.running if self.client.step_mode is not StepMode.LIVE else self.moving,
+            rate=self.replay.rate if self.replay.open else round(self._rate, 3) if self.moving else 0.0,
+            mode=self.client.step_mode,
+            speed=self.controls.speed,
+            source=self.controls.source,
+            recording=self.recordings.running,
+            replay=self.replay.view,
+            twists=self.controls.twists,
+            viewers=len(self.audience),
+            driver=None if holder is None else holder.name,
+            mine=holder is not None and holder.key == viewer.key,
+            lease_left=round(self.lease.left, 1),
+            lease=self.lease.seconds,
+        )
 
     def tell(self) -> None:
         """Let everybody look again."""
@@ -381,8 +360,8 @@ class ConsoleSession:
         return None if art is None else art.cameras.get(name)
 
 
-def _rounded(values: Any) -> list[float] | None:
-    return None if values is None else np.round(np.asarray(values, dtype=np.float64), _DIGITS).tolist()
+def _rounded(values: Any) -> list[Any]:
+    return np.round(np.asarray(values, dtype=np.float64), _DIGITS).tolist()
 
 
 def _said(event: ClientEvent) -> dict[str, Any]:

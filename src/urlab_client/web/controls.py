@@ -68,7 +68,7 @@ class Controls:
     """
 
     def __init__(self, console: Console) -> None:
-        self.running = False
+        self.running: bool = False
         self.speed: float | None = None
         self.source: str | None = None
         self.twists: dict[str, tuple[float, float, float]] = {}

@@ -217,10 +217,14 @@ _PATHS: dict[str, Any] = {
     "/api/events": _path(
         "get", "events", "Server-sent events `log`, `world` and `status`; `Last-Event-ID` goes on in the log."
     ),
+    "/api/asyncapi.json": _path("get", "asyncapi", "The WebSockets, described as AsyncAPI 3.0."),
     "/api/explain": _path("get", "explain", "Why does a robot not move? What the client finds out, in sentences."),
     "/api/ctrl": _path("post", "ctrl", "Set set-points: `{articulation: {actuator: value}}`. Needs the controls."),
     "/api/run": _path("post", "run", "Let physics run or stop it: `{running: bool}`. Everybody may stop it."),
     "/api/step": _path("post", "step_many", "Step in direct mode: `{n_steps: int}`. Needs the controls."),
+    "/api/models/{name}": _path(
+        "put", "import_model", "Make a blueprint of a model: the bytes of an .xml or .zip file. Needs the controls."
+    ),
     "/api/recording": {
         **_path("post", "record", "Record into an MCAP file: `{cameras: bool}`. Needs the controls."),
         **_path("delete", "stop_recording", "End the recording, and describe it. Needs the controls."),

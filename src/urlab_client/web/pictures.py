@@ -16,6 +16,7 @@ from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import URLabError, URLabTimeoutError
 from urlab_client.protocol.messages.streams import CameraSample
 from urlab_client.protocol.picture_files import jpeg
+from urlab_client.web.messages import PictureHead
 
 if TYPE_CHECKING:
     from urlab_client.aio import Stream, URLabCameraView, URLabClient
@@ -42,7 +43,7 @@ class EncodedPicture:
         self.seq = seq
         self.received_ns = received_ns
         self.jpeg = encoded
-        self.head = msgspec.json.encode({"seq": seq, "received": received_ns / 1e6, "sim_time": sim_time, "mode": mode})
+        self.head: bytes = msgspec.json.encode(PictureHead(seq, received_ns / 1e6, sim_time, mode))
 
     def frame(self) -> bytes:
         """Return length of the head (4 bytes, little-endian), head, and JPEG."""

@@ -11,6 +11,7 @@ from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 
 from urlab_client.protocol.enums import StepMode
+from urlab_client.web.asyncapi import asyncapi
 from urlab_client.web.console_session import ConsoleSession
 from urlab_client.web.driving_lease import Viewer
 from urlab_client.web.ops import encode
@@ -25,7 +26,7 @@ _ALIVE_S = 15.0
 
 
 class ReadingRoutes:
-    """Handlers of `/api/explain`, `/api/events` and pictures.
+    """Handlers of `/api/asyncapi.json`, `/api/explain`, `/api/events` and pictures.
 
     Args:
         console: The session that all viewers share.
@@ -39,11 +40,17 @@ class ReadingRoutes:
     def routes(self) -> list[tuple[str, _Handler, list[str]]]:
         """Return path, handler and methods of each route."""
         return [
+            ("/api/asyncapi.json", self._asyncapi, ["GET"]),
             ("/api/explain", self._explain, ["GET"]),
             ("/api/events", self._events, ["GET"]),
             ("/api/cameras/{path:path}.jpg", self._jpeg, ["GET"]),
             ("/api/cameras/{path:path}.png", self._png, ["GET"]),
         ]
+
+    async def _asyncapi(self, request: Request) -> Response:
+        url, root = request.url, request.scope.get("root_path", "")
+        document = asyncapi(url.netloc, root, "wss" if url.scheme == "https" else "ws")
+        return Response(document, media_type="application/json")
 
     async def _explain(self, request: Request) -> Response:
         found = await self._console.client.explain()

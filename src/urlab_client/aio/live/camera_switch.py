@@ -22,7 +22,7 @@ from urlab_client.protocol.messages.session import CameraInfo
 
 __all__ = ["CameraSwitch"]
 
-log = logging.getLogger("urlab_client.client")
+log: logging.Logger = logging.getLogger("urlab_client.client")
 
 _OFF_S = 1.0
 

@@ -19,7 +19,7 @@ from urlab_client.protocol.pixels import Pixels
 
 __all__ = ["LatestPicture", "LiveState", "LiveStats"]
 
-log = logging.getLogger("urlab_client.streams")
+log: logging.Logger = logging.getLogger("urlab_client.streams")
 
 _RETRY_S = 0.002
 
@@ -51,7 +51,7 @@ class LiveState(MessageHandler):
     """
 
     def __init__(self, source: StateSource, absorb: Callable[[StateSnapshot], None], lock: RLock) -> None:
-        self.stats = LiveStats()
+        self.stats: LiveStats = LiveStats()
         self._source = source
         self._absorb = absorb
         self._lock = lock

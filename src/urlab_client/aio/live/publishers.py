@@ -85,11 +85,11 @@ class Publishers:
         memory: SharedMemoryRegions | None = None,
     ) -> None:
         self.default_timeout = default_timeout
-        self.subscriptions = Subscriptions(keys)
-        self.events = EventBus()
+        self.subscriptions: Subscriptions = Subscriptions(keys)
+        self.events: EventBus = EventBus()
         self.camera_switch: CameraSwitch | None = None
-        self.own_steps = OwnSteps()
-        self.regions = None if memory is None else Regions(memory, self.subscriptions)
+        self.own_steps: OwnSteps = OwnSteps()
+        self.regions: Regions | None = None if memory is None else Regions(memory, self.subscriptions)
         self._rpc_endpoint = rpc_endpoint
         self._state_port = state_port
         self._live = live

@@ -43,7 +43,7 @@ class RowSource(PublishedSource):
     """
 
     name = "row_stream"
-    unreachable = StateSource.unreachable
+    unreachable: str = StateSource.unreachable
     silent = (
         "Rows come in live mode only: client.runtime.set_mode('live'); paused they repeat. Component names are the "
         "engine's, not always the compiled ones."
@@ -61,7 +61,7 @@ class RowSource(PublishedSource):
     ) -> None:
         super().__init__(subscriptions)
         self._endpoint = endpoint
-        self.articulations = frozenset(articulations)
+        self.articulations: frozenset[str] = frozenset(articulations)
         self._components = frozenset(collection("components", components))
         self._kinds = frozenset(TopicKind(kind) for kind in collection("kinds", kinds))
         if not self._kinds:

@@ -24,7 +24,7 @@ from urlab_client.protocol.pixels import PictureStamp, picture_stamp
 
 __all__ = ["StepStreams"]
 
-log = logging.getLogger("urlab_client.client")
+log: logging.Logger = logging.getLogger("urlab_client.client")
 
 _OPENING_S: Final = 2.0
 """How long the first step waits until a camera streams and the connection to it stands."""

@@ -52,9 +52,9 @@ class MirroredEntity:
     def __init__(self, mirror: Mirror, name: str) -> None:
         self.mirror = mirror
         self.name = name
-        self.body_id = -1
+        self.body_id: int = -1
         self.free_joint: str | None = None
-        self.has_free_base = False
+        self.has_free_base: bool = False
         self.qpos_offset: int | None = None
         self.qvel_offset: int | None = None
         self.pose: EntityState | None = None
@@ -155,7 +155,7 @@ class MirroredArticulation(MirroredEntity):
     def __init__(self, mirror: Mirror, info: ArticulationInfo, layout: ArticulationLayout) -> None:
         super().__init__(mirror, info.prefix)
         self.controller: ControllerInfo | None = None
-        self.control_mode = ControlMode.RAW
+        self.control_mode: ControlMode = ControlMode.RAW
         self.ctrl: Floats = np.zeros(0)
         self._written_ctrl: Floats = np.zeros(0)
         self._driven = False
@@ -188,7 +188,7 @@ class MirroredArticulation(MirroredEntity):
         self.user = {}
         self.bodies: dict[str, BodyPose] | None = None
         self.twist: TwistState | None = None
-        self.actions = 0
+        self.actions: int = 0
 
     def _bind_controller(self, info: ControllerInfo | None) -> None:
         before = self.controller
@@ -203,8 +203,8 @@ class MirroredArticulation(MirroredEntity):
 
     def _bind_root(self) -> None:
         model, layout = self.mirror.model, self.layout
-        self.body_id = layout.root_body
-        self.has_free_base = layout.free_joint >= 0
+        self.body_id: int = layout.root_body
+        self.has_free_base: bool = layout.free_joint >= 0
         self.free_joint = self.qpos_offset = self.qvel_offset = None
         if model is not None and self.has_free_base:
             name = next(name for name, i in layout.joints.items() if i == layout.free_joint)

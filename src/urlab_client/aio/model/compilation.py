@@ -25,7 +25,7 @@ from urlab_client._mjcf_files import NamedFiles, named_files
 
 __all__ = ["compile_confined"]
 
-log = logging.getLogger("urlab_client.mirror")
+log: logging.Logger = logging.getLogger("urlab_client.mirror")
 
 _MEMORY_BYTES: Final = 2 * 2**30
 _CPU_S: Final = 30

@@ -79,16 +79,16 @@ class Actuator:
         kv: float | None = None,
     ) -> None:
         self._record = record
-        self.name = name
-        self.id = id
-        self.type = type
-        self.ctrl_local = ctrl_local
+        self.name: str = name
+        self.id: int = id
+        self.type: ActuatorType | str | None = type
+        self.ctrl_local: slice = ctrl_local
         self._first_out = first_out
-        self.joint = joint
-        self.ctrlrange = ctrlrange
-        self.forcerange = forcerange
-        self.kp = kp
-        self.kv = kv
+        self.joint: str | None = joint
+        self.ctrlrange: tuple[float, float] | None = ctrlrange
+        self.forcerange: tuple[float, float] | None = forcerange
+        self.kp: float | None = kp
+        self.kv: float | None = kv
 
     @property
     def force(self) -> float | None:
@@ -230,14 +230,14 @@ class Joint:
         range: tuple[float, float] | None,  # noqa: A002
     ) -> None:
         self._record = record
-        self.name = name
-        self.id = id
-        self.jnt_type = jnt_type
-        self.qpos_offset = qpos_offset
-        self.qpos_local_offset = qpos_local_offset
-        self.qvel_offset = qvel_offset
-        self.qvel_local_offset = qvel_local_offset
-        self.range = range
+        self.name: str = name
+        self.id: int = id
+        self.jnt_type: int = jnt_type
+        self.qpos_offset: int = qpos_offset
+        self.qpos_local_offset: int = qpos_local_offset
+        self.qvel_offset: int = qvel_offset
+        self.qvel_local_offset: int = qvel_local_offset
+        self.range: tuple[float, float] | None = range
 
     @property
     def kind(self) -> JointKind:
@@ -300,9 +300,9 @@ class Sensor:
 
     def __init__(self, record: MirroredArticulation, *, name: str, id: int, dim: int) -> None:  # noqa: A002
         self._record = record
-        self.name = name
-        self.id = id
-        self.dim = dim
+        self.name: str = name
+        self.id: int = id
+        self.dim: int = dim
 
     @property
     def latest(self) -> Floats | None:
@@ -349,8 +349,8 @@ class Body:
 
     def __init__(self, record: MirroredArticulation, *, name: str, id: int) -> None:  # noqa: A002
         self._record = record
-        self.name = name
-        self.id = id
+        self.name: str = name
+        self.id: int = id
 
     @property
     def xpos(self) -> Floats | None:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Loaded", "Mirror", "model_names", "write_options"]
 
-log = logging.getLogger("urlab_client.mirror")
+log: logging.Logger = logging.getLogger("urlab_client.mirror")
 
 _CHOICES = {
     "integrator": ("mjtIntegrator", "mjINT_"),
@@ -154,10 +154,10 @@ class Mirror:
     """
 
     def __init__(self) -> None:
-        self.lock = threading.RLock()
+        self.lock: threading.RLock = threading.RLock()
         self.model: mujoco.MjModel | None = None
         self.data: mujoco.MjData | None = None
-        self.approximate = False
+        self.approximate: bool = False
         self._stale = False
         self._dragged: int | None = None
 

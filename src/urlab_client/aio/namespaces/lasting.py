@@ -14,7 +14,7 @@ from urlab_client.protocol.types import PIEStartResult, PIEStatus
 
 __all__ = ["Playing", "SceneEdit"]
 
-log = logging.getLogger("urlab_client.client")
+log: logging.Logger = logging.getLogger("urlab_client.client")
 
 
 class Playing:

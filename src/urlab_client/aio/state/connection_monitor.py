@@ -22,7 +22,7 @@ from urlab_client.protocol.topics import STATE_FULL
 
 __all__ = ["ConnectionMonitor"]
 
-log = logging.getLogger("urlab_client.client")
+log: logging.Logger = logging.getLogger("urlab_client.client")
 
 _PROBE_S = 2.0
 _SILENCE_S = 1.0  # while play runs a snapshot comes every 100 ms, in every mode and paused, too

@@ -20,7 +20,7 @@ from urlab_client.protocol.messages.streams import PlayStarted
 
 __all__ = ["Discovery"]
 
-log = logging.getLogger("urlab_client.client")
+log: logging.Logger = logging.getLogger("urlab_client.client")
 
 
 class Discovery:

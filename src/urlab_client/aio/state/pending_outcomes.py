@@ -50,7 +50,7 @@ class PendingOutcomes:
     """
 
     def __init__(self) -> None:
-        self.connects = 0
+        self.connects: int = 0
         self.mode: StepMode | str | None = None
         self.paused = False
         self.play = False
@@ -61,9 +61,11 @@ class PendingOutcomes:
 
     def clear(self) -> None:
         """Forget steps and resets: a reply told the state."""
-        self.steps = self.since = 0
-        self.time = 0.0
-        self.queued = self.reset = False
+        self.steps: int = 0
+        self.since: int = 0
+        self.time: float = 0.0
+        self.queued: bool = False
+        self.reset: bool = False
         self.keyframe: str | None = None
         self.carried: list[tuple[int, Carried]] = []
 

@@ -22,7 +22,7 @@ from urlab_client.protocol.names import NameMap
 
 __all__ = ["SceneObjects"]
 
-log = logging.getLogger("urlab_client.client")
+log: logging.Logger = logging.getLogger("urlab_client.client")
 
 # Unreal's actor names: class, then a number or a generated id.
 _ENGINE_NAME = re.compile(r"(?P<stem>.+)_C_(?:\d+|UAID_\w+)")

@@ -77,6 +77,8 @@ class SessionKeeper:
                 await self._look()
             except ClientClosed:
                 return
+            except URLabError as error:
+                log.warning("the session could not be looked after: %s", error)
 
     async def _act_on(self, event: ClientEvent) -> None:
         match event:

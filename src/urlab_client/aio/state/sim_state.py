@@ -49,7 +49,7 @@ from urlab_client.protocol.types import SimOptions
 
 __all__ = ["SimState"]
 
-log = logging.getLogger("urlab_client.client")
+log: logging.Logger = logging.getLogger("urlab_client.client")
 
 # By the server's clock. More than this means that the clock was set, not that a message was overtaken.
 _OVERTAKEN_S = 1.0
@@ -100,31 +100,33 @@ class SimState:
     ) -> None:
         self.session = session
         self.publishers = publishers
-        self.step_streams = StepStreams(publishers)
-        self.mirror = Mirror()
-        self.objects = SceneObjects(session, publishers, self.mirror, motion)
+        self.step_streams: StepStreams = StepStreams(publishers)
+        self.mirror: Mirror = Mirror()
+        self.objects: SceneObjects = SceneObjects(session, publishers, self.mirror, motion)
         self.wanted_mode = wanted_mode
         self._mode = StepMode.LIVE
-        self.mode_assumed = False
+        self.mode_assumed: bool = False
         self._live = LiveState(publishers.state(), self._absorb_live, self.mirror.lock)
         self.promoted_from: StepMode | str | None = None
         self.mode_word = ""
         self.level = "standard"
-        self.paused = False
-        self.sent_level = "standard"
+        self.paused: bool = False
+        self.sent_level: str = "standard"
         self.hello: HelloOk | None = None
-        self.step_count = 0
+        self.step_count: int = 0
         self.reset_seed: int | None = None
-        self.sim_time = 0.0
-        self.sim_time_sec = self.sim_time_nsec = 0
-        self.wall_time_sec = self.wall_time_nsec = 0
-        self.recv_wall_time_ns = 0
+        self.sim_time: float = 0.0
+        self.sim_time_sec: int = 0
+        self.sim_time_nsec: int = 0
+        self.wall_time_sec: int = 0
+        self.wall_time_nsec: int = 0
+        self.recv_wall_time_ns: int = 0
         self.user: dict[str, Any] = {}
         session.on_opened = self._note_session
         session.on_refusal = self._note_refusal
         session.control.resolve = self._articulation_key
         self._live_pictures = live_pictures
-        self.pending = PendingOutcomes()
+        self.pending: PendingOutcomes = PendingOutcomes()
         self.on_adopted: Callable[[], None] | None = None
         self.switching_play = False
         self.observers: tuple[ClientObserver, ...] = ()  # replaced, never changed: from any thread

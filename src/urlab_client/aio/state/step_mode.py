@@ -18,7 +18,7 @@ from urlab_client.protocol.messages.runtime import SetMode, SetModeOk, SetPaused
 __all__ = ["ask_mode", "promote", "settle_mode", "stopped_live"]
 
 
-log = logging.getLogger("urlab_client.client")
+log: logging.Logger = logging.getLogger("urlab_client.client")
 
 
 async def ask_mode(state: SimState, turn: Turn, mode: StepMode | str) -> StepMode | str:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["StepPictures"]
 
-log = logging.getLogger("urlab_client.client")
+log: logging.Logger = logging.getLogger("urlab_client.client")
 
 _BLOCKING_S: Final = 3.0  # an alpha waits up to 2 s + 1 s for each picture
 _RENDER_S: Final = 5.0

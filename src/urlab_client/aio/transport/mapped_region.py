@@ -17,7 +17,7 @@ from pathlib import Path
 from urlab_client._windows import NamedLock
 from urlab_client.protocol.errors import ProtocolError
 from urlab_client.protocol.fence import processor_fence
-from urlab_client.protocol.shm import HEADER_SIZE, LAYOUT_SIZE, RegionNotReady, attach
+from urlab_client.protocol.shm import HEADER_SIZE, LAYOUT_SIZE, Region, RegionNotReady, attach
 
 if sys.platform != "win32":
     import fcntl
@@ -79,7 +79,7 @@ class MappedRegion:
         access = mmap.ACCESS_WRITE if writable else mmap.ACCESS_READ
         self._mmap = mmap.mmap(self._fd, self._size, access=access)
         try:
-            self.region = attach(memoryview(self._mmap), fence=processor_fence())
+            self.region: Region = attach(memoryview(self._mmap), fence=processor_fence())
         except ProtocolError as error:
             raise type(error)(f"{self.path}: {error.args[0]}") from None
         self._layout = self._mmap[:LAYOUT_SIZE]

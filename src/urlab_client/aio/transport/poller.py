@@ -21,7 +21,7 @@ from urlab_client.protocol import doorbell
 
 __all__ = ["Doorbell", "Poller", "RegionPoll", "ReplyPoll", "StreamPoll"]
 
-log = logging.getLogger("urlab_client.transport")
+log: logging.Logger = logging.getLogger("urlab_client.transport")
 
 _LINGER_S = 1.0
 _BLOCK_S = 0.05
@@ -47,7 +47,7 @@ class RegionPoll:
         self.probe = probe
         self.notify = notify
         self.block = block
-        self.told = False
+        self.told: bool = False
         self._since = time.monotonic()
 
     def resume(self) -> None:

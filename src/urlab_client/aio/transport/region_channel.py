@@ -63,17 +63,19 @@ class RegionChannel:
     """
 
     def __init__(self, requests: Path, replies: Path, events: tuple[str, str]) -> None:
-        self.requests = MappedRegion(requests, writable=True, exclusive=True)
+        self.requests: MappedRegion = MappedRegion(requests, writable=True, exclusive=True)
         try:
-            self.replies = MappedRegion(replies)
+            self.replies: MappedRegion = MappedRegion(replies)
         except BaseException:
             self.requests.close()
             raise
-        self.limit = min(self.requests.region.max_payload, self.replies.region.max_payload)
-        self._request_event, self.reply_event = map(NamedEvent, events)
+        self.limit: int = min(self.requests.region.max_payload, self.replies.region.max_payload)
+        request_event, reply_event = events
+        self._request_event = NamedEvent(request_event)
+        self.reply_event: NamedEvent = NamedEvent(reply_event)
         # A client that died here may have left a request behind whose reply is still to come.
-        self.dirty = True
-        self.seen = 0
+        self.dirty: bool = True
+        self.seen: int = 0
         self._token = ""
         self._asked_at = 0.0
 

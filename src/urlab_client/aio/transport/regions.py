@@ -33,7 +33,7 @@ from urlab_client.protocol.shm import Publication
 
 __all__ = ["Place", "Regions", "SharedPicture"]
 
-log = logging.getLogger("urlab_client.streams")
+log: logging.Logger = logging.getLogger("urlab_client.streams")
 
 T = TypeVar("T")
 
@@ -95,13 +95,13 @@ class _RegionReader:
     """One mapped region and those it feeds."""
 
     def __init__(self, path: Path, place: Place) -> None:
-        self.mapping = MappedRegion(path)
+        self.mapping: MappedRegion = MappedRegion(path)
         self.place = place
         self.handlers: dict[MessageHandler, None] = {}
         self.watch: StreamPoll | None = None
         self.silent = False
-        self.seen = 0
-        self.changed_at = 0.0
+        self.seen: int = 0
+        self.changed_at: float = 0.0
         # Pictures are read from whatever thread looks at them.
         self._lock = threading.Lock()
         self._closed = False

@@ -16,7 +16,7 @@ from urlab_client.protocol.shm import REPLY_FILE, REQUEST_FILE, region_directori
 
 __all__ = ["SharedMemoryRegions"]
 
-log = logging.getLogger("urlab_client.transport")
+log: logging.Logger = logging.getLogger("urlab_client.transport")
 
 
 class SharedMemoryRegions:

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from urlab_client.aio.transport.base import LateReply, RequestTransport
+from urlab_client.aio.transport.base import LateReply, RequestTransport, TransportStats
 from urlab_client.aio.transport.busy_poll import BusyPoll
 from urlab_client.aio.transport.delivery import deliver
 from urlab_client.aio.transport.mapped_region import RegionInUse
@@ -37,7 +37,7 @@ from urlab_client.protocol.shm import REPLY_FILE, REQUEST_FILE, RegionNotReady
 
 __all__ = ["ShmTransport"]
 
-log = logging.getLogger("urlab_client.transport")
+log: logging.Logger = logging.getLogger("urlab_client.transport")
 
 # Replies that grow with what happens in the scene, whatever size they had before.
 _UNBOUNDED = frozenset({"hello", "meta", "get_contacts", "list_keyframes", "replay_list_sessions"})
@@ -81,7 +81,7 @@ class ShmTransport:
 
     def __init__(self, inner: RequestTransport, memory: SharedMemoryRegions) -> None:
         self.on_event: Callable[[ClientEvent], None] | None = None
-        self.stats = inner.stats
+        self.stats: TransportStats = inner.stats
         self._inner = inner
         self._memory = memory
         inner.on_event = self._on_event

@@ -31,7 +31,7 @@ from urlab_client.protocol.layouts import BytesLike
 
 __all__ = ["ConnectionStatus", "MessageGone", "MessageHandler", "Subscription", "Subscriptions", "client_closed"]
 
-log = logging.getLogger("urlab_client.transport")
+log: logging.Logger = logging.getLogger("urlab_client.transport")
 
 # Set before connecting. These queues fill only while the loop is blocked: a backlog of small messages is worth
 # keeping for streams that want all, and is skimmed in milliseconds by those that want the newest. Pictures are large.
@@ -298,7 +298,7 @@ class Subscriptions:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._subscribers: dict[tuple[str, bool], _Subscriber] = {}
         self._attached: dict[MessageHandler, tuple[Subscription, Callable[[], Subscription]]] = {}
-        self.closed = False
+        self.closed: bool = False
 
     def attach(self, handler: MessageHandler, wanted: Callable[[], Subscription]) -> None:
         """Let `handler` have what `wanted` describes, which `refresh` asks again.

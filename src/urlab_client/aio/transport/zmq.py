@@ -49,7 +49,7 @@ from urlab_client.protocol.messages.streams import (
 
 __all__ = ["ZmqTransport"]
 
-log = logging.getLogger("urlab_client.transport")
+log: logging.Logger = logging.getLogger("urlab_client.transport")
 
 # Plain numbers: each operation on the enumerations costs about a microsecond, and a request takes a dozen.
 _NOBLOCK = int(zmq.NOBLOCK)
@@ -64,6 +64,7 @@ _SPIN_S = 150e-6
 _LONGEST_SPIN_S = 500e-6
 
 _Send = Callable[[bytes, int], None]
+_Get = Callable[[int], int]
 
 _CERTAIN = 3  # a server that is just ending breaks a handshake off once; one with another key always does
 
@@ -107,12 +108,13 @@ class ZmqTransport:
         self._waiting: set[asyncio.Future[None]] = set()
         self._last_id = 0
         self._send: _Send | None = None
+        self._get: _Get | None = None
         self._connected = False
         self._closed = False
         self._obstacle = connection_status.UNANSWERED
         self._attempts = connection_status.Attempts(0.0)
-        self.lost_at = 0.0
-        self.refused = False
+        self.lost_at: float = 0.0
+        self.refused: bool = False
         self._silent_since: float | None = None
         self._retrying = False
         self.on_event: Callable[[ClientEvent], None] | None = None
@@ -132,11 +134,13 @@ class ZmqTransport:
         """Whether a server is on the line."""
         return self._connected
 
-    async def request(
+    async def request(  # noqa: PLR0912  # each call between a step and its socket costs every step
         self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
     ) -> bytes:
         """See `RequestTransport.request`."""
-        loop, socket, replies, send = self._open()
+        loop, send, get = self._loop, self._send, self._get
+        if loop is None or send is None or get is None or asyncio._get_running_loop() is not loop:  # noqa: SLF001
+            loop, send, get = self._open()
         while True:
             if not self._connected:
                 await self._wait_connected(loop, op, connect_by)
@@ -166,11 +170,11 @@ class ZmqTransport:
         try:
             if awake:
                 await self._busy_poll.look(op.name, reply, self._look)
-            elif cast("int", socket.get(_EVENTS)) & _POLLIN:
+            elif get(_EVENTS) & _POLLIN:
                 # Sending may have consumed the descriptor's edge.
                 loop.call_soon(self._on_readable)
-            if not reply.done():
-                replies.expect()
+            if not reply.done() and self._replies is not None:
+                self._replies.expect()
             answer = await reply
         except (asyncio.CancelledError, URLabTimeoutError):
             if late is not None:
@@ -195,6 +199,7 @@ class ZmqTransport:
         if self._closed:
             return
         self._closed = True
+        self._send = self._get = None
         self._connected = False
         closed = ClientClosed(f"The client of {self._endpoint} was closed.", hint="Make a new client.")
         self._fail_sent(lambda _: closed)
@@ -211,12 +216,12 @@ class ZmqTransport:
         self._socket.close(linger=0)
         shared_context.give_back(self._context)
 
-    def _open(self) -> tuple[asyncio.AbstractEventLoop, zmq.Socket[bytes], Readiness, _Send]:
+    def _open(self) -> tuple[asyncio.AbstractEventLoop, _Send, _Get]:
         if self._closed:
             raise ClientClosed(f"The client of {self._endpoint} is closed.", hint="Make a new client.")
         loop = running_loop(self._loop)
-        if self._socket is not None and self._replies is not None and self._send is not None:
-            return loop, self._socket, self._replies, self._send
+        if self._send is not None and self._get is not None:
+            return loop, self._send, self._get
         context = shared_context.borrow()
         socket = context.socket(zmq.DEALER)
         connection_status.configure(socket)
@@ -239,8 +244,9 @@ class ZmqTransport:
         self._events = watch_socket(loop, monitor, self._on_event)
         self._replies = watch_socket(loop, socket, self._on_readable, awaited=self._awaited)
         loop.call_soon(self._on_event)
-        self._send = cast("_Send", super(zmq.Socket, socket).send)  # without the wrapper's arguments for other sockets
-        return loop, socket, self._replies, self._send
+        send = self._send = cast("_Send", super(zmq.Socket, socket).send)  # without the wrapper's other arguments
+        get = self._get = cast("_Get", socket.get)
+        return loop, send, get
 
     def _reply_to_come(self, key: bytes, reply: asyncio.Future[bytes]) -> asyncio.Future[bytes]:
         """Return what becomes of a request that its caller no longer waits for."""
@@ -322,8 +328,7 @@ class ZmqTransport:
 
     def _look(self) -> None:
         """Take what is there, where nothing has told that anything is."""
-        socket = self._socket
-        if socket is not None and not self._closed and cast("int", socket.get(_EVENTS)) & _POLLIN:
+        if self._get is not None and self._get(_EVENTS) & _POLLIN:
             self._take()
 
     def _on_readable(self) -> None:
@@ -340,10 +345,10 @@ class ZmqTransport:
 
     def _receive(self) -> tuple[asyncio.Future[bytes], bytes] | None:
         """Read until nothing is left that anybody waits for; return the last one who waits, and the reply."""
-        socket = self._socket
-        if socket is None or self._closed:
+        socket, get = self._socket, self._get
+        if socket is None or get is None:  # it has been closed
             return None
-        receive, get = socket.recv, cast("Callable[[int], int]", socket.get)
+        receive = socket.recv
         while True:
             try:
                 key = receive(_NOBLOCK)

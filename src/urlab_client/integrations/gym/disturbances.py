@@ -59,7 +59,8 @@ class Disturbances:
         Args:
             rng: The environment's generator, which the seed comes from.
         """
-        seed = self.seed = int(rng.integers(_SEED_END))
+        self.seed: int = int(rng.integers(_SEED_END))
+        seed = self.seed
         declared = self._declaration
         self._pushes = [_PushSchedule(push, stream(seed, _PUSH, i)) for i, push in enumerate(declared.push)]
         self._noises = []

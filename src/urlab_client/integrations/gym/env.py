@@ -133,11 +133,11 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
             task=task,
             randomise=None if randomise is None else Randomisation.of(randomise),
         )
-        self.randomise = self._episode.randomise
+        self.randomise: Randomisation | None = self._episode.randomise
         n_task = 0 if task is None else task.n_observed
         self._disturbances = None if self.randomise is None else Disturbances(self.randomise, self.mapping, n_task)
-        self.action_space = self.mapping.action_space
-        self.observation_space = self._episode.observation_space
+        self.action_space: gymnasium.Space[Any] = self.mapping.action_space
+        self.observation_space: gymnasium.Space[Any] = self._episode.observation_space
         model = client.model
         self.metadata = {
             **self.metadata,

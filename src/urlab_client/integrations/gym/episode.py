@@ -102,13 +102,13 @@ class EnvEpisode:
         self.frames: dict[str, Pixels] = {}
         self._model = model
         fields = fields_of(settings.observations)
-        self.mapping = SpaceMapping(
+        self.mapping: SpaceMapping = SpaceMapping(
             model, compiled_prefixes(client), fields, settings.space_mode, settings.articulations
         )
         cameras = settings.cameras
         self._sensors = {key: [*self.mapping.layout(key).sensors] for key in self.mapping.keys}
         minimal = set(fields) <= set(LEVELS["minimal"])
-        self.observation_space = self._with_cameras(cameras)
+        self.observation_space: Space = self._with_cameras(cameras)
         self._observed_cameras = tuple(cameras)
         self._level = ObservationLevel.MINIMAL if minimal else ObservationLevel.STANDARD
         self._cameras = {name: client_camera(client, name) for name in (*cameras, *rendered)}
@@ -117,7 +117,7 @@ class EnvEpisode:
         self._keyframe = settings.keyframe
         self._task = task
         self._goal: dict[str, Floats] = {}
-        self.randomise = _in_force(client, model, randomise)
+        self.randomise: Randomisation | None = _in_force(client, model, randomise)
         layouts = {key: self.mapping.layout(key) for key in self.mapping.keys}
         self._variation = variation_of(client, model, layouts)
         latencies = () if self.randomise is None else self.randomise.camera

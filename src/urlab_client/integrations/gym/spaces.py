@@ -82,13 +82,13 @@ class SpaceMapping:
             raise ValueError(f"observations must be one or more of {', '.join(FIELDS)}, not {list(fields)!r}")
         if mode not in get_args(SpaceMode):
             raise ValueError(f"space_mode must be 'flat' or 'dict', not {mode!r}")
-        self.keys = tuple(prefixes)
-        self.observed = self.keys if observed is None else tuple(observed)
+        self.keys: tuple[str, ...] = tuple(prefixes)
+        self.observed: tuple[str, ...] = self.keys if observed is None else tuple(observed)
         if missing := set(self.observed) - set(self.keys):
             raise ValueError(
                 f"no articulation {', '.join(sorted(missing))} to observe; there are: {', '.join(self.keys)}"
             )
-        self.fields = tuple(fields)
+        self.fields: tuple[Field, ...] = tuple(fields)
         self.mode: SpaceMode = mode
         layouts = articulation_layouts(model, prefixes)
         self._parts = {key: _part(model, layout) for key, layout in layouts.items()}
@@ -97,8 +97,8 @@ class SpaceMapping:
         self._n_actions = ends[-1]
         self._driven = tuple(key for key, part in self._parts.items() if len(part.low))
         self._actions = {key: slice(a, b) for key, a, b in zip(self._parts, [0, *ends], ends, strict=False)}
-        self.action_space = self._make_action_space()
-        self.observation_space = self._make_observation_space()
+        self.action_space: Space = self._make_action_space()
+        self.observation_space: Space = self._make_observation_space()
 
     def layout(self, key: str) -> ArticulationLayout:
         """Return where an articulation's values live in the compiled model."""

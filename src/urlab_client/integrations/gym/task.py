@@ -43,7 +43,7 @@ class TaskScene:
     def __init__(self, model: mujoco.MjModel, mapping: SpaceMapping) -> None:
         self.model = model
         self.mapping = mapping
-        self.data = mujoco.MjData(model)
+        self.data: mujoco.MjData = mujoco.MjData(model)
         self._ids: dict[str, dict[str, int]] = {}
 
     def id(self, kind: str, name: str) -> int:
@@ -141,7 +141,9 @@ class States:
         self.qpos = qpos
         self.qvel = qvel
         self.time = time
-        self.goal = {name: np.array([goal[name] for goal in goals]) for name in goals[0]}
+        self.goal: dict[str, NDArray[np.float64]] = {
+            name: np.array([goal[name] for goal in goals]) for name in goals[0]
+        }
 
     def __len__(self) -> int:
         return len(self.qpos)

@@ -71,9 +71,10 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         self._disturbances: list[Disturbances] = []
         if randomise is not None:
             self._disturbances = [Disturbances(randomise, mapping, n_task) for _ in range(num_envs)]
+        self._blurred = randomise is not None and randomise.disturbs_observations
         self.task = task
         self.num_envs = num_envs
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.autoreset_mode: AutoresetMode = AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.single_observation_space = observation_space
         self.single_action_space = mapping.action_space
@@ -83,7 +84,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         self.termination_fn = termination_fn
         self._max_episode_steps = max_episode_steps
         self._observations: Observation = create_empty_array(observation_space, num_envs)
-        self._sensed: Observation = create_empty_array(observation_space, num_envs) if self._disturbances else None
+        self._sensed: Observation = create_empty_array(observation_space, num_envs) if self._blurred else None
         self._elapsed = np.zeros(num_envs, dtype=np.int64)
         self._ended = np.ones(num_envs, dtype=bool)
         self._started = False
@@ -226,7 +227,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         ended = self._ended.copy()
         final = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(ended):
-            final[i] = _pick(self._sensed if self._disturbances else self._observations, int(i))
+            final[i] = _pick(self._sensed if self._blurred else self._observations, int(i))
         errors = self._start(np.flatnonzero(ended))
         after = self._infos({**_errors_in(infos), **errors})
         return {**after, "final_obs": final, "_final_obs": ended, "final_info": infos, "_final_info": ended}
@@ -252,19 +253,19 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
 
     def _told(self) -> Observation:
         """Return the observations as they are seen."""
-        return _map(np.copy, self._sensed if self._disturbances else self._observations)
+        return _map(np.copy, self._sensed if self._blurred else self._observations)
 
     def _begin(self, indices: Indices) -> None:
         for i, disturbances in self._disturbed(indices):
             disturbances.begin(self._rngs[i])
 
     def _see(self, indices: Indices) -> None:
-        for i, disturbances in self._disturbed(indices):
+        for i, disturbances in self._disturbed(indices) if self._blurred else ():
             _put(self._sensed, i, disturbances.seen(_pick(self._observations, i)))
 
     def _delayed(self, indices: Indices, actions: Any) -> Any:
         """Return the actions that have effect now; those of other environments are left as they are."""
-        if not self._disturbances:
+        if self.randomise is None or not self.randomise.delays_actions:
             return actions
         delayed = _map(np.array, actions)
         for i, disturbances in self._disturbed(indices):
@@ -273,6 +274,8 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
 
     def _forces(self, indices: Indices) -> dict[int, dict[str, Floats]]:
         """Return the pushes during the next action by environment; those without one are left out."""
+        if self.randomise is None or not self.randomise.push:
+            return {}
         pushed = {i: disturbances.forces() for i, disturbances in self._disturbed(indices)}
         return {i: forces for i, forces in pushed.items() if forces}
 

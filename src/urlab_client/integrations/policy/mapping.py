@@ -191,14 +191,16 @@ class PolicyMapping:
                 f"{source}: the joints of {self._robot!r} are not known.",
                 hint="Make the client with local_model=True and call discover() during play.",
             )
-        self.joints = self._joints(robot, spec.action.joints, "action.joints")
-        self.actuators = [_actuator(robot, joint, source) for joint in self.joints]
-        self.ctrl = np.array([actuator.ctrl_local.start for actuator in self.actuators], dtype=np.intp)
-        self.action_size = len(self.joints)
+        self.joints: list[Joint] = self._joints(robot, spec.action.joints, "action.joints")
+        self.actuators: list[Actuator] = [_actuator(robot, joint, source) for joint in self.joints]
+        self.ctrl: NDArray[np.intp] = np.array(
+            [actuator.ctrl_local.start for actuator in self.actuators], dtype=np.intp
+        )
+        self.action_size: int = len(self.joints)
         self._qpos, self._qvel = _offsets(self.joints)
         self._scale, self._offset = _array(spec.action.scale), _array(spec.action.offset)
         self._terms: list[tuple[_Read, Term]] = []
-        self.observation_size = 0
+        self.observation_size: int = 0
         for index, term in enumerate(spec.observation):
             where = f"observation[{index}]"
             size, read = self._term(robot, term, where)

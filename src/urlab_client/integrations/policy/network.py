@@ -62,8 +62,8 @@ class OnnxNetwork:
                 )
         self._input = ends["input"][0].name
         self._batched = len(ends["input"][0].shape) == 2
-        self.inputs = _width(ends["input"][0].shape)
-        self.outputs = _width(ends["output"][0].shape)
+        self.inputs: int | None = _width(ends["input"][0].shape)
+        self.outputs: int | None = _width(ends["output"][0].shape)
 
     def __call__(self, observation: Floats, /) -> Floats:
         """See `Network`."""

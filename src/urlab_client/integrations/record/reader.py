@@ -233,7 +233,7 @@ class Run:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.damage = ""
+        self.damage: str = ""
 
     def summary(self, progress: Callable[[int], None] | None = None) -> Summary:
         """Say what is in it.

@@ -23,7 +23,7 @@ from urlab_client.sync.client import URLabClient
 
 __all__ = ["AsyncRecorder", "Recorder", "record"]
 
-log = logging.getLogger("urlab_client.record")
+log: logging.Logger = logging.getLogger("urlab_client.record")
 
 _MIB = 1 << 20
 _LIVE_ITEMS = 10_000

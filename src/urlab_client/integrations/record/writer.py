@@ -43,7 +43,7 @@ from urlab_client.protocol.serializable import Serializable
 
 __all__ = ["FORMAT", "RecorderStats", "RecordingError", "WriterOptions", "WriterThread"]
 
-log = logging.getLogger("urlab_client.record")
+log: logging.Logger = logging.getLogger("urlab_client.record")
 
 FORMAT = "1"
 """Version of what is in a recording."""

@@ -30,7 +30,7 @@ from urlab_client.sync.client import URLabClient
 
 __all__ = ["AsyncView", "Moment", "View", "ViewBackend", "ViewOptions", "ViewStats", "make_view"]
 
-log = logging.getLogger("urlab_client.view")
+log: logging.Logger = logging.getLogger("urlab_client.view")
 
 _NS = 1_000_000_000
 

@@ -194,8 +194,7 @@ class StepOk(StateReply, tag="step_ok", kw_only=True, omit_defaults=True):
 
     def __post_init__(self) -> None:
         """See the base class."""
-        if self.arts is not None:
-            self.per_articulation = self.arts
+        super().__post_init__()
         if self.scene is not None:
             self.entities = self.scene
 

@@ -47,7 +47,7 @@ from urlab_client.server.system.temporary_folder import sweep, working_in
 
 __all__ = ["ContentRoot"]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 UPLOADED: Final = "uploaded"
 """In place of the source of a blueprint that came over the wire."""
@@ -71,8 +71,8 @@ class ContentRoot:
             limits: For what clients name.
         """
         self.limits = limits
-        self.root = saved_dir.resolve()
-        self.model_roots = tuple(root.resolve() for root in model_roots)
+        self.root: Path = saved_dir.resolve()
+        self.model_roots: tuple[Path, ...] = tuple(root.resolve() for root in model_roots)
         self._blueprints: dict[str, Blueprint] = {}
         sweep(self.root / IMPORTS, f"*/{_UNDER_WAY}*", f"{_UNDER_WAY}*")
         for record in sorted(self.root.glob(f"{IMPORTS}/*/blueprint.json")):

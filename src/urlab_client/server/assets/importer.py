@@ -23,7 +23,7 @@ from urlab_client.server.limits import Limits
 
 __all__ = ["Compiled", "build_snapshot", "mujoco_messages", "named_kinds", "one_line"]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 DEFAULT_MODEL_NAMES: Final = frozenset({"", "MuJoCo Model"})
 """What MuJoCo calls a model whose file gives no name."""
@@ -104,7 +104,7 @@ def build_snapshot(file: Path, snapshot: Path, limits: Limits) -> tuple[Compiled
     return compiled, model
 
 
-_hook_lock = threading.Lock()
+_hook_lock = threading.RLock()  # blocks may be nested: the inner one collects
 
 
 @contextlib.contextmanager

@@ -29,7 +29,7 @@ from urlab_client.server.system.atomic_write import write_atomic
 
 __all__ = ["LevelError", "read_level", "write_level"]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 FORMAT: Final = "urlab-level"
 VERSION: Final = 1

@@ -33,7 +33,7 @@ from urlab_client.server.limits import Limits
 
 __all__ = ["CompiledScene", "compile_scene", "saved_model"]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 _DEFAULT_LIMITS: Final = Limits()
 
@@ -76,7 +76,8 @@ class CompiledScene:
     @cached_property
     def _attached(self) -> tuple[str, dict[str, bytes]]:
         with mujoco_messages():
-            return attached_scene(self.spec, self.actors) or self._flat
+            attached = attached_scene(self.spec, self.actors)
+        return attached or self._flat
 
     @cached_property
     def _flat(self) -> tuple[str, dict[str, bytes]]:

@@ -29,7 +29,7 @@ class LevelActors:
         Args:
             naming: How articulations are named: `model` after the MJCF's model name, `plugin` as the plugin does.
         """
-        self.selected = ""
+        self.selected: str = ""
         self._naming = naming
         self._actors: dict[str, Actor] = {}
 

@@ -39,7 +39,7 @@ class Levels:
         self._content = content
         self._actors = actors
         self._playing = playing
-        self.package = UNTITLED
+        self.package: str = UNTITLED
         self.external: dict[str, Path] = {}
 
     def create(self, name: str, *, force_overwrite: bool = False) -> str:

@@ -21,7 +21,7 @@ from urlab_client.server.limits import Limits
 
 __all__ = ["MARKER_RADIUS_M", "Arrow", "Box", "DebugLine", "Drawings", "Primitive", "Sphere", "Text"]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 MARKER_RADIUS_M: Final = 0.05
 OVERLAY_S: Final = 10.0

@@ -116,7 +116,7 @@ class Viewport:
     """
 
     def __init__(self) -> None:
-        self.view = _DEFAULT_VIEW
+        self.view: ViewportCamera = _DEFAULT_VIEW
         self.mode = ViewMode.LIT
         self.track: Track | None = None
         self._followed_at: float | None = None

@@ -77,9 +77,9 @@ class EditorWorld:
         self.content = content
         self.pie_running = False
         self._actors = LevelActors(actor_names)
-        self.levels = Levels(content, self._actors, lambda: self.pie_running)
-        self.blueprints = Blueprints(content, self._actors, self.levels)
-        self.quick_convert = QuickConvert(self._actors)
+        self.levels: Levels = Levels(content, self._actors, lambda: self.pie_running)
+        self.blueprints: Blueprints = Blueprints(content, self._actors, self.levels)
+        self.quick_convert: QuickConvert = QuickConvert(self._actors)
         self._frozen: tuple[Actor, ...] = ()
 
     def authored(self) -> object:

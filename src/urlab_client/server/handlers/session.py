@@ -45,7 +45,7 @@ from urlab_client.server.refusal import Refusal
 from urlab_client.server.render.camera_renderer import FRAMES_DEADLINE_S, Film
 from urlab_client.server.rpc.dispatch import handles
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 _PICTURES_WAIT_S: Final = 0.2
 """How long a step waits for its pictures where it does not say."""

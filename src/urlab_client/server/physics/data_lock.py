@@ -74,7 +74,7 @@ class DataLock:
                 physics busy for hours, and no other request may hang for that.
             call: Tells when there is nothing to wait for.
         """
-        self.inner = threading.RLock()
+        self.inner: threading.RLock = threading.RLock()
         self._timeout = timeout
         self._call = call
 

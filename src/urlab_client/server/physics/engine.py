@@ -37,7 +37,7 @@ from urlab_client.server.system.health import Health
 
 __all__ = ["Engine"]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 T = TypeVar("T")
 
@@ -98,13 +98,15 @@ class Engine:
         self.scene = scene
         self.dialect = dialect
         self._call = MujocoCall(max(step_timeout_s, LEAST_PATIENCE_S))
-        self.lock = DataLock(step_timeout_s, self._call)
+        self.lock: DataLock = DataLock(step_timeout_s, self._call)
         self.on_tick: list[Hook] = []
         self.seed: int | None = None
         self._model = scene.model
         self._data = scene.data
-        self.articulations = Articulations(scene, controllers, dialect)
-        self.variation = None if randomise is None else SceneVariation(scene, randomise, self.articulations)
+        self.articulations: Articulations = Articulations(scene, controllers, dialect)
+        self.variation: SceneVariation | None = (
+            None if randomise is None else SceneVariation(scene, randomise, self.articulations)
+        )
         self._thread = PhysicsThread(
             scene.model,
             self.lock,
@@ -122,7 +124,7 @@ class Engine:
         self._mode = self._pinned or StepMode.LIVE
         self._paused = paused
         self._step_count = 0
-        self.snapshots = Snapshots()
+        self.snapshots: Snapshots = Snapshots()
         self._live_pushed: list[int] = []
         self._fault: str | None = None
         self._player: Player | None = None

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 __all__ = ["Hook", "Snapshots", "call_hooks"]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 Hook = Callable[[], None]
 

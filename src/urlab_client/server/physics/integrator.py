@@ -58,7 +58,7 @@ class Integrator:
         self._variation = variation
         self._call = call
         self._stopping = stopping
-        self.substep_s = math.inf
+        self.substep_s: float = math.inf
         self.on_substep: list[Hook] = []
 
     def advance(self, n_steps: int, raw: Container[ArticulationControl]) -> None:

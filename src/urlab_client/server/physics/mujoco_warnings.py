@@ -10,7 +10,7 @@ import mujoco
 
 __all__ = ["mujoco_warnings"]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 
 class _WarningLog:
@@ -46,4 +46,4 @@ class _WarningLog:
             logger.warning("MuJoCo: %s%s", text, f" ({count} times so far)" if count > 1 else "")
 
 
-mujoco_warnings = _WarningLog()
+mujoco_warnings: _WarningLog = _WarningLog()

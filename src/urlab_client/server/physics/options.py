@@ -58,7 +58,7 @@ IN_REPLY: Final = (IN_ORDER[0], *THREADS, *IN_ORDER[1:], *MASKS)
 """All options in the order of the reply."""
 
 _TYPES: Final = get_type_hints(SimOptions)
-OptionsInForce = defstruct(
+OptionsInForce: type[Struct] = defstruct(
     "OptionsInForce", [(name, _TYPES[name], None) for name in IN_REPLY], omit_defaults=True, module=__name__
 )
 """The fields of `SimOptions` in that order."""

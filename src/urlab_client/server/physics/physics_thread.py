@@ -20,7 +20,7 @@ from urlab_client.server.system.thread_join import ended, within
 
 __all__ = ["PhysicsThread"]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 
 class PhysicsThread:
@@ -57,8 +57,8 @@ class PhysicsThread:
         self._fail = fail
         self._give_up = give_up
         self._health = health
-        self.wake = threading.Condition(lock.inner)
-        self.stopping = False
+        self.wake: threading.Condition = threading.Condition(lock.inner)
+        self.stopping: bool = False
         self.death: str | None = None
         self._thread = threading.Thread(target=self._run, name="urlab-physics", daemon=True)
 

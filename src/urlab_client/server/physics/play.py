@@ -32,7 +32,7 @@ from urlab_client.server.render.camera_renderer import CameraRenderer
 
 __all__ = ["Play", "Running"]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 MAX_WAIT_S: Final = 86400.0
 _DEFAULT_LIMITS: Final = Limits()

@@ -33,7 +33,7 @@ __all__ = [
     "joint_name",
 ]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 Floats = NDArray[np.float64]
 
@@ -105,7 +105,7 @@ class LiveRecording:
         """
         self._most_bytes = most_bytes
         self.frames: deque[Frame] = deque()
-        self.max_duration_s = 0.0
+        self.max_duration_s: float = 0.0
         self._data = scene.data
         model = scene.model
         coordinates = np.diff(np.append(model.jnt_qposadr, model.nq))

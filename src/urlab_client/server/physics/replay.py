@@ -29,7 +29,7 @@ from urlab_client.server.physics.recording import (
 
 __all__ = ["Player", "ReplaySessions", "recordings", "replay_folder"]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 _DEFAULT_LIMITS: Final = Limits()
 
@@ -51,7 +51,7 @@ class Player:
             frames: At least one frame.
             relative: Shift free joints so that the first recorded position is where the joint is now.
         """
-        self.total_frames = len(frames)
+        self.total_frames: int = len(frames)
         self._scene = scene
         self._frames = frames
         self._relative = relative
@@ -200,9 +200,9 @@ class ReplaySessions:
             files: The recordings that were there when play started; `scan` loads them.
             limits: Sizes of recordings.
         """
-        self.live = LiveRecording(scene, limits.recording_bytes)
+        self.live: LiveRecording = LiveRecording(scene, limits.recording_bytes)
         self._most = limits.recording_file_bytes
-        self.active = LIVE_SESSION
+        self.active: str = LIVE_SESSION
         self._loaded: dict[str, list[Frame]] = {}
         self._unread = files
 

@@ -38,7 +38,7 @@ from urlab_client.server.system.thread_join import ended
 
 __all__ = ["CameraRenderer", "Exposure", "Film", "Painting", "Shot"]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 Bytes = NDArray[np.uint8]
 Look = Mapping[str, NDArray[Any]]

@@ -79,7 +79,7 @@ class Latency:
         self._random = random.Random(seed)  # noqa: S311 - nothing depends on its being hard to guess
         longest = settings.delay_s + settings.jitter_s
         self._spacing = max(longest / CAPACITY, 1.0 / settings.max_fps if settings.max_fps else 0.0)
-        self.withholds = self._spacing > 0.0
+        self.withholds: bool = self._spacing > 0.0
         keep = before is not None and self.withholds and before.settings.clock == settings.clock
         self.past: deque[Past] = before.past if before is not None and keep else deque()
 

@@ -26,7 +26,7 @@ __all__ = [
     "search_backend",
 ]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 
 _PROBE_DEADLINE_S: Final = 60.0

@@ -36,7 +36,7 @@ __all__ = [
     "showing",
 ]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 SELECTED: Final[Vec3] = (1.0, 0.55, 0.05)
 """Colour of the box around what is selected."""

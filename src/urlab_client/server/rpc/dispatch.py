@@ -28,7 +28,7 @@ from urlab_client.server.system.serving_thread import ServingThread
 
 __all__ = ["HANDLERS", "Dispatcher", "Handler", "HandlerTable", "handles"]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 Q = TypeVar("Q", bound=Request[Any])
 A = TypeVar("A", bound=Reply | bytes)

@@ -18,7 +18,7 @@ from urlab_client.server.system.thread_join import ended
 
 __all__ = ["Watchdog"]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 INTERVAL_S: Final = 0.25
 

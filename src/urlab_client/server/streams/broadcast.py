@@ -32,7 +32,7 @@ from urlab_client.server.transport.shared_memory import SharedMemoryServer
 
 __all__ = ["Broadcast", "Tick", "next_info"]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -122,7 +122,7 @@ class Broadcast:
         )
         self._actuators = Actuators(scene.model, self._controls)
         self._wanted_rows: list[PublishedRow] = []
-        self.full_wanted = False
+        self.full_wanted: bool = False
         self._info_wanted = False
         self._live_ticks = 0
         self._info_due = next_info(0)

@@ -33,7 +33,7 @@ from urlab_client.server.transport.shared_memory import SharedMemoryServer
 
 __all__ = ["CameraStreams"]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 PERIOD_S: Final = 1.0 / 30.0
 QUEUED_FRAMES: Final = 10
@@ -136,7 +136,7 @@ class CameraStreams:
             with uninterrupted():
                 self._context.term()
             raise
-        self.port = self._streams[0].port
+        self.port: int = self._streams[0].port
 
     @property
     def alive(self) -> bool:

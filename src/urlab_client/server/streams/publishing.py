@@ -31,7 +31,7 @@ from urlab_client.server.transport.shared_memory import SharedMemoryServer
 
 __all__ = ["StreamServer"]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 WAITING_TICKS: Final = 64
 """Ticks that may wait to be sent; of more, the oldest go unsent."""

@@ -15,7 +15,7 @@ from urlab_client.server.system.thread_join import ended
 
 __all__ = ["Registration"]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 
 class Registration:

@@ -18,7 +18,7 @@ from urlab_client.server.physics.controllers import ArticulationControl
 
 __all__ = ["PublishedRow", "published_rows", "topic_frame"]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 Floats: TypeAlias = NDArray[np.float64]
 Encoder: TypeAlias = Callable[[], bytes | None]

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 
 __all__ = ["Health"]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 
 class Health:

@@ -24,7 +24,7 @@ from urlab_client.server.system.health import Health
 
 __all__ = ["CurveKeys", "CurveServer", "UnprotectedServer", "ZapAuthenticator", "is_loopback"]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 _ZAP: Final = "inproc://zeromq.zap.01"
 _STOP: Final = "inproc://urlab-auth-stop"

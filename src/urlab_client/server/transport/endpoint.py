@@ -22,7 +22,7 @@ from urlab_client.server.transport.curve_authentication import CurveKeys, ZapAut
 
 __all__ = ["PortInUse", "RpcEndpoint", "bind_tcp", "bound_peers", "connect_host", "numeric_host", "tcp"]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 LINGER_MS: Final = 500
 """How long a reply under way may keep the socket open after the end."""

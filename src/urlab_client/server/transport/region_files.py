@@ -28,7 +28,7 @@ else:
 
 __all__ = ["InstanceDirectory", "RegionFile", "RequestFile"]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 PREFIX: Final = "urlab-"
 LOCK_FILE: Final = "lock"
@@ -67,7 +67,7 @@ class InstanceDirectory:
         base.mkdir(mode=0o700, parents=True, exist_ok=True)
         _remove_left_behind(base)
         self._instance = Path(tempfile.mkdtemp(prefix=PREFIX, dir=base.resolve()))
-        self.path = self._instance / LIVE_DIRECTORY
+        self.path: Path = self._instance / LIVE_DIRECTORY
         with contextlib.ExitStack() as made:
             made.callback(_remove, self._instance)
             self._lock = os.open(self._instance / LOCK_FILE, os.O_RDWR | os.O_CREAT | _RAW, 0o600)

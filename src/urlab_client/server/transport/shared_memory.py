@@ -38,7 +38,7 @@ from urlab_client.server.transport.region_files import InstanceDirectory, Region
 
 __all__ = ["MAX_REPLY_BYTES", "SharedMemoryServer"]
 
-logger = logging.getLogger("urlab_client.server")
+logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 Answer = Callable[[bytes], bytes]
 
@@ -99,7 +99,7 @@ class SharedMemoryServer:
         with contextlib.ExitStack() as made:
             self._instance = InstanceDirectory(base)
             made.callback(self._instance.remove)
-            self.directory = self._instance.path
+            self.directory: Path = self._instance.path
             self._requests = RequestFile(self.directory / REQUEST_FILE, RPC_STRIDE)
             made.callback(self._requests.close)
             self._replies = RegionFile(self.directory / REPLY_FILE, RPC_STRIDE)
@@ -120,7 +120,7 @@ class SharedMemoryServer:
         self._given_up = False
         self._seen = 0  # whoever was quicker than the thread is not forgotten
         self._answer: Answer = bytes
-        self.serving = ServingThread("urlab-shm", self._run)
+        self.serving: ServingThread = ServingThread("urlab-shm", self._run)
 
     def start(self, answer: Answer) -> None:
         """Start the thread that serves.

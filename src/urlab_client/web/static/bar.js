@@ -16,6 +16,15 @@ const LINKS = {
   gone: "No console",
 };
 
+/** On a phone the picture comes first, and the controls are in a sheet over it. */
+const PHONE = matchMedia("(max-width: 700px)");
+
+function toggleSheet() {
+  const open = document.body.classList.toggle("sheet");
+  ui.sheet.setAttribute("aria-expanded", open);
+  text(ui.sheet, open ? "Close" : "Controls");
+}
+
 export const run = (running) => ask("POST", "api/run", { running });
 export const step = (n) => ask("POST", "api/step", { n_steps: n });
 export const reset = (keyframe) => op("reset", keyframe ? { keyframe_name: keyframe } : {});
@@ -76,9 +85,18 @@ export function makeBar() {
   ui.restart = confirmed({ id: "restart", title: "Begin play, or begin again" }, () => now.status?.playing ? "Restart play" : "Begin play",
     () => now.status?.playing && "Lose this simulation?", restartPlay);
 
+  ui.sheet = h("button", { id: "sheet-toggle", "aria-expanded": "false", "aria-controls": "sheet", onclick: toggleSheet }, "Controls");
+  ui.more = h("div", { class: "row more" },
+    h("span", { class: "group" }, ui.step, ui.steps),
+    h("span", { class: "group" }, ui.reset, ui.keyframe),
+    h("label", {}, "mode ", ui.mode),
+    h("label", {}, "control ", ui.source),
+    h("label", { class: "speed" }, "speed ", ui.speed, ui.speedText),
+    ui.restart);
+
   $("bar").append(
     h("div", { class: "row" },
-      h("span", { class: "brand" }, h("img", { src: "static/icon.svg", alt: "", width: 24, height: 24 }), "URLab"),
+      h("h1", { class: "brand" }, h("img", { src: "static/icon.svg", alt: "", width: 24, height: 24 }), h("span", {}, "URLab console")),
       ui.link, ui.address,
       h("span", { class: "facts" },
         h("span", { title: "How old what you see is" }, "age ", ui.age),
@@ -89,14 +107,10 @@ export function makeBar() {
       h("span", { class: "acts" }, ui.drive,
         h("button", { class: "quiet", title: "A link for one more browser", onclick: invite }, "Invite")),
       h("button", { class: "quiet", title: "Keys (?)", "aria-label": "Keys", onclick: () => $("help").showModal() }, "?")),
-    h("div", { class: "row controls acts" },
-      ui.play, ui.stop,
-      h("span", { class: "group" }, ui.step, ui.steps),
-      h("span", { class: "group" }, ui.reset, ui.keyframe),
-      h("label", {}, "mode ", ui.mode),
-      h("label", {}, "control ", ui.source),
-      h("label", { class: "speed" }, "speed ", ui.speed, ui.speedText),
-      ui.restart));
+    h("div", { class: "row controls acts" }, ui.play, ui.stop, ui.sheet, ui.more));
+  const place = () => (PHONE.matches ? $("sheet").prepend(ui.more) : document.querySelector(".controls").append(ui.more));
+  PHONE.addEventListener("change", place);
+  place();
 
   on("open", () => { now.socket = true; now.since = null; });
   on("closed", () => { now.socket = false; now.since = now.since ?? Date.now(); show(now.status); banner(); });

@@ -83,14 +83,14 @@ function ping() {
 }
 setInterval(ping, PING_MS);
 
-/** Ask over HTTP; a failure becomes a toast and null. */
+/** Ask over HTTP, with a file or with JSON; a failure becomes a toast and null. */
 export async function ask(method, path, body, { quiet = false } = {}) {
   let answer;
   try {
     answer = await fetch(new URL(path, base), {
       method,
-      headers: { "x-urlab-viewer": me.viewer, "content-type": "application/json" },
-      body: body === undefined ? undefined : JSON.stringify(body),
+      headers: { "x-urlab-viewer": me.viewer, ...(body instanceof Blob ? {} : { "content-type": "application/json" }) },
+      body: body === undefined || body instanceof Blob ? body : JSON.stringify(body),
     });
   } catch {
     if (!quiet) toast("The console does not answer.");

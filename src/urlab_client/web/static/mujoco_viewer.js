@@ -32,6 +32,7 @@
   // Sockets
 
   const Real = window.WebSocket;
+  const sockets = new Set();
 
   /** What the viewer takes for a socket. `name` is the last part of its address. */
   class Socket extends EventTarget {
@@ -46,19 +47,21 @@
       this.newest = null;
       this.toldAt = 0;
       this.repeats = 0; // states that were told again, and not yet acknowledged
-      this.repeating = setInterval(() => this.repeat(), AGAIN_MS / 2);
+      sockets.add(this);
     }
 
+    /** Tell the newest state again before a frame that would else find none for a while, however long that took. */
     repeat() {
       if (this.newest === null || performance.now() - this.toldAt < AGAIN_MS) return;
       this.repeats += 1;
+      this.toldAt = performance.now();
       this.tell("message", { data: this.newest });
     }
 
     /** MuJoCo's own panels are somebody else's, always. */
     refuse() {
       this.readyState = Real.CLOSED;
-      clearInterval(this.repeating);
+      sockets.delete(this);
       this.tell("close", { wasClean: true, code: TAKEN, reason: "this page watches" });
     }
 
@@ -88,7 +91,7 @@
 
     close() {
       this.readyState = Real.CLOSED;
-      clearInterval(this.repeating);
+      sockets.delete(this);
       this.socket?.close();
     }
 
@@ -122,6 +125,7 @@
   const next = (callback) => {
     const asked = performance.now();
     draw((now) => {
+      sockets.forEach((socket) => socket.repeat());
       callback(now);
       const took = performance.now() - asked;
       pause = took > SLOW_MS ? Math.min(took, 500) : 0;

@@ -1,7 +1,7 @@
 // Recordings: making them, and the files: download in several kinds, replay, upload, removal.
 
 import { $, confirmed, h, number, text, toast } from "./dom.js";
-import { ask, me, on } from "./link.js";
+import { ask, on } from "./link.js";
 
 const record = h("button", { id: "record", onclick: toggle }, "● Record");
 const cameras = h("input", { type: "checkbox", id: "record-cameras", checked: true });
@@ -33,11 +33,7 @@ async function toggle() {
 async function upload() {
   const [chosen] = file.files;
   if (!chosen) return;
-  const answer = await fetch(`api/recordings/${encodeURIComponent(chosen.name)}`,
-    { method: "PUT", headers: { "x-urlab-viewer": me.viewer }, body: chosen }).catch(() => null);
-  const said = await answer?.json().catch(() => null);
-  if (answer?.ok) toast(`${chosen.name} is here.`, "good");
-  else toast(said?.error?.message ?? "The console does not answer.");
+  if (await ask("PUT", at(chosen.name), chosen)) toast(`${chosen.name} is here.`, "good");
   file.value = "";
   refresh();
 }

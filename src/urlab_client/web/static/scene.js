@@ -1,13 +1,17 @@
 // The level: what stands in it, spawning, moving, removing; and what touches what.
 
 import { $, choices, confirmed, h, number, text, toast } from "./dom.js";
-import { on, op } from "./link.js";
+import { ask, on, op } from "./link.js";
 import { fold } from "./robots.js";
 
 const actors = h("div", { class: "actors" });
 const blueprint = h("select", { "aria-label": "Blueprint", id: "blueprint" });
-const id = h("input", { placeholder: "id", "aria-label": "Actor id", id: "actor-id", size: 8 });
-const place = xyz([0, 0, 0]);
+const id = h("input", { "aria-label": "Name of the new actor", id: "actor-id", size: 8 });
+const APART_M = 1;
+const place = xyz([0, 0, 0], "new actor");
+const yaw = h("input", { type: "number", step: 15, value: 0, "aria-label": "new actor: yaw, degrees" });
+const file = h("input", { type: "file", accept: ".xml,.zip", hidden: true, id: "model-file", onchange: importModel });
+const importing = h("button", { class: "quiet", title: "An MJCF file, or a ZIP archive with one and its meshes", onclick: () => file.click() }, "Import a model …");
 const warning = h("div", { class: "line warning", id: "no-manager", hidden: true },
   h("span", {}, "This level has no manager, without which play cannot begin."),
   h("button", { id: "add-manager", onclick: async () => done(await op("ensure_manager")) }, "Add manager"));
@@ -15,8 +19,8 @@ const warning = h("div", { class: "line warning", id: "no-manager", hidden: true
 const isManager = (actor) => /^A?Mj(Replay)?Manager$/.test(actor.class);
 const managesPlay = (actor) => /^A?MjManager$/.test(actor.class);
 
-function xyz(values) {
-  return values.map((value, i) => h("input", { type: "number", step: 0.1, value: +value.toFixed(3), "aria-label": "xyz"[i] }));
+function xyz(values, whose) {
+  return values.map((value, i) => h("input", { type: "number", step: 0.1, value: +value.toFixed(3), "aria-label": `${whose}: ${"xyz"[i]}, metres` }));
 }
 
 const rows = new Map();
@@ -50,44 +54,99 @@ async function refresh() {
     rows.delete(key);
   }
   choices(blueprint, (blueprints?.blueprints ?? []).map((one) => [one.blueprint_class_path, one.blueprint_short_name]));
+  propose();
 }
 
 /** One actor of the list; it stays while the actor does, so that nobody loses what they are typing. */
 class Row {
   constructor(actor) {
-    this.where = xyz(actor.location);
-    this.element = actorRow(actor, this.where);
+    const name = actor.actor_id || actor.name;
+    const target = actor.actor_id ? { target: actor.actor_id } : { target: actor.name, target_by: "actor_name" };
+    this.where = xyz(actor.location, name);
+    this.yaw = h("input", { type: "number", step: 15, value: 0, "aria-label": `${name}: yaw, degrees` });
+    this.element = h("div", { class: "actor", role: "group", "aria-label": name, "data-actor": name },
+      h("span", { class: "name", title: actor.name }, name,
+        h("span", { class: "tag" }, actor.is_light ? "light" : actor.is_articulation ? "robot" : "mesh")),
+      h("span", { class: "acts" },
+        h("button", { class: "quiet", title: "Move there and turn", "aria-label": `Move ${name}`,
+          onclick: async () => done(await op("set_actor_transform", { ...target, location: read(this.where), rotation_quat: quaternion(this.yaw) })) }, "move"),
+        actor.is_articulation ? h("button", { class: "quiet", title: "Spawn another one beside it", "aria-label": `Duplicate ${name}`,
+          onclick: async () => done(await op("duplicate_actor", { ...target, new_actor_id: unused(name), location: free(read(this.where)) })) }, "duplicate") : null,
+        confirmed({ class: "quiet", title: "Remove from the level", "aria-label": `Remove ${name}` }, "remove", "Remove?", async () => done(await op("destroy_actor", target)))),
+      fields(this.where, this.yaw));
   }
 
   update(actor) {
-    if (this.where.includes(document.activeElement)) return;
+    if ([...this.where, this.yaw].includes(document.activeElement)) return;
     this.where.forEach((input, i) => { input.value = +actor.location[i].toFixed(3); });
+    const [, , z, w] = actor.rotation_quat;
+    this.yaw.value = +((360 / Math.PI) * Math.atan2(z, w)).toFixed(1);
+    this.location = actor.location;
   }
 }
 
-function actorRow(actor, where) {
-  const target = actor.actor_id ? { target: actor.actor_id } : { target: actor.name, target_by: "actor_name" };
-  return h("div", { class: "actor", "data-actor": actor.actor_id || actor.name },
-    h("span", { class: "name", title: actor.name }, actor.actor_id || actor.name,
-      h("span", { class: "tag" }, actor.is_light ? "light" : actor.is_articulation ? "robot" : "mesh")),
-    h("span", { class: "group" }, ...where,
-      h("button", { class: "quiet", title: "Move there", onclick: async () => done(await op("set_actor_transform", { ...target, location: read(where) })) }, "move"),
-      confirmed({ class: "quiet", title: "Remove from the level" }, "remove", "Remove?", async () => done(await op("destroy_actor", target)))));
+/** Position and yaw, each with its label. */
+const fields = (where, yaw) => h("span", { class: "fields" },
+  where.map((input, i) => h("label", {}, `${"xyz"[i]} `, input)), h("span", { class: "hint" }, "m"),
+  h("label", {}, "yaw ", yaw), h("span", { class: "hint" }, "°"));
+
+function quaternion(yaw) {
+  const half = (Math.PI / 360) * (+yaw.value || 0);
+  return [0, 0, Math.sin(half), Math.cos(half)];
+}
+
+/** The next place along x, from there, that no actor stands in. */
+function free([x, y, z]) {
+  const others = [...rows.values()].map((row) => row.location).filter(Boolean);
+  const taken = (at) => others.some((other) => Math.hypot(other[0] - at, other[1] - y) < APART_M);
+  while (taken(x)) x = +(x + APART_M).toFixed(3);
+  return [x, y, z];
+}
+
+/** A name that no actor has: what stands before a number at its end, and the next number. */
+function unused(name) {
+  const stem = name.replace(/[_-]?\d+$/, "");
+  for (let n = 2; ; n++) if (!document.querySelector(`[data-actor="${stem}_${n}"]`)) return `${stem}_${n}`;
+}
+
+/** Propose a name and a free place for what would be spawned next, where nobody has typed one. */
+function propose() {
+  const chosen = blueprint.selectedOptions[0]?.text ?? "robot";
+  id.placeholder = document.querySelector(`[data-actor="${chosen}"]`) ? unused(chosen) : chosen;
+  if (place.some((input) => input.dataset.typed)) return;
+  free([0, 0, 0]).forEach((value, i) => { place[i].value = value; });
 }
 
 async function spawn() {
-  if (!id.value) {
-    toast("Give the actor an id first.");
-    id.focus();
-    return;
+  const answer = await op("spawn_actor", { blueprint: blueprint.value, actor_id: id.value || id.placeholder, location: read(place), rotation_quat: quaternion(yaw) });
+  if (answer) {
+    id.value = "";
+    for (const input of place) delete input.dataset.typed;
   }
-  done(await op("spawn_actor", { blueprint: blueprint.value, actor_id: id.value, location: read(place) }));
+  done(answer);
+}
+
+async function importModel() {
+  const [chosen] = file.files;
+  if (!chosen) return;
+  file.value = "";
+  text(importing, "Importing …");
+  const answer = await ask("PUT", `api/models/${encodeURIComponent(chosen.name)}`, chosen);
+  text(importing, "Import a model …");
+  if (!answer) return;
+  toast(`${answer.name} can be spawned.`, "good");
+  await refresh();
+  blueprint.value = answer.blueprint;
+  propose();
 }
 
 export function makeScene() {
-  $("scene").append(h("h2", {}, "Scene"), warning, actors,
-    h("div", { class: "line spawn" }, blueprint, id, h("span", { class: "group" }, ...place),
-      h("button", { id: "spawn", onclick: spawn }, "Spawn")));
+  for (const input of place) input.addEventListener("input", () => { input.dataset.typed = "yes"; });
+  blueprint.addEventListener("change", propose);
+  $("scene").append(h("h2", {}, "Scene", h("span", { class: "space" }), importing, file), warning, actors,
+    h("div", { class: "spawn" }, h("h3", {}, "Add to the level"),
+      h("span", { class: "fields" }, h("label", {}, "blueprint ", blueprint), h("label", {}, "name ", id)),
+      fields(place, yaw), h("button", { id: "spawn", onclick: spawn }, "Spawn")));
   on("world", refresh);
   on("log", ({ entries }) => {
     if (entries.some((entry) => /^(spawn|destroy|set_actor|duplicate|ensure_manager|load_level|create_level|import)/.test(entry.what))) refresh();

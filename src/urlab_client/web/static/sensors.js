@@ -1,12 +1,31 @@
-// Sensors as live curves over the last seconds of simulation time.
+// Curves over the last seconds of simulation time: sensors, and of each robot what joints and actuators do.
 
-import { $, h, number, text } from "./dom.js";
+import { Chart, COLORS } from "./chart.js";
+import { $, h } from "./dom.js";
 import { on } from "./link.js";
 
-const SPAN = 8;
-const COLORS = ["--c1", "--c2", "--c3", "--c4", "--c5", "--c6"];
-let curves = [];
+const SPANS = [2, 8, 30, 120];
+const AXES = { 3: ["x", "y", "z"], 4: ["w", "x", "y", "z"] };
+const KEPT_S = SPANS.at(-1);
+const span = h("select", { id: "span", "aria-label": "Seconds of the curves", onchange: () => charts.forEach((chart) => chart.touch()) },
+  SPANS.map((seconds) => h("option", { value: seconds, selected: seconds === 8 }, `${seconds} s`)));
+const pause = h("button", { id: "pause-curves", "aria-pressed": "false", onclick: () => hold(!view.held) }, "❚❚ Hold");
+const back = h("input", { type: "range", id: "scroll-back", min: 0, max: KEPT_S, step: "any", value: KEPT_S, "aria-label": "Scroll back", hidden: true,
+  oninput: () => { view.end = view.last - (KEPT_S - back.value) * Math.min(1, (view.last - view.first) / KEPT_S); charts.forEach((chart) => chart.touch()); } });
 const probe = h("i", { hidden: true });
+
+/** What all curves show alike: up to when, or the newest while nothing is held; where somebody points. */
+const view = { held: false, end: 0, last: 0, first: 0, hover: null, get span() { return +span.value; } };
+let charts = [];
+
+function hold(held) {
+  Object.assign(view, { held, end: view.last });
+  pause.setAttribute("aria-pressed", held);
+  pause.textContent = held ? "▶ Follow" : "❚❚ Hold";
+  back.hidden = !held;
+  back.value = KEPT_S;
+  charts.forEach((chart) => chart.touch());
+}
 
 /** A custom property as a colour that a canvas understands: of light and dark the one in force. */
 function resolved(name) {
@@ -14,94 +33,89 @@ function resolved(name) {
   return getComputedStyle(probe).color;
 }
 
-class Curve {
-  constructor(art, sensor) {
-    this.art = art;
-    this.name = sensor.name;
-    this.dim = sensor.dim;
-    this.points = [];
-    this.canvas = h("canvas", {});
-    this.shown = h("span", { class: "num" });
-    this.element = h("div", { class: "curve", "data-sensor": `${art}/${sensor.name}` },
-      h("div", { class: "line" }, h("b", {}, sensor.name), h("span", { class: "tag" }, sensor.kind), h("span", { class: "space" }), this.shown),
-      this.canvas);
-    this.seen = false;
-    new IntersectionObserver(([entry]) => { this.seen = entry.isIntersecting; }).observe(this.canvas);
-  }
+const single = (joint) => joint.kind === "hinge" || joint.kind === "slide";
 
-  add(time, value) {
-    const last = this.points.at(-1);
-    if (last && time < last[0]) this.points = [];
-    if (last && time === last[0]) return;
-    this.points.push([time, value]);
-    const cut = this.points.findIndex(([at]) => at >= time - SPAN);
-    if (cut > 60) this.points.splice(0, cut);
-    this.value = value;
+/** Every curve that a robot can have: what it is, its unit, the names of its signals, and where its values are. */
+function sources(art) {
+  const found = art.sensors.map((sensor) => ({
+    key: `${art.key}/${sensor.name}`, title: sensor.name, kind: sensor.kind, unit: sensor.unit, shown: true,
+    signals: sensor.dim === 1 ? [sensor.name] : AXES[sensor.dim] ?? [...Array(sensor.dim).keys()].map(String),
+    read: (state) => state.sensors?.[sensor.name],
+  }));
+  for (const unit of ["rad", "m"]) {
+    const joints = art.joints.filter((joint) => single(joint) && joint.unit === unit);
+    if (!joints.length) continue;
+    const what = unit === "rad" ? "joint angles" : "joint positions";
+    found.push({ key: `${art.key}/qpos/${unit}`, title: what, kind: "joints", unit, signals: joints.map((joint) => joint.name),
+      read: (state) => state.qpos && joints.map((joint) => state.qpos[joint.index]) });
+    found.push({ key: `${art.key}/qvel/${unit}`, title: "joint velocities", kind: "joints", unit: `${unit}/s`, signals: joints.map((joint) => joint.name),
+      read: (state) => state.qvel?.length ? joints.map((joint) => state.qvel[joint.dof]) : null });
   }
-
-  draw(colors) {
-    if (!this.seen || !this.value) return;
-    text(this.shown, this.value.slice(0, 4).map((value) => number(value, 2)).join(" "));
-    const ratio = devicePixelRatio;
-    const width = Math.round(this.canvas.clientWidth * ratio);
-    const height = Math.round(this.canvas.clientHeight * ratio);
-    if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
-    const paint = this.canvas.getContext("2d");
-    paint.clearRect(0, 0, width, height);
-    let low = Infinity;
-    let high = -Infinity;
-    for (const [, value] of this.points) for (const one of value) { low = Math.min(low, one); high = Math.max(high, one); }
-    const middle = (low + high) / 2;
-    const half = Math.max((high - low) / 2, 0.02 * Math.abs(middle), 1e-3) * 1.12;
-    const end = this.points.at(-1)[0];
-    const x = (time) => width - ((end - time) / SPAN) * width;
-    const y = (value) => height / 2 - ((value - middle) / half) * (height / 2);
-    if (middle - half < 0 && middle + half > 0) {
-      paint.strokeStyle = colors.grid;
-      paint.lineWidth = ratio;
-      paint.beginPath();
-      paint.moveTo(0, y(0));
-      paint.lineTo(width, y(0));
-      paint.stroke();
-    }
-    paint.lineWidth = 1.6 * ratio;
-    paint.lineJoin = "round";
-    for (let i = 0; i < Math.min(this.dim, 12); i++) {
-      paint.strokeStyle = colors.lines[i % colors.lines.length];
-      paint.beginPath();
-      for (const [time, value] of this.points) paint.lineTo(x(time), y(value[i]));
-      paint.stroke();
-    }
+  if (art.actuators.length) {
+    const pd = art.controller?.kind === "pd";
+    const takes = new Set(art.actuators.map((actuator) => (pd ? "force" : actuator.takes)));
+    const forces = takes.size === 1 && takes.has("force");
+    found.push({ key: `${art.key}/ctrl`, title: forces ? "forces applied" : "controls applied", kind: "actuators", unit: forces ? "N m, N" : "",
+      signals: art.actuators.map((actuator) => actuator.name), read: (state) => state.ctrl && art.actuators.map((actuator) => state.ctrl[actuator.index]) });
   }
+  return found.map((source) => ({ ...source, art: art.key }));
 }
 
 export function makeSensors() {
   const grid = h("div", { class: "curves" });
-  $("sensors").append(h("h2", {}, "Sensors", h("span", { class: "tag" }, `last ${SPAN} s`)), grid, probe);
-  on("world", ({ world }) => {
-    const old = new Map(curves.map((curve) => [`${curve.art}/${curve.name}/${curve.dim}`, curve]));
-    curves = world.articulations.flatMap((art) => art.sensors.map((sensor) =>
-      old.get(`${art.key}/${sensor.name}/${sensor.dim}`) ?? new Curve(art.key, sensor)));
-    grid.replaceChildren(...world.articulations.flatMap((art) => {
-      const own = curves.filter((curve) => curve.art === art.key).map((curve) => curve.element);
-      return own.length && world.articulations.length > 1 ? [h("h3", {}, art.key), ...own] : own;
+  const add = h("select", { id: "add-curve", "aria-label": "Add a curve" });
+  $("sensors").append(h("h2", {}, "Curves", h("span", { class: "space" }), add, span, pause), back, grid, probe);
+  let all = [];
+  const chosen = new Map(JSON.parse(localStorage.getItem("urlab-curves") ?? "[]")); // key: whether somebody wants it
+
+  function choose(key, wanted) {
+    chosen.set(key, wanted);
+    localStorage.setItem("urlab-curves", JSON.stringify([...chosen]));
+    arrange();
+  }
+
+  function arrange() {
+    const old = new Map(charts.map((chart) => [chart.signature, chart]));
+    const robots = new Set(all.map((source) => source.art));
+    charts = all.filter((source) => chosen.get(source.key) ?? source.shown).map((source) => {
+      const signature = JSON.stringify([source.key, source.signals, source.unit]);
+      const chart = old.get(signature) ?? new Chart(source, view, signature, { close: () => choose(source.key, false), touchAll: () => charts.forEach((one) => one.touch()) });
+      chart.source = source;
+      return chart;
+    });
+    grid.replaceChildren(...[...robots].flatMap((art) => {
+      const own = charts.filter((chart) => chart.source.art === art).map((chart) => chart.element);
+      return own.length && robots.size > 1 ? [h("h3", {}, art), ...own] : own;
     }));
-    $("sensors").classList.toggle("empty", curves.length === 0);
+    const rest = all.filter((source) => !(chosen.get(source.key) ?? source.shown));
+    add.replaceChildren(h("option", { value: "" }, "Add a curve …"),
+      ...rest.map((source) => h("option", { value: source.key }, `${source.art}: ${source.title}`)));
+    add.hidden = !rest.length;
+    $("sensors").classList.toggle("empty", all.length === 0);
+  }
+
+  add.addEventListener("change", () => add.value && choose(add.value, true));
+  on("world", ({ world }) => {
+    all = world.articulations.flatMap(sources);
+    arrange();
   });
-  let changed = false;
   on("state", (state) => {
-    for (const curve of curves) {
-      const value = state.articulations[curve.art]?.sensors?.[curve.name];
-      if (value) curve.add(state.time, value);
+    if (state.time < view.last && view.held) hold(false);
+    if (state.time < view.last) view.first = state.time;
+    view.last = state.time;
+    view.first = Math.max(view.first, view.last - KEPT_S);
+    for (const chart of charts) {
+      const own = state.articulations[chart.source.art];
+      const values = own && chart.source.read(own);
+      if (values) chart.data.add(state.time, values, KEPT_S);
     }
-    changed = true;
+    if (!view.held) charts.forEach((chart) => chart.touch());
   });
   const paint = () => {
     requestAnimationFrame(paint);
-    if (!changed) return;
-    changed = false;
-    const colors = { grid: resolved("--line"), lines: COLORS.map(resolved) };
-    for (const curve of curves) curve.draw(colors);
+    if (!charts.some((chart) => chart.stale)) return;
+    const colors = { grid: resolved("--line"), ink: resolved("--dim"), lines: COLORS.map(resolved) };
+    for (const chart of charts) chart.draw(colors);
   };
   paint();
 }

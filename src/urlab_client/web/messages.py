@@ -1,0 +1,175 @@
+"""What goes over the WebSockets: one declaration per message, from which the AsyncAPI document is made, too."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, TypeAlias
+
+from msgspec import Meta, Struct
+
+from urlab_client.protocol.enums import StepMode
+from urlab_client.web.description import WorldDescription
+from urlab_client.web.recordings import RunningRecording
+from urlab_client.web.replay import ReplayView
+
+__all__ = [
+    "Ack",
+    "ArticulationSample",
+    "Ctrl",
+    "EntitySample",
+    "FromViewer",
+    "Link",
+    "Log",
+    "LogEntry",
+    "Name",
+    "PictureHead",
+    "Ping",
+    "Pong",
+    "Refused",
+    "State",
+    "Status",
+    "World",
+    "You",
+]
+
+Numbers: TypeAlias = list[float | None]
+"""Numbers of five digits; null for one that is not finite."""
+
+
+class Link(Struct):
+    """The connection to the server: `connecting`, `connected`, `lost`, `silent` or `taken_over`, and why."""
+
+    state: str
+    reason: str = ""
+    since: float = 0.0
+
+
+class LogEntry(Struct):
+    """One line of the log. `kind` is `call`, `error` or `event`; `at` is Unix time in seconds."""
+
+    n: int
+    at: float
+    kind: str
+    who: str
+    what: str
+    text: str
+    ms: float | None = None
+
+
+class You(Struct, tag_field="type", tag="you"):
+    """The first message: `viewer` is for the header `X-URLab-Viewer`, `name` is what the others see."""
+
+    viewer: str
+    name: str
+
+
+class World(Struct, tag_field="type", tag="world"):
+    """What there is: at first, and whenever it changes."""
+
+    world: WorldDescription
+
+
+class ArticulationSample(Struct):
+    """One robot: positions, velocities, controls, readings, and what viewers have commanded."""
+
+    qpos: Numbers
+    qvel: Numbers
+    ctrl: Numbers | None
+    sensors: dict[str, Numbers | None]
+    targets: list[float] | None
+
+
+class EntitySample(Struct):
+    """One body: its position in the world frame, metres."""
+
+    xpos: Numbers
+
+
+class State(Struct, tag_field="type", tag="state"):
+    """The newest state, at most 60 in a second. `time` is simulation time in seconds, `made` Unix time in ms."""
+
+    seq: int
+    time: float
+    step: int
+    made: float
+    articulations: dict[str, ArticulationSample]
+    entities: dict[str, EntitySample]
+
+
+class Status(Struct, tag_field="type", tag="status"):
+    """Connection, play, time, recording and replay, and who drives, as one viewer is told whenever it changes.
+
+    `rate` is simulation time per real time, `speed` the pacing of live mode in percent, `mine` whether this viewer
+    drives, `lease_left` how many seconds the controls stay the driver's without use.
+    """
+
+    link: Link
+    address: str
+    playing: bool
+    moving: bool
+    running: bool
+    rate: float
+    mode: StepMode
+    speed: float | None
+    source: str | None
+    recording: RunningRecording | None
+    replay: ReplayView | None
+    twists: dict[str, tuple[float, float, float]]
+    viewers: int
+    driver: str | None
+    mine: bool
+    lease_left: float
+    lease: float
+
+
+class Log(Struct, tag_field="type", tag="log"):
+    """New entries of the log, the newest last."""
+
+    entries: list[LogEntry]
+
+
+class Refused(Struct, tag_field="type", tag="refused"):
+    """A message was refused: `code`, `message` and `hint`, as HTTP answers have them."""
+
+    error: dict[str, Any]
+
+
+class Pong(Struct, tag_field="type", tag="pong"):
+    """The answer to `ping`: its `at`, and the console's Unix time in ms."""
+
+    at: float
+    now: float
+
+
+class Ack(Struct, tag_field="type", tag="ack"):
+    """A state was shown. No more than two are sent without it."""
+
+
+class Ping(Struct, tag_field="type", tag="ping"):
+    """Asks for a `pong`, to compare clocks."""
+
+    at: float = 0.0
+
+
+class Name(Struct, tag_field="type", tag="name"):
+    """The name that the others see."""
+
+    name: str = ""
+
+
+class Ctrl(Struct, tag_field="type", tag="ctrl"):
+    """Set-points by articulation and actuator. Needs the controls."""
+
+    values: Annotated[dict[str, dict[str, float]], Meta(description="Articulation to actuator to set-point.")] = {}
+
+
+FromViewer: TypeAlias = Ack | Ping | Name | Ctrl
+"""What a viewer says."""
+
+
+class PictureHead(Struct):
+    """What comes before a picture: `received` is Unix time in ms, `sim_time` seconds."""
+
+    seq: int
+    received: float
+    sim_time: float | None
+    mode: str

@@ -1,0 +1,106 @@
+"""The part of the HTTP API that takes models in: an MJCF file, or a ZIP archive with one and its meshes."""
+
+from __future__ import annotations
+
+import tempfile
+import zipfile
+from collections.abc import AsyncIterator, Awaitable, Callable
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
+
+import anyio.to_thread
+from starlette.requests import Request
+from starlette.responses import Response
+
+from urlab_client.protocol.errors import RPC_ERRORS
+from urlab_client.web.console_session import ConsoleSession
+from urlab_client.web.driving_lease import Viewer
+from urlab_client.web.ops import encode
+
+if TYPE_CHECKING:
+    from urlab_client.aio import URLabClient
+    from urlab_client.protocol.scene_types import URLabBlueprint
+
+__all__ = ["ModelRoutes", "take_model"]
+
+_LARGEST_FILE = 256 << 20
+_LARGEST_CONTENT = 1 << 30
+
+
+class ModelRoutes:
+    """Handler of `/api/models`.
+
+    Args:
+        console: The session that all viewers share.
+        viewer: Says who asks.
+    """
+
+    def __init__(self, console: ConsoleSession, viewer: Callable[[Request], Viewer]) -> None:
+        self._console = console
+        self._viewer = viewer
+
+    def routes(self) -> list[tuple[str, Callable[[Request], Awaitable[Response]], list[str]]]:
+        """Return path, handler and methods of each route."""
+        return [("/api/models/{name}", self._take, ["PUT"])]
+
+    async def _take(self, request: Request) -> Response:
+        viewer, name = self._viewer(request), request.path_params["name"]
+        self._console.lease.use(viewer)
+        made = await take_model(self._console.client, name, request.stream())
+        self._console.note("call", viewer.name, "import model", name)
+        return Response(encode({"blueprint": made.class_path, "name": made.short_name}), media_type="application/json")
+
+
+async def take_model(client: URLabClient, name: str, chunks: AsyncIterator[bytes]) -> URLabBlueprint:
+    """Receive a model and make a blueprint of it.
+
+    Servers that take models over the wire get it so; others read it from this machine's disk, if it is theirs.
+
+    Args:
+        client: The client.
+        name: The file's name, which ends with `.xml` or `.zip`.
+        chunks: Its bytes.
+
+    Raises:
+        ValueError: It is neither, is too large, or the archive has no MJCF file to begin with.
+        URLabError: The server rejects it.
+    """
+    ending = PurePosixPath(name).suffix.lower()
+    if ending not in {".xml", ".zip"} or PurePosixPath(name).name != name or "\\" in name:
+        raise ValueError(f"{name!r} is not the name of a model: send an .xml file, or a .zip archive with one")
+    with tempfile.TemporaryDirectory(prefix="urlab-model-", ignore_cleanup_errors=True) as folder:
+        file = Path(folder) / name
+        size = 0
+        with file.open("wb") as target:
+            async for chunk in chunks:
+                size += len(chunk)
+                if size > _LARGEST_FILE:
+                    raise ValueError(f"a model is at most {_LARGEST_FILE} bytes")
+                await anyio.to_thread.run_sync(target.write, chunk)
+        if ending == ".zip":
+            file = await anyio.to_thread.run_sync(_unpacked, file, Path(folder) / "content")
+        try:
+            return await client.scene.upload_model(file)
+        except RPC_ERRORS["unknown_op"]:
+            return await client.scene.import_xml(str(file))
+
+
+def _unpacked(archive: Path, folder: Path) -> Path:
+    """Unpack an archive and return its MJCF file: the one at the top, of several the one called like it."""
+    try:
+        with zipfile.ZipFile(archive) as packed:
+            names = [PurePosixPath(info.filename) for info in packed.infolist()]
+            if any(name.is_absolute() or ".." in name.parts for name in names):
+                raise ValueError(f"{archive.name} has files outside its own folder")
+            if sum(info.file_size for info in packed.infolist()) > _LARGEST_CONTENT:
+                raise ValueError(f"{archive.name} unpacks to more than {_LARGEST_CONTENT} bytes")
+            packed.extractall(folder)
+    except zipfile.BadZipFile as error:
+        raise ValueError(f"{archive.name} is not a ZIP archive: {error}") from None
+    found = sorted(folder.rglob("*.xml"), key=lambda file: len(file.parts))
+    top = [file for file in found if len(file.parts) == len(found[0].parts)]
+    like = [file for file in top if file.stem in {archive.stem, "scene"}]
+    if len(like or top) == 1:
+        return (like or top)[0]
+    names = ", ".join(file.name for file in top) or "none"
+    raise ValueError(f"{archive.name} must have one .xml file at its top, or one called {archive.stem}.xml: {names}")
