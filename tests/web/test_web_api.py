@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from jsonschema import Draft202012Validator
 from PIL import Image
 from starlette.applications import Starlette
 from starlette.routing import Mount
@@ -123,6 +122,8 @@ def test_openapi_describes_every_op_that_is_served(http: TestClient) -> None:
 
 
 def test_asyncapi_describes_every_message_of_the_websockets(http: TestClient) -> None:
+    from jsonschema import Draft202012Validator
+
     document = http.get("/api/asyncapi.json").json()
     assert document["servers"]["console"]["host"] == "localhost"
     components = document["components"]

@@ -68,7 +68,7 @@ def add_parser(commands: Commands) -> None:
         "SIGTERM.",
         examples=(
             ("urlab mcp sim://quadruped --allow-drive", "a simulated robot for an agent that starts this command"),
-            ("urlab mcp tcp://localhost", "look at a running server, and change nothing"),
+            ("urlab mcp tcp://localhost", "look at a server that runs already; another client's session ends"),
             ("urlab mcp --http --allow-drive --allow-edit", "at an address, with all tools"),
         ),
     )
