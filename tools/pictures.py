@@ -18,9 +18,12 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 IMAGES = ROOT / "docs" / "images"
 PICTURES = {
-    "console_dark.png": ("tools/console_pictures.py", ""),
-    "console_light.png": ("tools/console_pictures.py", ""),
-    "console_phone.png": ("tools/console_pictures.py", ""),
+    "console_dark.webp": ("tools/console_pictures.py", ""),
+    "console_error.webp": ("tools/console_pictures.py", ""),
+    "console_light.webp": ("tools/console_pictures.py", ""),
+    "console_phone.webp": ("tools/console_pictures.py", ""),
+    "console_replay.webp": ("tools/console_pictures.py", ""),
+    "console_sheet.webp": ("tools/console_pictures.py", ""),
     "frames.svg": ("tools/gen_frames.py", ""),
     "gym_arm.png": ("examples/gym_env.py", "arm.png"),
     "policy.png": ("examples/run_policy.py", "policy.png"),

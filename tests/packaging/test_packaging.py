@@ -48,6 +48,15 @@ def wheel(dist: Path) -> Path:
     return wheel
 
 
+PROGRAMS = "Scripts" if os.name == "nt" else "bin"
+
+
+def packages_of(venv: Path) -> Path:
+    """Return the folder that a virtual environment has its packages in."""
+    (packages,) = venv.glob("Lib/site-packages" if os.name == "nt" else "lib/python*/site-packages")
+    return packages
+
+
 @pytest.fixture(scope="module")
 def venv(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a virtual environment that has the wheel, and the dependencies of this one, but not the repository."""
@@ -58,7 +67,7 @@ def venv(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     ):
         done = run(command, folder)
         assert done.returncode == 0, done.stderr
-    (packages,) = folder.glob("lib/python*/site-packages")
+    packages = packages_of(folder)
     # A path in a .pth file is only searched: editable installations in it have no effect.
     shared = [path for path in sys.path if path.endswith("site-packages")]
     (packages / "dependencies.pth").write_text("".join(f"{path}\n" for path in shared), encoding="utf-8")
@@ -143,18 +152,18 @@ with urlab_client.URLabClient("sim://ball", step_mode="direct") as client:
 
 
 def test_the_wheel_works_without_the_repository(venv: Path, tmp_path: Path) -> None:
-    done = run([venv / "bin" / "python", "-W", "error", "-c", DRIVE], tmp_path)
+    done = run([venv / PROGRAMS / "python", "-W", "error", "-c", DRIVE], tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     time, file, version = done.stdout.split()
     assert time == "0.2"
     assert Path(file).is_relative_to(venv)
-    assert run([venv / "bin" / "urlab", "--version"], tmp_path).stdout == f"urlab_client {version}\n"
+    assert run([venv / PROGRAMS / "urlab", "--version"], tmp_path).stdout == f"urlab_client {version}\n"
 
 
 @pytest.fixture
 def rival(venv: Path) -> Iterator[Path]:
     """Install a distribution of another name that says it brings a package `urlab_client`."""
-    (packages,) = venv.glob("lib/python*/site-packages")
+    packages = packages_of(venv)
     info = packages / "other_bridge-1.0.dist-info"
     info.mkdir(exist_ok=True)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other-bridge\nVersion: 1.0\n", encoding="utf-8")
@@ -164,7 +173,7 @@ def rival(venv: Path) -> Iterator[Path]:
 
 
 def test_the_doctor_names_a_package_in_the_way(venv: Path, rival: Path, tmp_path: Path) -> None:
-    done = run([venv / "bin" / "urlab", "doctor", "sim://ball"], tmp_path)
+    done = run([venv / PROGRAMS / "urlab", "doctor", "sim://ball"], tmp_path)
     assert "other-bridge installs a package urlab_client, too" in done.stderr
     assert "pip uninstall -y other-bridge urlab-client" in done.stderr
     assert "Traceback" not in done.stderr
@@ -173,7 +182,7 @@ def test_the_doctor_names_a_package_in_the_way(venv: Path, rival: Path, tmp_path
 def test_a_broken_import_names_the_package_in_the_way(venv: Path, rival: Path, tmp_path: Path) -> None:
     file = rival / "urlab_client" / "aio" / "session.py"
     own = file.read_bytes()
-    command = [venv / "bin" / "python", "-c", "from urlab_client import URLabClient"]
+    command = [venv / PROGRAMS / "python", "-c", "from urlab_client import URLabClient"]
     try:
         file.write_text("", encoding="utf-8")
         done = run(command, tmp_path)

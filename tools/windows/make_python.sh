@@ -49,7 +49,7 @@ kill_wine() {
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 
-if [[ ! -e $target/py/python3.dll ]]; then
+if [[ ! -e $target/py/bcryptprimitives.dll ]]; then
     # Panda3D's wheel for Windows carries CPython's own DLL and extension modules, to put them beside frozen programs.
     within 120 'downloading the interpreter' "${pip[@]}" "${windows_wheels[@]}" -d "$work" --no-deps panda3d
     python3 -m zipfile -e "$work"/panda3d-*.whl "$work/x"
@@ -76,6 +76,7 @@ if [[ ! -e $target/py/python3.dll ]]; then
             grep -oE '\b_?Py\w+$' | sort -u | sed 's/.*/& = python311.&/'
     } >"$work/python3.def"
     x86_64-w64-mingw32-gcc -shared -static-libgcc -o "$target/py/python3.dll" "$work/python3.def"
+    x86_64-w64-mingw32-gcc -shared -O2 -o "$target/py/bcryptprimitives.dll" "$here/random_bytes.c" -ladvapi32
 fi
 
 # Under Wine the interpreter starts only where its output is a pipe. Wine's own .NET and browser, which it would ask for
@@ -109,7 +110,7 @@ if [[ $(cat "$site/.packages" 2>/dev/null) != "${packages[*]}" ]]; then
     for wheel in "$work"/wheels/*.whl; do
         python3 -m zipfile -e "$wheel" "$site/"
     done
-    mkdir -p "$target/py/Scripts"
+    mkdir -p "$target/py/Scripts" && cp "$target/py/bcryptprimitives.dll" "$target/py/Scripts/"
     find "$site" -path '*.data/scripts/*.exe' -exec mv {} "$target/py/Scripts/" \;
     python3 - "$site" <<'EOF'
 import pathlib

@@ -22,7 +22,7 @@ def mapping(what: str, value: Mapping[str, V], of: str) -> Mapping[str, V]:
     Raises:
         TypeError: It is not a mapping.
     """
-    if not isinstance(value, Mapping):
+    if not isinstance(value, Mapping):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise TypeError(f"{what} takes a dictionary of {of}, got {value!r:.80}.")
     return value
 
@@ -33,7 +33,7 @@ def collection(what: str, values: Collection[V]) -> Collection[V]:
     Raises:
         TypeError: It is one value, or a text, which would be taken for its letters.
     """
-    if isinstance(values, str) or not isinstance(values, Collection):
+    if isinstance(values, str) or not isinstance(values, Collection):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise TypeError(f"{what} takes a collection, such as ({values!r:.80},), not one of its items.")
     return values
 
@@ -74,6 +74,6 @@ def text(what: str, value: str) -> str:
     Raises:
         TypeError: It is not a text.
     """
-    if not isinstance(value, str):
+    if not isinstance(value, str):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise TypeError(f"{what} takes a text, got {value!r:.80}.")
     return value

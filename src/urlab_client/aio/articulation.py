@@ -510,9 +510,10 @@ def _wrench(force: Sequence[float], torque: Sequence[float]) -> list[float]:
     for what, vector in (("force", force), ("torque", torque)):
         if not is_array(vector):
             raise TypeError(f"apply_xfrc: {what} takes 3 numbers, got {vector!r:.80}.")
-        if len(vector) != 3:
-            raise ValueError(f"apply_xfrc: {what} takes 3 numbers, got {len(vector)}.")
-        values += [finite(f"apply_xfrc: {what}[{i}]", v) for i, v in enumerate(vector)]
+        numbers = list(vector)
+        if len(numbers) != 3:
+            raise ValueError(f"apply_xfrc: {what} takes 3 numbers, got {len(numbers)}.")
+        values += [finite(f"apply_xfrc: {what}[{i}]", v) for i, v in enumerate(numbers)]
     return values
 
 

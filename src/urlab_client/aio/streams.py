@@ -385,7 +385,7 @@ class Stream(Generic[T]):
         kept = StreamBuffer(StreamPolicy(policy), buffer, buffer_bytes)
         if max_rate is not None and kept.policy is not StreamPolicy.LATEST:
             raise ValueError(f"max_rate is for policy 'latest', which leaves out items; {kept.policy!r} keeps them")
-        if max_rate is not None and not (isinstance(max_rate, SupportsFloat) and 0 < float(max_rate) < math.inf):
+        if max_rate is not None and not (isinstance(max_rate, SupportsFloat) and 0 < float(max_rate) < math.inf):  # pyright: ignore[reportUnnecessaryIsInstance]
             raise ValueError(f"max_rate must be a number above 0, got {max_rate!r:.80}")
         self._handler = _StreamHandler(
             source, kept, tolerant=tolerant, timeout=timeout, default_timeout=default_timeout, max_rate=max_rate

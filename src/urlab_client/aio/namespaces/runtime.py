@@ -319,7 +319,7 @@ class RuntimeNamespace(RuntimeOps):
 def _transports(name: str, wanted: bool | CameraTransports) -> CameraTransports:
     if isinstance(wanted, bool):
         return CameraTransports(zmq=wanted, shm=wanted)
-    if not isinstance(wanted, CameraTransports):
+    if not isinstance(wanted, CameraTransports):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise TypeError(f"set_camera_streaming: camera {name!r} takes a bool or CameraTransports, got {wanted!r:.80}.")
     if wanted.zmq is None and wanted.shm is None:
         return CameraTransports(zmq=True, shm=True)

@@ -412,8 +412,8 @@ class SceneNamespace(SceneOps):
             ValueError: Two assets share an actor id; nothing was done. Or two MJCF files would have to be uploaded.
             URLabRPCError: From the op that failed; what was placed before it stays.
         """
-        wanted = list(assets) if isinstance(assets, Iterable) else [assets]
-        if strange := [asset for asset in wanted if not isinstance(asset, URLabAsset)]:
+        wanted = list(assets) if isinstance(assets, Iterable) else [assets]  # pyright: ignore[reportUnnecessaryIsInstance]
+        if strange := [asset for asset in wanted if not isinstance(asset, URLabAsset)]:  # pyright: ignore[reportUnnecessaryIsInstance]
             raise TypeError(f"apply_scene takes URLabAsset objects, got {strange[0]!r:.80}.")
         ids = [asset.actor_id for asset in wanted]
         twice = sorted({i for i in ids if ids.count(i) > 1})
@@ -465,7 +465,7 @@ class SceneNamespace(SceneOps):
 def _class_path(blueprint: URLabBlueprint | str) -> str:
     if isinstance(blueprint, str):
         return blueprint
-    if not isinstance(blueprint, URLabBlueprint):
+    if not isinstance(blueprint, URLabBlueprint):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise TypeError(f"blueprint takes what import_xml() returns, or a class path, got {blueprint!r:.80}.")
     return blueprint.class_path
 

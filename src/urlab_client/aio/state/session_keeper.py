@@ -30,7 +30,7 @@ from urlab_client.protocol.messages.streams import (
 
 __all__ = ["SessionKeeper"]
 
-log = logging.getLogger("urlab_client.client")
+log: logging.Logger = logging.getLogger("urlab_client.client")
 
 _LOOK_S: Final = 5.0  # how often it is made sure that the session is still this client's
 _PROBE_S: Final = 2.0
