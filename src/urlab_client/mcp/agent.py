@@ -34,6 +34,7 @@ from urlab_client.mcp.declaration import Declared, Needs, declared
 from urlab_client.mcp.driving import Limits, Stopped
 from urlab_client.mcp.editing import Tools
 from urlab_client.mcp.results import Result
+from urlab_client.mcp.wording import for_agents
 from urlab_client.protocol.errors import URLabError
 from urlab_client.web.console_session import ConsoleSession
 from urlab_client.web.driving_lease import NotDriving
@@ -116,7 +117,7 @@ class Agent:
                 arguments["progress"] = context.session.report_progress
             answer = _answer(await getattr(self._tools, found.name)(**arguments))
         except (URLabError, NotDriving, Stopped, ValueError, TypeError, LookupError, OSError) as error:
-            text = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
+            text = for_agents(str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error))
             console.note("error", viewer.name, params.name, text)
             return CallToolResult(content=[TextContent(text=text)], is_error=True)
         if found.needs is not Needs.READ:

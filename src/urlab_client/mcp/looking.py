@@ -15,7 +15,8 @@ from urlab_client.mcp.declaration import Needs, tool
 from urlab_client.mcp.driving import Limits
 from urlab_client.mcp.results import Contacts, Explained, Log, Picture, RobotState, World
 from urlab_client.mcp.toolset import Toolset
-from urlab_client.protocol.client_types import Verdict
+from urlab_client.mcp.wording import for_agents
+from urlab_client.protocol.client_types import Finding, Verdict
 from urlab_client.protocol.messages.streams import CameraSample
 from urlab_client.protocol.picture_files import JPEG_QUALITY
 from urlab_client.web.console_session import ConsoleSession
@@ -98,7 +99,8 @@ class Looking(Toolset):
 
         Call this when something did not move as expected. Findings with verdict `problem` come with what to do.
         """
-        findings = (await self.client.explain()).findings
+        found = (await self.client.explain()).findings
+        findings = [Finding(one.verdict, one.subject, for_agents(one.text)) for one in found]
         problems = sum(finding.verdict is Verdict.PROBLEM for finding in findings)
         return self.stamped(Explained(problems=problems, findings=findings))
 
