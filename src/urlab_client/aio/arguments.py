@@ -48,10 +48,9 @@ def collection(what: str, values: Collection[V]) -> Collection[V]:
     Raises:
         TypeError: It is one value, or a text, which would be taken for its letters.
     """
-    takes = "a collection of several, such as a tuple or a list"
-    require(what, values, Collection, takes)
     if isinstance(values, str):
-        raise TypeError(f"{what} takes {takes}, got {values!r:.80}.")
+        raise TypeError(f"{what} takes a collection, such as ({values!r:.80},), not one of its items.")
+    require(what, values, Collection, "a collection, such as a tuple")
     return values
 
 
