@@ -179,7 +179,7 @@ def test_a_recording_is_made_offered_for_download_and_replayed_in_seconds(page: 
     page.until("document.querySelector('#record').textContent.includes('Stop')")
     page.slide(0.9)
     page.until(page.elbow_is(0.9))
-    page.asked("api/status", lambda status: status["recording"]["pictures"] >= 4)
+    page.asked("api/status", lambda status: status["recording"]["pictures"] >= 4 and status["recording"]["seconds"] > 3)
     page.click("#record")
     page.until("document.querySelectorAll('[data-recording]').length === 1")
     page.driver.execute_script("document.querySelector('[data-recording] .menu').open = true")
@@ -210,6 +210,7 @@ def test_a_recording_is_made_offered_for_download_and_replayed_in_seconds(page: 
     page.until("document.querySelector('#replay-play').textContent === '❚❚'")
     page.click("#replay-end")
     page.until("document.querySelector('#replay').hidden")
+    assert not page.look(RUNNING), "it was stopped, and what the replay showed was not its time"
     page.click("#play")
     page.until(RUNNING)
     remove = page.find("[data-recording] button[aria-label^=Delete]")
@@ -349,7 +350,7 @@ def test_the_3d_view_shows_the_robot_and_follows_it(page: Page, tmp_path: Path) 
     page.until("document.querySelector('#driver').dataset.who !== 'other'")  # who drove has closed their browser
     page.slide(0.0)
     page.until(page.elbow_is(0.0))
-    with opened(tmp_path, page.invitation(), (*SOLID, "--window-size=1000,500")) as one:
+    with opened(tmp_path, page.invitation(), (*SOLID, "--window-size=1000,700")) as one:
         one.driver.execute_script("window.scrollTo(0, 0)")
         stage = one.driver.find_element("css selector", ".stage")
 

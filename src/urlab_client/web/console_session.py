@@ -100,6 +100,7 @@ class ConsoleSession:
         self._want: str | None = "discover"
         self._wake = asyncio.Event()
         self._ready = asyncio.Event()
+        self._sim_time: float | None = None
         self._moved_at = 0.0
         self._rate = 0.0
         self._rate_from: tuple[float, float] | None = None
@@ -224,6 +225,7 @@ class ConsoleSession:
                     due = time.monotonic()
                     while True:
                         snapshot = await states.receive(timeout=None)
+                        self._note_time(snapshot.time)
                         if not self.replay.open:
                             self._publish(snapshot, {key: self._targets(key) for key in snapshot.per_articulation})
                         # By the clock and not by when it woke up, else each late awakening makes the rate lower.
@@ -235,19 +237,24 @@ class ConsoleSession:
                 self.note("error", "console", "state", str(error))
                 await anyio.sleep(_RETRY_S)
 
+    def _note_time(self, sim_time: float) -> None:
+        """Follow the time of the simulation, also while a recording is shown in its place."""
+        now = time.monotonic()
+        if sim_time == self._sim_time:
+            return
+        self._sim_time = sim_time
+        self._moved_at = now
+        if self._rate_from is None or not sim_time >= self._rate_from[1]:
+            self._rate_from, self._rate = (now, sim_time), 0.0
+        elif now - self._rate_from[0] > 1:
+            self._rate = (sim_time - self._rate_from[1]) / (now - self._rate_from[0])
+            self._rate_from = (now, sim_time)
+
     def show(self, snapshot: StateSnapshot, targets: Mapping[str, list[float]]) -> None:
         """Show a state to everybody in place of the server's."""
         self._publish(snapshot, targets)
 
     def _publish(self, snapshot: StateSnapshot, targets: Mapping[str, list[float] | None]) -> None:
-        now = time.monotonic()
-        if self.snapshot is None or snapshot.time != self.snapshot.time:
-            self._moved_at = now
-            if self._rate_from is None or not snapshot.time >= self._rate_from[1]:
-                self._rate_from, self._rate = (now, snapshot.time), 0.0
-            elif now - self._rate_from[0] > 1:
-                self._rate = (snapshot.time - self._rate_from[1]) / (now - self._rate_from[0])
-                self._rate_from = (now, snapshot.time)
         self.snapshot = snapshot
         self.state_seq += 1
         wall = snapshot.wall_time.sec + snapshot.wall_time.nsec / 1e9

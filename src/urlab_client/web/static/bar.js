@@ -2,7 +2,7 @@
 
 import { $, choices, confirmed, duration, h, text, toast } from "./dom.js";
 import { ask, clock, on, op } from "./link.js";
-import { toggleReplay } from "./replay.js";
+import { pauseReplay, toggleReplay } from "./replay.js";
 
 export const now = { status: null, state: null, socket: false };
 const ui = {};
@@ -39,7 +39,7 @@ export function toggleRun() {
 /** Stop whatever moves: physics, and a replay. */
 export function stop() {
   run(false);
-  if (now.status?.replay?.playing) toggleReplay();
+  if (now.status?.replay) pauseReplay();
 }
 
 async function restartPlay() {

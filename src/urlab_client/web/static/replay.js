@@ -22,6 +22,10 @@ export function toggleReplay() {
   return ask("POST", "api/replay", { playing: !replay?.playing });
 }
 
+export function pauseReplay() {
+  return ask("POST", "api/replay", { playing: false });
+}
+
 /** Go to a place; of those asked for while one is on its way, the newest. */
 async function seek(to) {
   wanted = to;
