@@ -6,7 +6,7 @@ import copy
 import pickle
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from typing import Any
 
 import gymnasium
@@ -71,6 +71,15 @@ def test_a_registered_task_passes_the_checker_and_closes_its_server(task_id: str
     env.close()
     with pytest.raises(urlab_client.ClientClosed):
         env.reset()
+
+
+def test_gymnasium_decides_how_long_the_episodes_of_a_registered_task_are() -> None:
+    for given, steps in (({}, 100), ({"max_episode_steps": 102}, 102)):
+        with closing(gymnasium.make("urlab/Reach-v0", **given)) as env:
+            env.reset(seed=0)
+            ends = [env.step(np.zeros(7, dtype=np.float32))[2:4] for _ in range(steps)]
+        assert ends[-1][1]
+        assert not any(truncated for _, truncated in ends[:-1])
 
 
 def test_a_reset_sets_the_set_points_to_zero(make_env: MakeEnv) -> None:

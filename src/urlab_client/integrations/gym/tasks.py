@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any, Final, Literal
 
 import gymnasium
@@ -40,6 +41,11 @@ def make(task_id: str, address: str | None = None, **options: Any) -> URLabEnv:
     return URLabEnv.connect(address or task.scene_address, task=task, **options)
 
 
+def _make_endless(task_id: str, **options: Any) -> URLabEnv:
+    """Make an environment that leaves it to Gymnasium to end episodes: `gymnasium.make(…, max_episode_steps=…)`."""
+    return make(task_id, max_episode_steps=sys.maxsize, **options)
+
+
 def make_vec(
     task_id: str, num_envs: int = 1, backend: Literal["servers", "batch"] = "servers", **options: Any
 ) -> URLabVectorEnv | URLabBatchEnv:
@@ -68,7 +74,7 @@ def register() -> None:
         if task_id not in gymnasium.registry:
             gymnasium.register(  # pyright: ignore[reportUnknownMemberType]  # its kwargs are a bare dict
                 task_id,
-                entry_point=make,
+                entry_point=_make_endless,
                 vector_entry_point=make_vec,
                 max_episode_steps=task.max_episode_steps,
                 kwargs={"task_id": task_id},
