@@ -9,6 +9,7 @@ import importlib
 import io
 import json
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -250,6 +251,10 @@ def scene_update(schema: str, data: bytes) -> Any:
     return kind.FromString(data)
 
 
+AGAIN_S = 1.0
+"""Foxglove's server advertises a channel a moment before it takes subscriptions to it; one that comes then is lost."""
+
+
 class Foxglove:
     """What a browser gets to see: channels by topic, the newest message of each."""
 
@@ -263,8 +268,16 @@ class Foxglove:
         """Read until there is a message of each topic, later than this call."""
         for topic in topics:
             self.newest.pop(topic, None)
-        while not all(topic in self.newest for topic in topics):
-            message = await self.socket.recv()
+        asked = time.monotonic()
+        while missing := [topic for topic in topics if topic not in self.newest]:
+            if time.monotonic() - asked > AGAIN_S:
+                asked = time.monotonic()
+                await self._subscribe([self.channels[topic] for topic in missing if topic in self.channels])
+            try:
+                async with asyncio.timeout(AGAIN_S):
+                    message = await self.socket.recv()
+            except TimeoutError:
+                continue
             if isinstance(message, bytes):
                 if message[0] == 1:
                     self.newest[self.topics[int.from_bytes(message[1:5], "little")]] = message[13:]
