@@ -127,12 +127,14 @@ class Film:
     Attributes:
         taken_at: When it was captured, monotonic seconds.
         captured: The same as Unix seconds.
+        number: Number of the state's snapshot.
         jobs: What has to be drawn.
         past: What delayed cameras show; those that have nothing to show yet are missing.
     """
 
     taken_at: float
     captured: float
+    number: int
     jobs: Sequence[Exposure]
     past: Mapping[Latency, Past]
 
@@ -147,6 +149,11 @@ class Film:
         asked = any(shot.camera in job.cameras for job in self.jobs if job.past is None)
         in_time = not asked or shot.camera.drawn_at >= self.taken_at
         return frame if in_time or shot.older or not shot.sync else None
+
+    def snapshot(self, shot: Shot) -> int:
+        """Return the number of the snapshot that the frame for a shot shows, or of an earlier one."""
+        past = None if shot.late is None else self.past.get(shot.late)
+        return self.number if past is None else past.frame_id
 
     def capture_time(self, shot: Shot) -> float:
         """Return when the camera saw what the frame for a shot shows, Unix seconds."""
@@ -335,7 +342,7 @@ class CameraRenderer:
         if cameras and draw:
             number = frame_id if self._stamped else None
             jobs.append(Exposure(cameras, self._copy_state(), now.wall, number, look=look))
-        return Film(now.wall, time.time(), jobs, past)
+        return Film(now.wall, time.time(), frame_id, jobs, past)
 
     def frames(
         self, shots: Sequence[Shot], film: Film, wait_s: float = FRAMES_DEADLINE_S

@@ -117,7 +117,7 @@ class CameraStreams:
         self._dialect = dialect
         self._zmq_on: set[str] = set()
         self._shm_on: set[str] = set()
-        self._sent: dict[str, int | None] = {}
+        self._sent: dict[str, int] = {}
         self._host = host
         self._memory = memory
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
@@ -286,19 +286,25 @@ class CameraStreams:
     def _payloads(self, running: Running, shots: Sequence[Shot], film: Film) -> dict[str, bytes]:
         """Draw, and return what is to be sent."""
         frames = running.cameras.frames(shots, film) or {}
-        captured = {shot.key: film.capture_time(shot) for shot in shots}
         with self._lock:
             if self._running is not running:
                 return {}
-            news = {key: frame for key, frame in frames.items() if self._is_news(running, key, frame)}
-        return {key: self._headed(frame, captured[key]) for key, frame in news.items()}
+            news: dict[str, bytes] = {}
+            for shot in shots:
+                frame = frames.get(shot.key)
+                if frame is None:
+                    continue
+                number = film.snapshot(shot) if frame.frame_id is None else frame.frame_id
+                if self._is_news(running, shot.key, number):
+                    news[shot.key] = self._headed(frame, film.capture_time(shot))
+        return news
 
-    def _is_news(self, running: Running, key: str, frame: CameraFrame) -> bool:
-        """Whether a picture is to be sent, as far as the camera is to send only what has changed."""
+    def _is_news(self, running: Running, key: str, number: int) -> bool:
+        """Whether a picture of snapshot `number` is to be sent, as far as the camera sends only what has changed."""
         latency = running.cameras.latency(key)
         repeats = self._dialect.cameras_repeat if latency is None else not latency.on_state_change
-        before, self._sent[key] = self._sent.get(key), frame.frame_id
-        return repeats or before != frame.frame_id
+        before, self._sent[key] = self._sent.get(key), number
+        return repeats or before != number
 
     def _headed(self, frame: CameraFrame, captured: float) -> bytes:
         if not self._dialect.camera_headers:
