@@ -179,7 +179,7 @@ def test_a_loop_that_is_closed_underneath_clients_takes_its_thread_along(
 @pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning")
 def test_a_client_that_nobody_closed_goes_with_its_loop(scripted: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """And not only when the thread sees that the loop is closed: the next client wants the server's memory."""
-    monkeypatch.setattr(readiness, "_CHECK_MS", 60_000)
+    monkeypatch.setattr(readiness, "_CHECK_MS", 5_000)
 
     async def main() -> tuple[weakref.ref[URLabClient], weakref.ref[object]]:
         client = URLabClient("tcp://127.0.0.1", step_port=scripted.port, local_model=False)
