@@ -75,7 +75,7 @@ def test_a_crash_costs_one_test_and_not_those_whose_names_begin_alike(run_tests:
         for last; do :; done
         if grep -q :: "${last#@Z:}"
         then sed 's/$/ PASSED/' "${last#@Z:}"
-        else echo tests/x.py::test_a; exit 9
+        else echo tests/x.py::test_a Assertion failed; exit 9
         fi
     """
     outcome = run(run_tests, tmp_path, program, "test_a", "test_a_too", "test_b[x]")

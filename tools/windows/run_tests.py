@@ -34,7 +34,7 @@ sys.path.append(str(ROOT / "tests" / "support"))
 
 from not_on_windows import listed, names  # noqa: E402
 
-RESULT = re.compile(r"(tests/\S.*?)(?: (PASSED|FAILED|ERROR|SKIPPED)\b.*| \++ Timeout \++)?")
+RESULT = re.compile(r"((?:tests/\S.*?)?)(?: (PASSED|FAILED|ERROR|SKIPPED)\b.*| \++ Timeout \++)?")
 TEST_S = 200
 SILENCE_S = 40  # beyond a test's time: the interpreter does not start, or end
 FILE_S = 1200
@@ -63,6 +63,15 @@ class Outcome:
     def rest(self) -> list[str]:
         """The tests that are meant to run and have no result."""
         return [test for test in self.meant if test not in self.results]
+
+    def result(self, line: str) -> tuple[str, str] | None:
+        """Return the test that a line of pytest's is about, and how it ended, or nothing as long as it runs."""
+        # What ends the interpreter may print its last words behind the test's name.
+        test = max((test for test in self.meant if f"{line} ".startswith(f"{test} ")), key=len, default="")
+        found = RESULT.fullmatch(line.removeprefix(test))
+        if test:
+            return test, (found[2] or "") if found else ""
+        return (found[1], found[2] or "") if found and "::" in found[1] else None
 
     def count(self, *words: str) -> int:
         """Return how many of the tests that are meant to run ended in one of these ways."""
@@ -187,11 +196,9 @@ def run_rest(outcome: Outcome, prefix: Prefix, log: Path, clock: Clock) -> tuple
                 for line in lines(process, clock):
                     written.write(line)
                     crashed = crashed or line.startswith("wine: Unhandled ")
-                    if found := RESULT.fullmatch(line.rstrip()):
-                        test, result = found.groups()
-                        if "::" in test:
-                            met += 1
-                            outcome.results[test] = result or ""
+                    if found := outcome.result(line.rstrip()):
+                        met += 1
+                        outcome.results |= [found]
             stopped = process.poll() is None
         finally:
             with contextlib.suppress(ProcessLookupError):
