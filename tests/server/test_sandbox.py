@@ -194,8 +194,8 @@ def test_what_a_model_names_may_lie_below_the_roots(wire: Wire, folder: Path) ->
         FIGURE.format(file="&#x2e;./secret.obj"),
         FIGURE.format(file="..\\secret.obj"),
         FIGURE.format(file="{folder}/secret.obj"),
-        FIGURE.format(file="link.obj"),
-        FIGURE.format(file="linked/secret.obj"),
+        pytest.param(FIGURE.format(file="link.obj"), id="a link"),
+        pytest.param(FIGURE.format(file="linked/secret.obj"), id="below a link"),
         FIGURE.format(file="secret.obj").replace("<asset>", '<compiler meshdir=".."/><asset>'),
         FIGURE.format(file="secret.obj").replace("<asset>", "<compiler\nassetdir = '{folder}'/><asset>"),
         FIGURE.format(file="x/secret.obj").replace("<asset>", '<compiler strippath="true" meshdir=".."/><asset>'),
@@ -407,6 +407,7 @@ def test_recordings_stay_where_they_belong(folder: Path) -> None:
         wire.ask("recording_stop")
         fence = folder / "root" / "fence"
         fence.symlink_to(folder)
+        fenced = os.path.lexists(fence)  # Wine makes none, and does not say so
         outside = sorted(folder.iterdir())
         for path in (*PATHS, str(fence / "out.json"), str(folder / "out.json")):
             text = path.replace("{root}", str(folder / "root")).replace("{folder}", str(folder))
@@ -417,20 +418,18 @@ def test_recordings_stay_where_they_belong(folder: Path) -> None:
                 reply = wire.raw({"op": "replay_load", "session_id": wire.session_id, "path": text})
                 assert reply["op"] == "replay_load_ok" or reply["code"] == "path_not_readable", text
         assert sorted(folder.iterdir()) == outside
-        assert os.path.lexists(fence)
+        assert os.path.lexists(fence) == fenced
 
 
 def test_a_level_that_a_client_opens_names_no_files_elsewhere(folder: Path, tmp_path: Path) -> None:
     levels = tmp_path / "Levels"
     levels.mkdir()
-    crate = '{"name": "Crate_0", "kind": "static_mesh", "mesh": {"shape": "file", "file": "%s"}}'
-    (levels / "thief.json").write_text(
-        '{"format": "urlab-level", "version": 1, "blueprints": {}, "actors": [%s]}' % (crate % (folder / "secret.obj"))
-    )
-    (levels / "other.json").write_text(
-        '{"format": "urlab-level", "version": 1, "blueprints": {"b": {"source": "x.xml", "record": "%s"}}, "actors": '
-        '[{"name": "b", "kind": "articulation", "blueprint": "b"}]}' % (folder / "blueprint.json")
-    )
+    crate = {"name": "Crate_0", "kind": "static_mesh", "mesh": {"shape": "file", "file": str(folder / "secret.obj")}}
+    blueprint = {"source": "x.xml", "record": str(folder / "blueprint.json")}
+    robot = {"name": "b", "kind": "articulation", "blueprint": "b"}
+    for name, blueprints, actor in (("thief", {}, crate), ("other", {"b": blueprint}, robot)):
+        level = {"format": "urlab-level", "version": 1, "blueprints": blueprints, "actors": [actor]}
+        (levels / f"{name}.json").write_bytes(msgspec.json.encode(level))
     with SimulatedServer(saved_dir=tmp_path, model_roots=[folder / "root"]) as server, Wire(server) as wire:
         wire.hello()
         for name in ("thief", "other"):
