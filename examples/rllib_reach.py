@@ -60,7 +60,7 @@ with tempfile.TemporaryDirectory(prefix="ray") as scratch:
     algorithm = (
         PPOConfig()
         .environment("reach")
-        .env_runners(num_env_runners=arguments.runners, rollout_fragment_length="auto")
+        .env_runners(num_env_runners=arguments.runners, rollout_fragment_length="auto", sample_timeout_s=600)
         .training(train_batch_size_per_learner=2000, minibatch_size=200, num_epochs=10, lr=1e-3)
         .build_algo()
     )
