@@ -6,6 +6,7 @@ For the wrappers of both clients, whose maps of articulations, joints and so on 
 from __future__ import annotations
 
 import difflib
+import functools
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar, cast, overload
@@ -46,6 +47,7 @@ class UnknownName(KeyError):
         matches: tuple[str, ...],
         known: tuple[str, ...],
         suggestions: tuple[str, ...],
+        *,
         owner: str = "",
     ) -> None:
         self.kind = kind
@@ -69,7 +71,8 @@ class UnknownName(KeyError):
         return str(self.args[0])  # a plain KeyError puts it in quotes
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.kind, self.name, self.matches, self.known, self.suggestions, self.owner)
+        kind = functools.partial(type(self), owner=self.owner)
+        return kind, (self.kind, self.name, self.matches, self.known, self.suggestions)
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
@@ -165,7 +168,7 @@ class NameMap(dict[str, T]):
         matches = self._aliases.get(cast("str", name), ())
         unique = [alias for alias, keys in self._aliases.items() if len(keys) == 1]
         suggestions = difflib.get_close_matches(name, [*known, *unique]) if isinstance(name, str) else []
-        return UnknownName(self.kind, name, matches, known, tuple(suggestions), self.owner)
+        return UnknownName(self.kind, name, matches, known, tuple(suggestions), owner=self.owner)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return NameMap, (dict(self), self._aliases, self.kind, self.owner)
