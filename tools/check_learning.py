@@ -101,7 +101,7 @@ def gym_async() -> str:
 
 
 def rllib() -> str:
-    """RLlib's PPO learns from two remote runners, and what it learned runs as a policy of `rollouts`."""
+    """RLlib's PPO updates from what two remote runners sample, and its network runs as a policy of `rollouts`."""
     example = Path(__file__).parents[1] / "examples/rllib_reach.py"
     with tempfile.TemporaryDirectory() as folder:
         done = subprocess.run(  # noqa: S603 - ours

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from urlab_client.integrations._feed.messages import CompressedImage, RawImage, Time
+from urlab_client.integrations._feed.messages import CompressedImage, EpisodeOutcome, RawImage, Time
 from urlab_client.integrations._feed.scene_messages import CameraLayout, SceneMessages
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraFrame, StateReply
@@ -15,7 +15,7 @@ from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.picture_files import pillow_image
 from urlab_client.protocol.pixels import Pixels, decode_camera
 
-__all__ = ["CameraPicture", "SampleClock", "Schedule", "State", "compressed", "picture_message"]
+__all__ = ["CameraPicture", "EpisodeMark", "SampleClock", "Schedule", "State", "compressed", "picture_message"]
 
 _FALLBACK_NS = 1_000_000
 
@@ -54,6 +54,15 @@ class CameraPicture:
         if isinstance(frame, CameraFrame):
             return decode_camera(frame.data, self.camera.view.mode, frame.width, frame.height).pixels
         return frame
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeMark:
+    """What became of the episode that the last state before it belongs to."""
+
+    outcome: EpisodeOutcome
+    goal: dict[str, list[float]]
+    wall_ns: int
 
 
 class Schedule:

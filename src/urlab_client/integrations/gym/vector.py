@@ -67,6 +67,7 @@ class _Session:
         self._episode_options = episode_options
         self._rendered = rendered
         self._opening: asyncio.Task[None] | None = None
+        self._earlier: EnvEpisode | None = None
 
     async def reset(
         self, rng: np.random.Generator, keyframe: str | None, seed: int | None, timeout: float
@@ -99,6 +100,8 @@ class _Session:
         if self._opening is not None:
             self._opening.cancel()
             await asyncio.wait((self._opening,))
+        if self.episode is not None:
+            await self.episode.close()
         await self._close_client()
 
     async def open(self) -> None:
@@ -109,7 +112,8 @@ class _Session:
                 await client.discover()
                 wanted = self._rendered
                 shown = () if wanted is None else (wanted.camera or first_camera(client),)
-                self.episode = EnvEpisode(client, rendered=shown, **self._episode_options)
+                options = self._episode_options
+                self.episode = self._earlier = EnvEpisode(client, rendered=shown, earlier=self._earlier, **options)
                 self.shown = shown
             except BaseException:
                 await client.close()
