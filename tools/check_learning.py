@@ -146,7 +146,7 @@ def minari() -> str:
             env = gymnasium.make("urlab/Reach-v0", max_episode_steps=20, **options)
             if options:
                 env = envhub.ForLeRobot(env, description="reach")
-            collector = library.DataCollector(env)
+            collector = library.DataCollector(env, jpeg_encoding=False)  # pictures without loss
             driven: list[tuple[list[Any], list[Any], list[Any]]] = []
             for seed in range(2):
                 seen: list[Any] = [collector.reset(seed=seed)[0]]
