@@ -76,17 +76,14 @@ def app(
         recordings: Folder of the recordings that viewers make, download and replay; made with the first one.
     """
     access = access or Access()
-    site = _Site(ConsoleSession(client, DrivingLease(lease_seconds), Path(recordings)), access)
+    site = _Site(ConsoleSession(client, DrivingLease(lease_seconds), Path(recordings)), access, metrics)
 
     @contextlib.asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncGenerator[None]:
         async with site.console.open():
             yield
 
-    routes = site.routes()
-    if metrics is not None:
-        routes.append(Route("/metrics", showing(metrics)))
-    application = Starlette(routes=routes, middleware=[Middleware(Guarded, access=access)], lifespan=lifespan)
+    application = Starlette(routes=site.routes(), middleware=[Middleware(Guarded, access=access)], lifespan=lifespan)
     application.state.access = access
     application.state.console = site.console
     return application
@@ -117,9 +114,10 @@ class _LoginRequest(Struct):
 
 
 class _Site:
-    def __init__(self, console: ConsoleSession, access: Access) -> None:
+    def __init__(self, console: ConsoleSession, access: Access, metrics: CollectorRegistry | None) -> None:
         self.console = console
         self._access = access
+        self._metrics = metrics
         self._viewers: dict[str, Viewer] = {}
         self._reading = ReadingRoutes(console, self._viewer)
         self._recordings = RecordingRoutes(console, self._viewer)
@@ -152,6 +150,7 @@ class _Site:
             WebSocketRoute("/api/live", self._live),
             WebSocketRoute("/api/cameras/{path:path}/live", self._pictures),
             Mount("/static", StaticFiles(directory=_STATIC)),
+            *([] if self._metrics is None else [Route("/metrics", showing(self._metrics))]),
             *self._studio_routes(),
         ]
 
@@ -176,7 +175,7 @@ class _Site:
         return FileResponse(_STATIC / "index.html")
 
     async def _openapi(self, request: Request) -> Response:
-        return _json(openapi(request.scope.get("root_path", "")))
+        return _json(openapi(request.scope.get("root_path", ""), metrics=self._metrics is not None))
 
     async def _world(self, request: Request) -> Response:
         return _json(encode(self.console.world))

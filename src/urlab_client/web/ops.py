@@ -118,11 +118,12 @@ def _controller(client: URLabClient, key: str) -> URLabController | None:
 
 
 @lru_cache(maxsize=8)
-def openapi(root: str = "") -> bytes:
+def openapi(root: str = "", *, metrics: bool = False) -> bytes:
     """Return the OpenAPI 3.1 document of the whole HTTP API.
 
     Args:
         root: The path under which the application is mounted, or a proxy shows it.
+        metrics: Whether it serves `/metrics`.
     """
     ops = [op for op in OPS.values() if op.request not in _UNSERVED]
     replies = [_STARTED if op.reply is BeginPieOk else op.reply for op in ops]
@@ -149,7 +150,11 @@ def openapi(root: str = "") -> bytes:
             },
             "servers": [{"url": root or "/"}],
             "security": security,
-            "paths": {**_PATHS, **{f"/api/ops/{op.name}": {"post": _operation(op)} for op in ops}},
+            "paths": {
+                **_PATHS,
+                **(_METRICS if metrics else {}),
+                **{f"/api/ops/{op.name}": {"post": _operation(op)} for op in ops},
+            },
         }
     )
 
@@ -208,6 +213,18 @@ def _path(method: str, name: str, summary: str, **more: Any) -> dict[str, Any]:
         }
     }
 
+
+_METRICS: dict[str, Any] = {
+    "/metrics": _path(
+        "get",
+        "metrics",
+        "What this program measures of the client's requests, in Prometheus' text format.",
+        responses={
+            "200": {"description": "Success.", "content": {"text/plain": {"schema": {"type": "string"}}}},
+            "default": _answer("Error", "What went wrong."),
+        },
+    )
+}
 
 _PATHS: dict[str, Any] = {
     "/api/world": _path("get", "world", "Articulations, joints with ranges, actuators, sensors, cameras."),
