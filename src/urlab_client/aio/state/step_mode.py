@@ -116,11 +116,11 @@ async def learn_mode(state: SimState, turn: Turn) -> None:
     """
     with anyio.CancelScope(shield=True):  # its requests have deadlines
         await turn.call(SetPaused(paused=True))  # before: entering live mode does not pause
+        previous: StepMode | str = StepMode.LIVE
         try:
             previous = known(StepMode, (await _request(turn, StepMode.LIVE)).previous_mode)
         except ModeLocked as locked:
-            previous = locked.pinned
-            if previous is not StepMode.LIVE:
+            if locked.pinned is not StepMode.LIVE:
                 await turn.call(SetPaused(paused=False))
                 raise
         if previous is not StepMode.LIVE:
