@@ -29,6 +29,7 @@ NOT_RUN = {
     r"urlab console( tcp://10\..*)?$": "goes to an editor",
     r"urlab mcp ": "tests/mcp run it",
     r"uvicorn fastapi_backend:app": "tests/examples/test_fastapi_backend.py serves it",
+    r"urlab teleop ": "takes keys from a terminal",
     r".* --python lerobot-env/": "needs LeRobot, which has an environment of its own",
     r"(KEY=\$\()?curl ": "test_docs_console.py makes these requests",
 }

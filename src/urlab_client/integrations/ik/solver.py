@@ -130,9 +130,7 @@ class InverseKinematics:
         self._low, self._high = np.array([_range(joint, actuator) for joint, actuator in self._held]).T
         self._private = _restricted(model, ids, self._low, self._high)
         self._configuration: Any = mink.Configuration(self._private)
-        self._task: Any = mink.FrameTask(
-            self._id, kind, position_cost=1.0, orientation_cost=1.0, lm_damping=_LM_DAMPING
-        )
+        self._task: Any = mink.FrameTask(model_names(model, kind)[self._id], kind, 1.0, 1.0, lm_damping=_LM_DAMPING)
         dofs = np.array(model.jnt_dofadr[ids], dtype=np.intp)
         frozen = sorted(set(range(model.nv)) - set(dofs.tolist()))
         self._frozen: list[Any] = [mink.DofFreezingTask(self._private, frozen)] if frozen else []
