@@ -11,7 +11,9 @@ import asyncio
 import logging
 import time
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 from urlab_client.aio.transport.base import LateReply, RequestTransport, TransportStats
 from urlab_client.aio.transport.busy_poll import BusyPoll
@@ -56,6 +58,34 @@ _GLANCE_S = 0.05
 # Looking from the loop before the thread is asked to; longer than the last waits took is of no use.
 _SPIN_S = 400e-6
 _LONGEST_SPIN_S = 2e-3
+
+
+class _Way(NamedTuple):
+    """What an op alone says about the way of its requests.
+
+    Attributes:
+        detour: Why they cannot go over shared memory, whatever its state; empty if they can.
+        pictures: Whether they may ask for pictures, which do not fit.
+        state: Whether replies hold the state, which is of about one size.
+    """
+
+    detour: str
+    pictures: bool
+    state: bool
+
+
+@cache
+def _way_of(op: Op) -> _Way:
+    detour = ""
+    if op.needs is Needs.EDITOR:
+        detour = "editor op"
+    elif op.ns == "scene":
+        detour = "upload"  # its chunks and its reply outgrow a slot
+    elif op.name in _UNBOUNDED:
+        detour = "handshake" if op.needs is Needs.NOTHING else "reply may be too large"
+    elif op.name in _UPLOADS:
+        detour = "upload"
+    return _Way(detour, op.name == "step", issubclass(op.reply, StateReply))
 
 
 class _Pending:
@@ -161,25 +191,32 @@ class ShmTransport:
         self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
     ) -> bytes:
         """See `RequestTransport.request`. Where late replies come is told of what goes over ZMQ, as handshakes do."""
-        detour = self._detour(frame, op)
+        way = _way_of(op)
+        pictures = way.pictures and b"include_cameras" in frame
+        detour = way.detour or ("pictures" if pictures else self._refused.get(op.name, ""))
         channel = None
         if not detour:
-            channel = self._usable_channel()
+            loop = asyncio.get_running_loop()
+            now = loop.time()
+            channel = self._usable_channel(now)
             if channel is None:
                 detour = self._obstacle
             elif len(frame) > channel.limit:
                 detour = "request too large"
-            elif issubclass(op.reply, StateReply) and not 0 < self._largest_state * _GROWTH <= channel.limit:
+            elif way.state and not 0 < self._largest_state * _GROWTH <= channel.limit:
                 detour = "reply may be too large" if self._largest_state else "size of the reply not known yet"
-        if channel is not None and not detour:
-            answer = await self._over_shm(channel, frame, op, deadline)
-            detour = self._refusal(answer, op)
-            if not detour:
-                self._learn(frame, op, answer)
-                return answer
+            else:
+                pending = _Pending(op, loop.create_future(), now, deadline)
+                answer = await self._over_shm(channel, frame, pending, loop)
+                detour = self._refusal(answer, op)
+                if not detour:
+                    if way.state and len(answer) > self._largest_state:
+                        self._largest_state = len(answer)
+                    return answer
         self.stats.over_zmq[detour] = self.stats.over_zmq.get(detour, 0) + 1
         answer = await self._inner.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
-        self._learn(frame, op, answer)
+        if way.state and not pictures:
+            self._largest_state = max(self._largest_state, len(answer))
         return answer
 
     async def aclose(self) -> None:
@@ -196,24 +233,8 @@ class ShmTransport:
 
     # Which way
 
-    def _detour(self, frame: bytes, op: Op) -> str:
-        """Return why a request cannot go over shared memory, whatever its state; empty if it can."""
-        if op.needs is Needs.EDITOR:
-            return "editor op"
-        if op.ns == "scene":
-            return "upload"  # its chunks and its reply outgrow a slot
-        if op.name in _UNBOUNDED:
-            return "handshake" if op.needs is Needs.NOTHING else "reply may be too large"
-        if op.name in _UPLOADS:
-            return "upload"
-        if op.name == "step" and b"include_cameras" in frame:
-            return "pictures"
-        return self._refused.get(op.name, "")
-
-    def _usable_channel(self) -> RegionChannel | None:
+    def _usable_channel(self, now: float) -> RegionChannel | None:
         """Return the channel if it may be used right now."""
-        loop = asyncio.get_running_loop()
-        now = loop.time()
         if self._closed or self._pending is not None:
             self._obstacle = "busy"
             return None
@@ -231,7 +252,7 @@ class ShmTransport:
                 self._put_off(error)
                 return None
         self._used_at = now
-        if not self._is_clean(channel):
+        if channel.dirty and not self._is_clean(channel):
             if self._channel is not None:
                 self._obstacle = "waiting for an old reply"
             return None
@@ -286,15 +307,13 @@ class ShmTransport:
                 return ""
         return self._refused.get(op.name, "")
 
-    def _learn(self, frame: bytes, op: Op, answer: bytes) -> None:
-        if issubclass(op.reply, StateReply) and b"include_cameras" not in frame:
-            self._largest_state = max(self._largest_state, len(answer))
-
     # Over shared memory
 
-    async def _over_shm(self, channel: RegionChannel, frame: bytes, op: Op, deadline: float | None) -> bytes:
-        loop = asyncio.get_running_loop()
-        pending = self._pending = _Pending(op, loop.create_future(), loop.time(), deadline)
+    async def _over_shm(
+        self, channel: RegionChannel, frame: bytes, pending: _Pending, loop: asyncio.AbstractEventLoop
+    ) -> bytes:
+        op, deadline = pending.op, pending.deadline
+        self._pending = pending
         # Until the reply is here, whatever ends the wait leaves one that is still to come.
         channel.dirty = True
         try:
@@ -315,7 +334,8 @@ class ShmTransport:
                     self._glances = loop.call_later(_GLANCE_S, self._glance, loop)
             answer = await pending.future
         finally:
-            self._unwatch()
+            if pending.watch is not None:
+                self._unwatch()
             self._pending = None
             self._used_at = loop.time()
         channel.dirty = False

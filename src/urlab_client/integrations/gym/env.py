@@ -21,6 +21,7 @@ from urlab_client.integrations.gym.task import EpisodeSettings, Task, check_alon
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.names import NameMap
+from urlab_client.protocol.pixels import without_alpha
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.articulation import URLabArticulation, URLabEntity
@@ -259,7 +260,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         frame = self._episode.frames.get(self._rendered[0])
         if frame is None:
             raise gymnasium.error.ResetNeeded("call reset() before render()")
-        return np.array(frame[..., :3], dtype=np.uint8)
+        return without_alpha(frame)
 
     def close(self) -> None:
         """Close the client, if it was made for this environment; put back what this one varied on its server."""

@@ -24,7 +24,7 @@ from urlab_client.protocol.enums import CameraMode, ObservationLevel, StepMode
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.cameras import CameraDelay
 from urlab_client.protocol.messages.session import StepOk
-from urlab_client.protocol.pixels import Pixels
+from urlab_client.protocol.pixels import Pixels, without_alpha
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.randomise.variation import EpisodeDraws, declared_in
 from urlab_client.sync.client import URLabClient as BlockingClient
@@ -354,7 +354,7 @@ class EnvEpisode:
         frame = self.frames[name]
         if self._cameras[name].mode != CameraMode.REAL:
             return frame
-        return np.ascontiguousarray(frame[..., :3], dtype=np.uint8)
+        return without_alpha(frame)
 
     def _with_cameras(self, cameras: Sequence[str]) -> Space:
         mapping = self.mapping
