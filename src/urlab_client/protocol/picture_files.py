@@ -44,21 +44,26 @@ def png(pixels: Pixels, mode: CameraMode | str) -> bytes:
     return _encoded(_image(np.where(within, depth, 0).astype(np.uint16)), "PNG")
 
 
-def jpeg(pixels: Pixels, mode: CameraMode | str, quality: int = JPEG_QUALITY) -> bytes:
+def jpeg(pixels: Pixels, mode: CameraMode | str, quality: int = JPEG_QUALITY, *, max_size: int | None = None) -> bytes:
     """Return a picture as JPEG, to be looked at: colours, or depth as grey, near is bright.
 
     Args:
         pixels: As in `CameraSample`.
         mode: What they mean.
         quality: 1 to 100.
+        max_size: Pixels that the longer side may have; None leaves the picture as large as it is.
 
     Raises:
         MissingExtra: Pillow is not installed.
-        ValueError: There is no such quality.
+        ValueError: There is no such quality or size.
     """
     if not 1 <= quality <= 100:
         raise ValueError(f"the quality of a JPEG is 1 to 100, got {quality}")
+    if max_size is not None and max_size < 1:
+        raise ValueError(f"max_size is at least 1 pixel, got {max_size}")
     image = _image(_grey(pixels)) if mode == CameraMode.DEPTH else pillow_image(pixels, mode)
+    if max_size is not None:
+        image.thumbnail((max_size, max_size))
     return _encoded(image, "JPEG", quality=quality)
 
 
