@@ -116,4 +116,4 @@ class Tools(Moving):
     def _edited(self, done: str) -> Edited:
         robots = list(self.client.articulations)
         bodies = [name for name in self.client.entities if name not in self.client.articulations]
-        return self.stamped(Edited(done=done, robots=robots, bodies=bodies))
+        return Edited(done, robots, bodies)

@@ -6,7 +6,6 @@ Pydantic is not imported: it calls this, from the hooks of `Serializable`. Value
 from __future__ import annotations
 
 import base64
-import re
 from collections.abc import Callable, Mapping
 from contextvars import ContextVar
 from types import UnionType
@@ -17,6 +16,7 @@ import numpy as np
 from msgspec import NODEFAULT, Struct
 from numpy.typing import NDArray
 
+from urlab_client.protocol.schemas import field_notes, prose
 from urlab_client.protocol.serializable import plain
 
 __all__ = ["core_schema", "json_schema", "kinds_of"]
@@ -60,23 +60,12 @@ def json_schema(struct: type[Struct], schema: Schema, handler: Any) -> Schema:
     """
     made = handler(schema)
     own = handler.resolve_ref_schema(made)
-    text = struct.__doc__ or ""
-    own |= {"title": struct.__name__, "description": text.partition("\n\n")[0].strip()}
-    said = dict(_ATTRIBUTE.findall(text.partition("Attributes:\n")[2]))
+    own |= {"title": struct.__name__, "description": prose(struct)}
     properties: dict[str, Schema] = own.get("properties", {})
-    for field in msgspec.structs.fields(struct):
-        description = _annotated(field.type) or " ".join(said.get(field.name, "").split())
-        if description and field.name in properties:
-            properties[field.name]["description"] = description
+    for name, note in field_notes(struct).items():
+        if name in properties:
+            properties[name]["description"] = note
     return made
-
-
-_ATTRIBUTE = re.compile(r"^ {8}(\w+): (.*(?:\n {9,}.*)*)", re.MULTILINE)
-
-
-def _annotated(annotation: Any) -> str:
-    notes = get_args(annotation)[1:] if get_origin(annotation) is Annotated else ()
-    return next((note.description for note in notes if isinstance(note, msgspec.Meta) and note.description), "")
 
 
 def kinds_of(struct: type[Struct]) -> dict[str, type[Struct]]:

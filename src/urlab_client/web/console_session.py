@@ -10,11 +10,12 @@ import contextlib
 import logging
 import time
 from collections import deque
-from collections.abc import AsyncGenerator, Generator, Mapping
+from collections.abc import AsyncGenerator, Callable, Generator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import anyio
+import anyio.to_thread
 import numpy as np
 from msgspec import structs
 
@@ -78,9 +79,16 @@ class ConsoleSession:
         client: The client; the console opens its session and keeps it.
         lease: The controls.
         recordings: Folder for recordings.
+        handshake: Returns what a read-only client discovers with; None for one that opens the session.
     """
 
-    def __init__(self, client: URLabClient, lease: DrivingLease, recordings: Path) -> None:
+    def __init__(
+        self,
+        client: URLabClient,
+        lease: DrivingLease,
+        recordings: Path,
+        handshake: Callable[[], bytes] | None = None,
+    ) -> None:
         self.client = client
         self.lease = lease
         self.link: Link = Link("connecting", since=time.time())
@@ -95,6 +103,8 @@ class ConsoleSession:
         self.controls: Controls = Controls(self)
         self.recordings: Recordings = Recordings(client, recordings)
         self.replay: Replay = Replay(self)
+        self._handshake = handshake
+        self._adopted = b""
         self._bells: set[asyncio.Event] = set()
         self._n = 0
         self._want: str | None = "discover"
@@ -153,10 +163,10 @@ class ConsoleSession:
                 try:
                     await self.client.resync(timeout=_CONNECT_S)
                 except URLabError:
-                    await self.client.discover()
+                    await self._discover()
             else:
-                await self.client.discover()
-        except (URLabError, OSError) as error:
+                await self._discover()
+        except (URLabError, OSError, ValueError) as error:
             self._want = "discover" if want == "discover" else "resync"
             if self.link.reason != str(error):
                 self._set_link("lost" if self._ready.is_set() else "connecting", str(error))
@@ -165,6 +175,15 @@ class ConsoleSession:
         self._set_link("connected")
         self._ready.set()
         self._begin_anew()
+
+    async def _discover(self) -> None:
+        if self._handshake is None:
+            await self.client.discover()
+            return
+        given = await anyio.to_thread.run_sync(self._handshake)
+        if given != self._adopted:
+            await self.client.discover(handshake=given)
+            self._adopted = given
 
     def _take(self, event: ClientEvent) -> None:
         """Act on what happened to the connection."""
@@ -226,7 +245,10 @@ class ConsoleSession:
                     while True:
                         snapshot = await states.receive(timeout=None)
                         self._note_time(snapshot.time)
-                        if not self.replay.open:
+                        if self._handshake is not None and not self.client.matches(snapshot):
+                            self.take_back()  # play began anew, and the driver has said so, or will
+                            await anyio.sleep(_RETRY_S)
+                        elif not self.replay.open:
                             self._publish(snapshot, {key: self._targets(key) for key in snapshot.per_articulation})
                         # By the clock and not by when it woke up, else each late awakening makes the rate lower.
                         due = max(due + _PERIOD_S, time.monotonic() - _PERIOD_S)
