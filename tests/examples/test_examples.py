@@ -14,6 +14,9 @@ import pytest
 # Examples that serve until they are told to stop, and the tests of which are elsewhere.
 SERVING = {"fastapi_backend"}
 
+# What a test of its own runs, with fewer episodes.
+SHORTENED = {"clone_behaviour"}
+
 # What no extra of the project installs. tools/check_learning.py runs them.
 FOREIGN = {"rllib_reach"}
 
@@ -24,7 +27,9 @@ MARKED = {
 }
 
 EXAMPLES = sorted(
-    path for path in (Path(__file__).parents[2] / "examples").glob("*.py") if path.stem not in SERVING | FOREIGN
+    path
+    for path in (Path(__file__).parents[2] / "examples").glob("*.py")
+    if path.stem not in SERVING | FOREIGN | SHORTENED
 )
 
 
