@@ -172,7 +172,7 @@ def test_a_slow_environment_counts_as_failed_and_holds_up_nobody_for_longer(made
 def test_an_environment_that_takes_long_to_come_back_holds_up_nobody(
     servers: list[str], made: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    env = URLabVectorEnv(servers, step_timeout=0.5)
+    env = URLabVectorEnv(servers, step_timeout=2.0)
     made.append(env)
     env.reset(seed=0)
     action = np.zeros(env.action_space.shape)
