@@ -1,6 +1,6 @@
 """Drives the environments with the learning libraries that users bring: Stable-Baselines3, RLlib, LeRobot and others.
 
-    pip install stable-baselines3 'ray[rllib]' mujoco-warp mujoco-mjx
+    pip install stable-baselines3 'ray[rllib]' mujoco-warp mujoco-mjx 'minari[create,hdf5]'
     python tools/check_learning.py            # or the names of some checks
     python tools/check_learning.py lerobot envhub --lerobot-python ENVIRONMENT/bin/python
 
@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -130,6 +131,49 @@ def mjx() -> str:
     if error > 1e-4:
         raise AssertionError(f"a step differs by {error}")
     return f"two copies, a step within {error:.0e}, on {jax.devices()[0].platform}"
+
+
+def minari() -> str:
+    """Minari collects what was driven, and loads it again: numbers, and pictures under LeRobot's names."""
+    library: Any = import_module("minari")
+    envhub: Any = import_module("urlab_client.integrations.gym.envhub")
+    rng = np.random.default_rng(1)
+    frames = 0
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["MINARI_DATASETS_PATH"] = folder
+        pictures: dict[str, Any] = {"space_mode": "dict", "observations": ["qpos"], "cameras": ["arm/wrist"]}
+        for number, options in enumerate(({}, pictures)):
+            env = gymnasium.make("urlab/Reach-v0", max_episode_steps=20, **options)
+            if options:
+                env = envhub.ForLeRobot(env, description="reach")
+            collector = library.DataCollector(env, jpeg_encoding=False)  # pictures without loss
+            driven: list[tuple[list[Any], list[Any], list[Any]]] = []
+            for seed in range(2):
+                seen: list[Any] = [collector.reset(seed=seed)[0]]
+                actions, rewards, over = [], [], False
+                while not over:
+                    actions.append(rng.uniform(-0.3, 0.3, 7).astype(np.float32))
+                    observation, reward, terminated, truncated, _ = collector.step(actions[-1])
+                    seen.append(observation)
+                    rewards.append(reward)
+                    over = terminated or truncated
+                driven.append((seen, actions, rewards))
+            name = f"urlab/reach-v{number}"
+            collector.create_dataset(name, algorithm_name="random", code_permalink="-", author="-", author_email="-")
+            collector.close()
+            loaded = library.load_dataset(name)
+            for episode, (seen, actions, rewards) in zip(loaded.iterate_episodes(), driven, strict=True):
+                found = episode.observations
+                pairs = [(found, seen), (episode.actions, actions), (episode.rewards, rewards)]
+                if options:
+                    pairs[0] = (found["agent_pos"], [each["agent_pos"] for each in seen])
+                    looked = [each["pixels"]["arm.wrist"] for each in seen]
+                    pairs.append((found["pixels"]["arm.wrist"], looked))
+                for ours, theirs in pairs:
+                    if not np.array_equal(ours, np.array(theirs)):
+                        raise AssertionError("the dataset differs from what was driven")
+                frames += len(rewards)
+    return f"{frames} steps of 4 episodes equal what was driven"
 
 
 def gym_async() -> str:
@@ -282,6 +326,7 @@ CHECKS: dict[str, tuple[str, Callable[[], str]]] = {
     "gym-async": ("gymnasium", gym_async),
     "warp": ("mujoco-warp", warp),
     "mjx": ("mujoco-mjx", mjx),
+    "minari": ("minari", minari),
     "rllib": ("ray", rllib),
 }
 

@@ -61,6 +61,7 @@ def environments() -> dict[str, list[str]]:
     """Return what to install beside the package, by environment."""
     return {
         "mujoco-3.8": ["mujoco==3.8.*"],
+        "mujoco-3.10": ["mujoco==3.10.*"],
         "mujoco-3.11": ["mujoco==3.11.*"],
         "mujoco-newest": ["mujoco"],
         "lowest": lowest(),

@@ -73,6 +73,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Run:
         SimulatedServer("arm", str(mjcf), play=True, model_roots=[folder]) as server,
         urlab_client.URLabClient(**server.client_options(), step_mode="direct") as client,
     ):
+        assert server.can_render  # the first picture would wait for that
         client.discover()
         client.reset()
         with record(client, folder / "run.mcap", cameras=["eye/up"], camera_hz=25, image_format="png"):

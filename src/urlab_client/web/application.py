@@ -209,7 +209,7 @@ class _Site:
     async def _op(self, request: Request) -> Response:
         op = served(request.path_params["op"])
         if op is None:
-            return _error(404, "unknown_op", f"There is no op {request.path_params['op']!r} here.", "See openapi.json.")
+            return _error(404, "unknown_op", f"No op is called {request.path_params['op']!r}.", "See openapi.json.")
         body = await _body(request)
         return _json(encode(await self.console.controls.do(self._viewer(request), parse(op, body))))
 

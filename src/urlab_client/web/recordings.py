@@ -185,7 +185,7 @@ class Recordings:
         """
         file = self.folder / name
         if not _NAME.fullmatch(name) or not file.is_file():
-            raise KeyError(f"there is no recording {name!r}")
+            raise KeyError(f"no recording is called {name!r}")
         return file
 
     async def describe(self, name: str) -> dict[str, Any]:

@@ -14,10 +14,11 @@ from typing import Final
 
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.live.camera_source import FIRST_PICTURE_S, CameraSource, HasCamera
+from urlab_client.aio.live.camera_source import CameraSource, HasCamera
 from urlab_client.aio.session import Turn
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_mode import learn_mode, stopped_live
+from urlab_client.aio.state.step_pictures import first_picture_s
 from urlab_client.aio.transport.subscriber import MessageHandler
 from urlab_client.protocol.codec import op_of
 from urlab_client.protocol.enums import StepMode
@@ -106,8 +107,8 @@ class Capturing:
         seconds = self._default_timeout if timeout is DEFAULT else timeout
         if seconds is None:
             return None
-        if timeout is DEFAULT and any(view.latest_frame is None for view in views):
-            seconds = max(seconds, FIRST_PICTURE_S)
+        if timeout is DEFAULT:
+            seconds = max(seconds, first_picture_s(views))
         return asyncio.get_running_loop().time() + seconds
 
     async def _learn_mode(self, turn: Turn) -> None:
@@ -179,7 +180,8 @@ class _Taking:
         while True:
             request = Step(include_cameras=dict.fromkeys(missing, "sync"), render="sync")
             request.camera_timeout_ms = 1000.0 * _RENDER_S
-            reply = await turn.call(request, takes=(op_of(Step).timeout or 0.0) + _RENDER_S)
+            seconds = _RENDER_S + first_picture_s(missing.values())
+            reply = await turn.call(request, takes=(op_of(Step).timeout or 0.0) + seconds)
             for name, frame in (reply.cameras or {}).items():
                 if name in missing and (frame.frame_id or 0) >= (reply.frame_id or 0):
                     view = missing.pop(name)

@@ -11,9 +11,7 @@ import asyncio
 import logging
 import time
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
-from typing import NamedTuple
 
 from urlab_client.aio.transport.base import LateReply, RequestTransport, TransportStats
 from urlab_client.aio.transport.busy_poll import BusyPoll
@@ -22,8 +20,9 @@ from urlab_client.aio.transport.mapped_region import RegionInUse
 from urlab_client.aio.transport.poller import ReplyPoll
 from urlab_client.aio.transport.region_channel import SYNC_PREFIX, RegionChannel, envelope_of, opening_of
 from urlab_client.aio.transport.server_regions import SharedMemoryRegions
+from urlab_client.aio.transport.shm_way import way_of
 from urlab_client.protocol import doorbell
-from urlab_client.protocol.base import Effect, Needs, Op
+from urlab_client.protocol.base import Effect, Op
 from urlab_client.protocol.errors import (
     ClientClosed,
     ConnectionLost,
@@ -33,7 +32,7 @@ from urlab_client.protocol.errors import (
     URLabError,
     URLabTimeoutError,
 )
-from urlab_client.protocol.messages.session import HelloOk, StateReply
+from urlab_client.protocol.messages.session import HelloOk
 from urlab_client.protocol.messages.streams import ClientEvent, ServerLost
 from urlab_client.protocol.shm import REPLY_FILE, REQUEST_FILE, RegionNotReady
 
@@ -41,10 +40,6 @@ __all__ = ["ShmTransport"]
 
 log: logging.Logger = logging.getLogger("urlab_client.transport")
 
-# Replies that grow with what happens in the scene, whatever size they had before.
-_UNBOUNDED = frozenset({"hello", "meta", "get_contacts", "list_keyframes", "replay_list_sessions"})
-# Pieces are larger than slots, and one that was executed without an answer may not be sent again.
-_UPLOADS = frozenset({"upload_model_manifest", "upload_model_chunk", "upload_model_commit"})
 # A reply may be so many times larger than the largest one of its kind seen before.
 _GROWTH = 8
 
@@ -58,34 +53,6 @@ _GLANCE_S = 0.05
 # Looking from the loop before the thread is asked to; longer than the last waits took is of no use.
 _SPIN_S = 400e-6
 _LONGEST_SPIN_S = 2e-3
-
-
-class _Way(NamedTuple):
-    """What an op alone says about the way of its requests.
-
-    Attributes:
-        detour: Why they cannot go over shared memory, whatever its state; empty if they can.
-        pictures: Whether they may ask for pictures, which do not fit.
-        state: Whether replies hold the state, which is of about one size.
-    """
-
-    detour: str
-    pictures: bool
-    state: bool
-
-
-@cache
-def _way_of(op: Op) -> _Way:
-    detour = ""
-    if op.needs is Needs.EDITOR:
-        detour = "editor op"
-    elif op.ns == "scene":
-        detour = "upload"  # its chunks and its reply outgrow a slot
-    elif op.name in _UNBOUNDED:
-        detour = "handshake" if op.needs is Needs.NOTHING else "reply may be too large"
-    elif op.name in _UPLOADS:
-        detour = "upload"
-    return _Way(detour, op.name == "step", issubclass(op.reply, StateReply))
 
 
 class _Pending:
@@ -191,7 +158,7 @@ class ShmTransport:
         self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
     ) -> bytes:
         """See `RequestTransport.request`. Where late replies come is told of what goes over ZMQ, as handshakes do."""
-        way = _way_of(op)
+        way = way_of(op)
         pictures = way.pictures and b"include_cameras" in frame
         detour = way.detour or ("pictures" if pictures else self._refused.get(op.name, ""))
         channel = None
