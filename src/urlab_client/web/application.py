@@ -32,6 +32,7 @@ from urlab_client.web import mujoco_viewer
 from urlab_client.web.access import Access, Guarded
 from urlab_client.web.console_session import Audience, ConsoleSession
 from urlab_client.web.driving_lease import DrivingLease, NotDriving, Viewer
+from urlab_client.web.handling_routes import HandlingRoutes
 from urlab_client.web.messages import Ack, Ctrl, FromViewer, Log, Name, Ping, Pong, Refused, You
 from urlab_client.web.metrics import showing
 from urlab_client.web.model_upload import ModelRoutes
@@ -124,6 +125,7 @@ class _Site:
         self._reading = ReadingRoutes(console, self._viewer)
         self._recordings = RecordingRoutes(console, self._viewer)
         self._models = ModelRoutes(console, self._viewer)
+        self._handling = HandlingRoutes(console.handling, self._viewer, _body)
 
     def routes(self) -> list[Route | WebSocketRoute | Mount]:
         def route(path: str, handler: _Handler, *methods: str) -> Route:
@@ -143,7 +145,11 @@ class _Site:
             route("/api/step", self._step, "POST"),
             *(
                 route(path, handler, *methods)
-                for path, handler, methods in (*self._recordings.routes(), *self._models.routes())
+                for path, handler, methods in (
+                    *self._recordings.routes(),
+                    *self._models.routes(),
+                    *self._handling.routes(),
+                )
             ),
             route("/api/lease", self._lease, "POST", "DELETE"),
             route("/api/connection", self._connection, "POST"),
@@ -354,12 +360,15 @@ class _Site:
         with self.console.bell() as changed:
 
             async def send() -> None:
-                sent = None
+                sent = told = None
                 with contextlib.suppress(WebSocketDisconnect, RuntimeError):
                     while True:
                         changed.clear()
                         snapshot = self.console.snapshot
                         shown = await self.console.mujoco_viewer.shown()
+                        if shown and shown is not told:
+                            told = shown
+                            await socket.send_text(mujoco_viewer.LAYOUT + shown.layout)
                         if shown and snapshot and snapshot is not sent and flow.sent - flow.acknowledged < _AHEAD:
                             sent = snapshot
                             flow.sent += 1

@@ -35,6 +35,7 @@ from urlab_client.protocol.messages.streams import (
 from urlab_client.web.controls import Controls
 from urlab_client.web.description import WorldDescription, describe
 from urlab_client.web.driving_lease import DrivingLease, Viewer
+from urlab_client.web.handling import Handling
 from urlab_client.web.messages import ArticulationSample, EntitySample, Link, LogEntry, State, Status, World
 from urlab_client.web.mujoco_viewer import MujocoViewer
 from urlab_client.web.ops import encode
@@ -95,6 +96,8 @@ class ConsoleSession:
         self.controls: Controls = Controls(self)
         self.recordings: Recordings = Recordings(client, recordings)
         self.replay: Replay = Replay(self)
+        self.handling: Handling = Handling(self)
+        self.controls.before_step = self.handling.apply
         self._bells: set[asyncio.Event] = set()
         self._n = 0
         self._want: str | None = "discover"
@@ -256,6 +259,7 @@ class ConsoleSession:
 
     def _publish(self, snapshot: StateSnapshot, targets: Mapping[str, list[float] | None]) -> None:
         self.snapshot = snapshot
+        self.mujoco_viewer.follow(snapshot)
         self.state_seq += 1
         wall = snapshot.wall_time.sec + snapshot.wall_time.nsec / 1e9
         received = snapshot.recv_wall_time_ns / 1e9
