@@ -8,11 +8,11 @@ vanishes lets go.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import numpy as np
 from msgspec import Meta, Struct
+from numpy.typing import NDArray
 
 from urlab_client.protocol.enums import StepMode
 from urlab_client.web.driving_lease import DrivingLease, Viewer
@@ -245,18 +245,21 @@ def _name(shown: Shown, body: int) -> str:
 
 def _view(shown: Shown, body: int) -> BodyView:
     mass = float(shown.model.body_mass[body])
-    position = np.round(shown.data.xpos[body], 4).tolist()
-    return BodyView(body, _name(shown, body), _owner(shown, body), round(mass, 4), position)
+    return BodyView(body, _name(shown, body), _owner(shown, body), round(mass, 4), _rounded(shown.data.xpos[body]))
 
 
 def _sphere(shown: Shown) -> tuple[list[float], float]:
     """Return a sphere around all robots, or around all bodies where there is none."""
     model, data = shown.model, shown.data
     owned = np.array([bool(_owner(shown, body)) for body in range(model.nbody)])
-    bodies: Sequence[bool] = owned if owned.any() else np.arange(model.nbody) > 0
-    geoms = np.asarray(bodies)[model.geom_bodyid] & (model.geom_rbound > 0.0)
+    bodies = owned if owned.any() else np.arange(model.nbody) > 0
+    geoms = bodies[model.geom_bodyid] & (model.geom_rbound > 0.0)
     if not geoms.any():
         return [0.0, 0.0, 0.0], 1.0
     places, sizes = data.geom_xpos[geoms], model.geom_rbound[geoms, None]
     low, high = (places - sizes).min(axis=0), (places + sizes).max(axis=0)
-    return np.round((low + high) / 2.0, 4).tolist(), round(float(np.linalg.norm(high - low)) / 2.0, 4)
+    return _rounded((low + high) / 2.0), round(float(np.linalg.norm(high - low)) / 2.0, 4)
+
+
+def _rounded(values: NDArray[np.float64]) -> list[float]:
+    return [round(float(value), 4) for value in values]
