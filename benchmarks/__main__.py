@@ -12,9 +12,12 @@ from pathlib import Path
 import msgspec
 
 from benchmarks.harness import Result, measure
-from benchmarks.machine import describe
+from benchmarks.machine import commit, describe
 from benchmarks.robots import DIALECT
 from benchmarks.rows import all_rows, one_row
+
+RELEASED = Path(__file__).parent / "released.json"
+"""Figures of the latest release, on a machine that does nothing else."""
 
 
 def main() -> int:
@@ -25,6 +28,9 @@ def main() -> int:
     parser.add_argument("--row", metavar="NAME", help="the one row of that name")
     parser.add_argument("--against", type=Path, metavar="FILE", help="figures of another run to report the change from")
     parser.add_argument("--json", type=Path, default=Path("benchmarks.json"), help="file to write (%(default)s)")
+    parser.add_argument(
+        "--released", action="store_true", help=f"write {RELEASED.parent.name}/{RELEASED.name}: every row of a commit"
+    )
     parser.add_argument("--seconds", type=float, help="seconds to measure each row, instead of 10, or 1 with --quick")
     parser.add_argument(
         "--dialect", choices=("alpha", "beta"), default="alpha", help="what the rows' servers speak (%(default)s)"
@@ -43,6 +49,12 @@ def main() -> int:
         for row in rows:
             print(f"{row.name:<30}{row.what} / {row.floor}")
         return 0
+    if options.released:
+        if options.only or options.row:
+            parser.error("--released takes every row: leave out --only and --row")
+        if commit() is None or str(commit()).endswith("+"):
+            parser.error("--released: the figures name a commit; commit the changes first")
+        options.json = RELEASED
     seconds = options.seconds or (1.0 if options.quick else 10.0)
     before = describe()
     print(f"{before['cpu']}, {before['cores']} cores, load {before['load']}, Python {before['python']}\n")
@@ -69,8 +81,13 @@ def _compare(results: Sequence[Result], against: Path) -> None:
     if not against.exists():
         print(f"\nno figures to compare with: {against} does not exist")
         return
-    known = {row["name"]: row for row in msgspec.json.decode(against.read_bytes())["rows"]}
-    print(f"\nratios by those of {against}; the brackets are the 10-90 % of rounds, then and now")
+    document = msgspec.json.decode(against.read_bytes())
+    known = {row["name"]: row for row in document["rows"]}
+    then = document["before"]
+    print(
+        f"\nratios by those of {against}, {then.get('time', 'at an unknown time')}, commit {then.get('commit')}, "
+        f"{then['cpu']}, {then['cores']} cores, load {then['load']}; in brackets the 10-90 % of rounds, then and now"
+    )
     for result in results:
         row = known.get(result.row.name)
         if row is None:

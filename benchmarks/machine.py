@@ -5,12 +5,14 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import platform
+import subprocess
 import sys
+from datetime import UTC, datetime
 from pathlib import Path
 
 import zmq
 
-__all__ = ["describe"]
+__all__ = ["commit", "describe"]
 
 _PACKAGES = ("mujoco", "msgspec", "numpy", "pyzmq", "anyio", "urlab-client", "uvloop")
 
@@ -25,6 +27,8 @@ def describe() -> dict[str, object]:
             continue
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return {
+        "time": datetime.now(UTC).isoformat(timespec="seconds"),
+        "commit": commit(),
         "cpu": _cpu(),
         "cores": usable,
         "load": [round(value, 2) for value in os.getloadavg()] if hasattr(os, "getloadavg") else None,
@@ -34,6 +38,20 @@ def describe() -> dict[str, object]:
         "libzmq": zmq.zmq_version(),
         "packages": versions,
     }
+
+
+def commit() -> str | None:
+    """Return the commit of the checkout, with `+` if files of it were changed since; None outside a repository."""
+    try:
+        head, changes = (_git("rev-parse", "HEAD").strip(), _git("status", "--porcelain", "--untracked-files=no"))
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return f"{head}+" if changes else head
+
+
+def _git(*arguments: str) -> str:
+    here = Path(__file__).parent
+    return subprocess.run(["git", *arguments], cwd=here, check=True, capture_output=True, text=True).stdout  # noqa: S607
 
 
 def _cpu() -> str:

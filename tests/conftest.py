@@ -5,12 +5,11 @@ import importlib.metadata
 import importlib.util
 import os
 import sys
-import tomllib
 from collections.abc import Generator
-from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
+from not_on_windows import listed, names
 
 # The tests start hundreds of processes; without bytecode files each would compile the package anew.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -54,23 +53,8 @@ def on_wine() -> bool:
     return hasattr(ctypes.WinDLL("ntdll"), "wine_get_version")
 
 
-def impossible_here() -> dict[str, str]:
-    """Return the tests that this system cannot run, and why: `not_on_windows.toml` is the list."""
-    if sys.platform != "win32":
-        return {}
-    listed = tomllib.loads((Path(__file__).parent / "not_on_windows.toml").read_text("utf-8"))
-    groups = [*listed["windows"], *(listed["wine"] if on_wine() else [])]
-    return {test: group["why"] for group in groups for test in group["tests"]}
-
-
-IMPOSSIBLE = impossible_here()
+IMPOSSIBLE = listed(wine=on_wine()) if sys.platform == "win32" else {}
 collect_ignore = [test.removeprefix("tests/") for test in IMPOSSIBLE if "::" not in test]  # some cannot be imported
-
-
-def impossible(item: pytest.Item) -> bool:
-    """Whether the list names a test, its file or its folder."""
-    name = item.nodeid.partition("[")[0]
-    return any(name == test or name.startswith((f"{test}::", f"{test}/")) or item.nodeid == test for test in IMPOSSIBLE)
 
 
 def too_new(item: pytest.Item) -> bool:
@@ -84,7 +68,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     left_out = [
         item
         for item in items
-        if any(item.get_closest_marker(marker) for marker in MISSING) or too_new(item) or impossible(item)
+        if any(item.get_closest_marker(marker) for marker in MISSING) or too_new(item) or names(IMPOSSIBLE, item.nodeid)
     ]
     if left_out:
         config.hook.pytest_deselected(items=left_out)

@@ -63,9 +63,9 @@ def test_a_model_is_written_with_its_files(robot: Path, tmp_path: Path) -> None:
     _mujoco.write_model(spec, tmp_path / "copy")
 
     original = mujoco.MjModel.from_xml_path(str(robot))
+    _mujoco.check_copy(robot, _mujoco.compiled_file(tmp_path / "copy" / "model.xml"))
     robot.parent.rename(tmp_path / "gone")
-    copy = mujoco.MjModel.from_xml_path(str(tmp_path / "copy" / "model.xml"))
-    _mujoco.check_copy(original, copy)
+    copy = _mujoco.compiled_file(tmp_path / "copy" / "model.xml")
     np.testing.assert_allclose(copy.body_mass, original.body_mass)
     assert copy.ntex == 1
 
@@ -95,12 +95,13 @@ def test_a_scene_is_exported_with_the_files_of_all_its_robots(robot: Path, tmp_p
     assert np.ptp(model.mesh_vert) > 0.5
 
 
+@pytest.mark.usefixtures("old")
 def test_a_copy_with_the_wrong_files_is_refused(robot: Path) -> None:
-    original = mujoco.MjModel.from_xml_path(str(robot))
+    copy = _mujoco.compiled_file(robot)
     (robot.parent / "meshes" / "other.obj").write_text(OBJ.format(0.9))
     robot.write_text(robot.read_text().replace("part.obj", "other.obj"))
     with pytest.raises(ValueError, match="files in folders of their own"):
-        _mujoco.check_copy(original, mujoco.MjModel.from_xml_path(str(robot)))
+        _mujoco.check_copy(robot, copy)
 
 
 @pytest.mark.usefixtures("old")
@@ -190,3 +191,34 @@ def test_one_module_alone_uses_what_older_releases_lack() -> None:
         if NEWER.search(line)
     ]
     assert found == []
+
+
+@pytest.mark.mujoco("3.16")
+def test_files_are_copied_to_where_an_archive_would_have_them(tmp_path: Path) -> None:
+    for part, names in {"meshes": ["a.obj", "b/a.obj", "one.obj", "B.OBJ"], "pictures": ["t.png", "side.png"]}.items():
+        for number, name in enumerate(names):
+            file = tmp_path / "robot" / part / name
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_bytes(PNG) if name.endswith("png") else file.write_text(OBJ.format(0.1 + number))
+    (tmp_path / "elsewhere.obj").write_text(OBJ.format(0.7))
+    sides = " ".join(f'file{side}="side.png"' for side in ("right", "left", "up", "down", "front", "back"))
+    (tmp_path / "robot" / "robot.xml").write_text(
+        '<mujoco><compiler meshdir="meshes" texturedir="pictures"/><asset>'
+        '<mesh file="a.obj"/><mesh name="deeper" file="b/a.obj"/><mesh file="one.obj"/>'
+        '<mesh name="again" file="one.obj"/>'
+        f'<mesh file="B.OBJ"/><mesh file="{tmp_path}/elsewhere.obj"/>'
+        f'<texture name="t" type="2d" file="t.png"/><texture name="c" type="cube" {sides}/></asset>'
+        "<worldbody><geom type='mesh' mesh='a'/></worldbody></mujoco>"
+    )
+    spec = mujoco.MjSpec.from_file(str(tmp_path / "robot" / "robot.xml"))
+    spec.compiler.savecompiled = False
+    spec.encode(str(tmp_path / "robot.mjz"))
+    shutil.unpack_archive(tmp_path / "robot.mjz", tmp_path / "unpacked", "zip")
+
+    _mujoco.write_model(spec, tmp_path / "copied")
+
+    def content(folder: Path) -> dict[Path, bytes]:
+        return {file.relative_to(folder): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+    assert content(tmp_path / "copied") == content(tmp_path / "unpacked")
+    assert _mujoco._plain_files(spec).keys() == {"one.obj", "B.OBJ", f"{tmp_path}/elsewhere.obj", "t.png", "side.png"}

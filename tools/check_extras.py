@@ -2,10 +2,13 @@
 
 Run: python tools/check_extras.py [EXTRA ...]
 
-For each extra of pyproject.toml, pip resolves what a fresh environment with the package, the extra and viser holds.
-Into such an environment goes the metadata of all of it, without the files, and `pip check` looks there: it reads
-nothing else, and most of the size is the files. Viser is held at the version that pip chooses when nothing else is
-asked for, lest the resolver makes an extra fit by taking an old one. Exit code 1 says that something does not fit.
+All extras of pyproject.toml together come first: the versions that fit for all of them fit for each, too. Only where
+there are none, or with `--each`, is every extra looked at alone, which shows the one in the way.
+
+Pip resolves what a fresh environment with the package, the extras and viser holds. Into such an environment goes the
+metadata of all of it, without the files, and `pip check` looks there: it reads nothing else, and most of the size is
+the files. Viser is held at the version that pip chooses when nothing else is asked for, lest the resolver makes an
+extra fit by taking an old one. Exit code 1 says that something does not fit.
 """
 
 from __future__ import annotations
@@ -57,25 +60,33 @@ class Checked:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description="Check that the extras fit together and beside viser.")
-    parser.add_argument("extras", nargs="*", help="extras to check (default: each, and all together)")
+    parser.add_argument("extras", nargs="*", help="extras to check, each alone (default: all together)")
+    parser.add_argument("--each", action="store_true", help="check each extra alone, too, where all fit together")
     declared = sorted(project()["optional-dependencies"])
-    chosen: list[str] = parser.parse_args().extras
+    arguments = parser.parse_args()
+    chosen: list[str] = arguments.extras
     unknown = sorted(set(chosen) - set(declared))
     if unknown:
         parser.error(f"no such extra: {', '.join(unknown)}; there are {', '.join(declared)}")
-    asked = [[extra] for extra in chosen or declared] + ([] if chosen else [declared])
 
     newest = version_of(resolve([NEIGHBOUR]), NEIGHBOUR)
     print(f"beside {NEIGHBOUR} {newest}", flush=True)
     width = max(map(len, [*declared, TOGETHER]))
-    failed: list[Checked] = []
-    with ThreadPoolExecutor(AT_ONCE) as pool:
-        for result in pool.map(lambda extras: check(extras, newest), asked):
-            shown = "  ".join(f"{name} {result.versions[name]}" for name in SHOWN if name in result.versions)
-            size = f"{len(result.versions):3} packages  {result.seconds:5.1f} s"
-            print(f"{result.name:<{width}}  {size}  {'FAILED' if result.problem else shown}", flush=True)
-            if result.problem:
-                failed.append(result)
+
+    def failures(asked: list[list[str]]) -> list[Checked]:
+        failed: list[Checked] = []
+        with ThreadPoolExecutor(AT_ONCE) as pool:
+            for result in pool.map(lambda extras: check(extras, newest), asked):
+                shown = "  ".join(f"{name} {result.versions[name]}" for name in SHOWN if name in result.versions)
+                size = f"{len(result.versions):3} packages  {result.seconds:5.1f} s"
+                print(f"{result.name:<{width}}  {size}  {'FAILED' if result.problem else shown}", flush=True)
+                if result.problem:
+                    failed.append(result)
+        return failed
+
+    failed = [] if chosen else failures([declared])
+    if chosen or failed or arguments.each:
+        failed += failures([[extra] for extra in chosen or declared])
     for result in failed:
         print(f"\n{result.name}:\n{result.problem}", file=sys.stderr)
     return 1 if failed else 0

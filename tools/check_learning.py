@@ -1,8 +1,8 @@
-"""Drives the environments with the learning libraries that users bring: Stable-Baselines3, AsyncVectorEnv, RLlib.
+"""Drives the environments with the learning libraries that users bring: Stable-Baselines3, RLlib, LeRobot and others.
 
-    pip install stable-baselines3 'ray[rllib]'
+    pip install stable-baselines3 'ray[rllib]' mujoco-warp mujoco-mjx 'minari[create,hdf5]'
     python tools/check_learning.py            # or the names of some checks
-    python tools/check_learning.py lerobot --lerobot-python ENVIRONMENT/bin/python
+    python tools/check_learning.py lerobot envhub --lerobot-python ENVIRONMENT/bin/python
 
 The libraries are too large for the suite. The suite asserts what they need without them; this says whether they agree.
 It prints a line for each check and exits with 1 when one failed.
@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -82,6 +83,99 @@ def sb3_batch() -> str:
     return f"{model.num_timesteps} steps, {len(model.ep_info_buffer)} episodes of 100 actions"
 
 
+def warp() -> str:
+    """MuJoCo Warp steps a batch: the same spaces, resets with the same bits, steps as near as float32 allows."""
+    worst = 0.0
+    for name in ("urlab/Reach-v0", "urlab/Walk-v0"):
+        ours, plain = (
+            gymnasium.make_vec(name, num_envs=3, backend="batch", max_episode_steps=5, engine=engine)
+            for engine in ("warp", "mujoco")
+        )
+        if (ours.observation_space, ours.action_space) != (plain.observation_space, plain.action_space):
+            raise AssertionError("other spaces")
+        if not np.array_equal(ours.reset(seed=1)[0], plain.reset(seed=1)[0]):
+            raise AssertionError("the resets differ")
+        action = 0.2 * plain.action_space.sample()
+        for step in range(7):
+            seen, expected = ours.step(action), plain.step(action)
+            error = float(np.abs(seen[0] - expected[0]).max())
+            if error > (0.0 if step == 5 else 1e-2):
+                raise AssertionError(f"{name}: step {step} differs by {error}")
+            worst = max(worst, error)
+        ours.close()
+        plain.close()
+    return f"two tasks, 3 copies: resets equal, 6 steps within {worst:.0e}, on {_warp_device()}"
+
+
+def _warp_device() -> str:
+    return str(import_module("warp").get_device())
+
+
+def mjx() -> str:
+    """MJX takes the scene of a batch, and the positions of its resets, and steps them as MuJoCo does."""
+    jax: Any = import_module("jax")
+    library: Any = import_module("mujoco.mjx")
+    batch: Any = gymnasium.make_vec("urlab/Quadruped-v0", num_envs=2, backend="batch", n_substeps=1)
+    observation, _ = batch.reset(seed=1)
+    model = library.put_model(batch.unwrapped.model)
+    qpos = observation[:, : batch.unwrapped.model.nq].astype(np.float32)
+
+    @jax.jit
+    @jax.vmap
+    def stepped(positions: Any) -> Any:
+        return library.step(model, library.make_data(model).replace(qpos=positions)).qpos
+
+    expected, *_ = batch.step(0 * batch.action_space.sample())
+    error = float(np.abs(np.asarray(stepped(qpos)) - expected[:, : qpos.shape[1]]).max())
+    batch.close()
+    if error > 1e-4:
+        raise AssertionError(f"a step differs by {error}")
+    return f"two copies, a step within {error:.0e}, on {jax.devices()[0].platform}"
+
+
+def minari() -> str:
+    """Minari collects what was driven, and loads it again: numbers, and pictures under LeRobot's names."""
+    library: Any = import_module("minari")
+    envhub: Any = import_module("urlab_client.integrations.gym.envhub")
+    rng = np.random.default_rng(1)
+    frames = 0
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["MINARI_DATASETS_PATH"] = folder
+        pictures: dict[str, Any] = {"space_mode": "dict", "observations": ["qpos"], "cameras": ["arm/wrist"]}
+        for number, options in enumerate(({}, pictures)):
+            env = gymnasium.make("urlab/Reach-v0", max_episode_steps=20, **options)
+            if options:
+                env = envhub.ForLeRobot(env, description="reach")
+            collector = library.DataCollector(env, jpeg_encoding=False)  # pictures without loss
+            driven: list[tuple[list[Any], list[Any], list[Any]]] = []
+            for seed in range(2):
+                seen: list[Any] = [collector.reset(seed=seed)[0]]
+                actions, rewards, over = [], [], False
+                while not over:
+                    actions.append(rng.uniform(-0.3, 0.3, 7).astype(np.float32))
+                    observation, reward, terminated, truncated, _ = collector.step(actions[-1])
+                    seen.append(observation)
+                    rewards.append(reward)
+                    over = terminated or truncated
+                driven.append((seen, actions, rewards))
+            name = f"urlab/reach-v{number}"
+            collector.create_dataset(name, algorithm_name="random", code_permalink="-", author="-", author_email="-")
+            collector.close()
+            loaded = library.load_dataset(name)
+            for episode, (seen, actions, rewards) in zip(loaded.iterate_episodes(), driven, strict=True):
+                found = episode.observations
+                pairs = [(found, seen), (episode.actions, actions), (episode.rewards, rewards)]
+                if options:
+                    pairs[0] = (found["agent_pos"], [each["agent_pos"] for each in seen])
+                    looked = [each["pixels"]["arm.wrist"] for each in seen]
+                    pairs.append((found["pixels"]["arm.wrist"], looked))
+                for ours, theirs in pairs:
+                    if not np.array_equal(ours, np.array(theirs)):
+                        raise AssertionError("the dataset differs from what was driven")
+                frames += len(rewards)
+    return f"{frames} steps of 4 episodes equal what was driven"
+
+
 def gym_async() -> str:
     """`AsyncVectorEnv` runs two environments in processes of its own, and each equals a single one."""
     envs = gymnasium.make_vec(ARM, num_envs=2, vectorization_mode="async")
@@ -101,32 +195,15 @@ def gym_async() -> str:
 
 
 def rllib() -> str:
-    """RLlib's PPO samples with one remote runner and makes an update."""
-    ray: Any = import_module("ray")
-    config: Any = import_module("ray.rllib.algorithms.ppo").PPOConfig
-    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False)
-
-    def make(_: Any) -> gymnasium.Env[Any, Any]:
-        import_module("urlab_client.integrations.gym")  # in the runner's process, too
-        return gymnasium.make(ARM)
-
-    try:
-        import_module("ray.tune.registry").register_env("arm", make)
-        algorithm = (
-            config()
-            .environment("arm")
-            .env_runners(num_env_runners=1, rollout_fragment_length=200)
-            .training(train_batch_size_per_learner=200, minibatch_size=64, num_epochs=1)
-            .build_algo()
+    """RLlib's PPO updates from what two remote runners sample, and its network runs as a policy of `rollouts`."""
+    example = Path(__file__).parents[1] / "examples/rllib_reach.py"
+    with tempfile.TemporaryDirectory() as folder:
+        done = subprocess.run(  # noqa: S603 - ours
+            [sys.executable, example, "--iterations", "3"], cwd=folder, capture_output=True, text=True, check=False
         )
-        result = algorithm.train()
-        algorithm.stop()
-    finally:
-        ray.shutdown()
-    steps = result["env_runners"]["num_env_steps_sampled_lifetime"]
-    if steps < 200:
-        raise AssertionError(f"{steps} steps sampled")
-    return f"{steps:.0f} steps by a remote runner, mean return {result['env_runners']['episode_return_mean']:.0f}"
+    if done.returncode:
+        raise AssertionError(done.stderr)
+    return done.stdout.strip().splitlines()[-1]
 
 
 def lerobot(python: str) -> str:
@@ -168,6 +245,51 @@ def lerobot(python: str) -> str:
     return f"{len(driven)} frames of 2 episodes equal what was driven, with LeRobot {about['version']}"
 
 
+def envhub(python: str) -> str:
+    """LeRobot loads the example's `env.py` as one from its hub, and its evaluation rolls a policy out in it."""
+    file = Path(__file__).parents[1] / "examples/envhub/env.py"
+    done = subprocess.run([python, "-c", ROLL_OUT, str(file)], capture_output=True, text=True, check=False)  # noqa: S603
+    if done.returncode:
+        raise AssertionError(done.stderr)
+    return done.stdout.strip().splitlines()[-1]
+
+
+ROLL_OUT = """
+import sys
+import numpy as np
+import torch
+from lerobot import __version__
+from lerobot.envs.utils import _call_make_env, _import_hub_module, _normalize_hub_result
+from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.scripts.lerobot_eval import rollout
+
+class Still(PreTrainedPolicy):
+    config_class, name = object, "still"
+    def __init__(self): torch.nn.Module.__init__(self); self.seen = None
+    def reset(self): pass
+    def select_action(self, batch): self.seen = batch; return torch.zeros(len(batch["observation.state"]), 7)
+    get_optim_params = forward = predict_action_chunk = None
+
+Still.__abstractmethods__ = frozenset()
+if __name__ == "__main__":
+    module = _import_hub_module(sys.argv[1], "urlab/push")
+    same = lambda x: x
+    returns = []
+    for asynchronous in (False, True):
+        ((suite, tasks),) = _normalize_hub_result(_call_make_env(module, 2, asynchronous, None)).items()
+        policy = Still()
+        found = rollout(tasks[0], policy, same, same, same, same, seeds=[1, 2])
+        tasks[0].close()
+        assert found["action"].shape == (2, 150, 7), found["action"].shape
+        assert not found["success"].any()
+        assert policy.seen["observation.state"].shape == (2, 8)
+        assert policy.seen["observation.images.arm.overview"].shape == (2, 3, 72, 96)
+        assert policy.seen["task"] == ["push the block to the mark"] * 2
+        returns.append(found["reward"].sum(1))
+    assert torch.equal(*returns), returns
+    print(f"two episodes of 150 actions, twice, the same with processes, with LeRobot {__version__}")
+"""
+
 READ_BACK = """
 import json, sys
 import numpy as np
@@ -202,20 +324,29 @@ CHECKS: dict[str, tuple[str, Callable[[], str]]] = {
     "sb3-ppo": ("stable-baselines3", sb3_ppo),
     "sb3-batch": ("stable-baselines3", sb3_batch),
     "gym-async": ("gymnasium", gym_async),
+    "warp": ("mujoco-warp", warp),
+    "mjx": ("mujoco-mjx", mjx),
+    "minari": ("minari", minari),
     "rllib": ("ray", rllib),
 }
+
+WITH_LEROBOT: dict[str, Callable[[str], str]] = {"lerobot": lerobot, "envhub": envhub}
+"""Checks that call an interpreter which has LeRobot; `envhub` needs this package there, too."""
 
 
 def main() -> int:
     """Run the checks; return the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("checks", nargs="*", choices=[[], "lerobot", *CHECKS], help="all but lerobot by default")
+    parser.add_argument(
+        "checks", nargs="*", choices=[[], *WITH_LEROBOT, *CHECKS], help="all without LeRobot by default"
+    )
     parser.add_argument("--lerobot-python", metavar="PATH", help="an interpreter that has LeRobot 0.6")
     arguments = parser.parse_args()
-    if "lerobot" in arguments.checks:
+    if wanted := WITH_LEROBOT.keys() & set(arguments.checks):
         if arguments.lerobot_python is None:
-            parser.error("lerobot needs --lerobot-python")
-        CHECKS["lerobot"] = ("urlab-client", partial(lerobot, arguments.lerobot_python))
+            parser.error(f"{', '.join(sorted(wanted))}: give --lerobot-python")
+        for name in wanted:
+            CHECKS[name] = ("urlab-client", partial(WITH_LEROBOT[name], arguments.lerobot_python))
     failed = 0
     for name in arguments.checks or list(CHECKS):
         package, check = CHECKS[name]

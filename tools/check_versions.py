@@ -8,8 +8,10 @@ of MuJoCo each. The core is what depends on these: protocol, both clients, serve
 environments. Then a client there drives a server of this interpreter's, which so needs the package, too, and the other
 way round. Exit code 1 says that something failed.
 
-With --quick, for CI, which runs the whole suite with the newest MuJoCo: `lowest`, whose MuJoCo is the oldest, and the
-release between.
+With --quick, for CI, which runs the whole suite with the newest MuJoCo: `lowest`, whose MuJoCo is the oldest, and of
+the release between what has MuJoCo in it.
+
+Asyncio's debug mode is on here, as nowhere else: it costs time, and nothing in it depends on a version.
 """
 
 from __future__ import annotations
@@ -29,12 +31,12 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 DRIVE = ROOT / "tools" / "drive_other_release.py"
 
-CORE = (
-    "tests/test_mujoco_releases.py",
-    *("tests/protocol", "tests/aio", "tests/sync", "tests/server", "tests/conformance"),
+SIMULATING = (
+    *("tests/test_mujoco_releases.py", "tests/server", "tests/conformance"),
     *("tests/integrations/test_gym.py", "tests/integrations/test_vector_env.py"),
 )
-QUICK = ("lowest", "mujoco-3.11")
+CORE = (*SIMULATING, "tests/protocol", "tests/aio", "tests/sync")
+QUICK = {"lowest": CORE, "mujoco-3.11": SIMULATING}
 
 # What the core's tests use of the extra `test`; the rest is for integrations, and takes long to install.
 TESTS_NEED = {"coacd", "gymnasium", "hypothesis", "pillow", "trio", "uvloop"}
@@ -59,6 +61,7 @@ def environments() -> dict[str, list[str]]:
     """Return what to install beside the package, by environment."""
     return {
         "mujoco-3.8": ["mujoco==3.8.*"],
+        "mujoco-3.10": ["mujoco==3.10.*"],
         "mujoco-3.11": ["mujoco==3.11.*"],
         "mujoco-newest": ["mujoco"],
         "lowest": lowest(),
@@ -108,12 +111,12 @@ def main() -> int:
         parser.error(f"unknown: {', '.join(sorted(unknown))}. There are {', '.join(known)}.")
     if arguments.quick and arguments.environments:
         parser.error("--quick has environments of its own")
-    chosen = QUICK if arguments.quick else arguments.environments or known
+    chosen = QUICK if arguments.quick else dict.fromkeys(arguments.environments or known, CORE)
     failed: list[str] = []
     with tempfile.TemporaryDirectory(prefix="urlab-versions-") as scratch:
         folder = (arguments.keep or Path(scratch)).absolute()
-        for environment in chosen:
-            failed += check(environment, make(folder / environment, known[environment]), pytest or [*CORE])
+        for environment, tests in chosen.items():
+            failed += check(environment, make(folder / environment, known[environment]), pytest or [*tests])
     if failed:
         print(f"failed: {', '.join(failed)}", file=sys.stderr)
     return 1 if failed else 0
@@ -123,7 +126,7 @@ def check(environment: str, python: Path, pytest: list[str]) -> list[str]:
     """Run tests in an environment, and drive servers between it and this one; return what failed."""
     started = time.monotonic()
     print(f"=== {environment}: {versions(python)}", flush=True)
-    tests = [str(python), "-m", "pytest", "-q", "-p", "no:cacheprovider", *pytest]
+    tests = [str(python), "-m", "pytest", "-q", "-p", "no:cacheprovider", "-o", "asyncio_debug=true", *pytest]
     commands = {f"{environment}: pytest": tests}
     for client, server in ((str(python), sys.executable), (sys.executable, str(python))):
         commands[f"{environment}: client of {client}, server of {server}"] = [client, str(DRIVE), server]

@@ -338,11 +338,11 @@ def around() -> list[str]:
     """Return the public modules beside clients and server."""
     packages = sorted(path.parent.name for path in (SRC / "urlab_client" / "integrations").glob("[!_]*/__init__.py"))
     integrations = [f"urlab_client.integrations.{name}" for name in packages]
-    at = integrations.index("urlab_client.integrations.record") + 1
+    for package, module in (("gym", "envhub"), ("record", "export")):
+        at = integrations.index(f"urlab_client.integrations.{package}") + 1
+        integrations.insert(at, f"urlab_client.integrations.{package}.{module}")
     return [
-        *integrations[:at],
-        "urlab_client.integrations.record.export",
-        *integrations[at:],
+        *integrations,
         "urlab_client.randomise",
         "urlab_client.cluster",
         "urlab_client.web",

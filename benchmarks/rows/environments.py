@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
-from benchmarks.harness import Burst, Pair, Row
+from benchmarks.harness import Burst, Figure, Pair, Row
 from benchmarks.robots import dialect, humanoid
 
 __all__ = ["ROWS"]
@@ -17,6 +19,8 @@ _OWN = "Humanoid-v5"
 _SUBSTEPS = 5  # as Gymnasium's takes
 _SERVERS = 4
 _BATCH = 16
+_PROCESSOR_S = 2.0  # that figures per core are taken from
+_MORE = 256  # copies by which the memory of one is measured
 
 
 def _stepping(environment: Any, copies: int = 1) -> Burst:
@@ -42,9 +46,77 @@ def _own(copies: int | None = None) -> Any:
 
 
 @contextlib.contextmanager
-def _against(ours: Callable[[], Any], copies: int, own_copies: int | None) -> Iterator[Pair]:
+def _against(
+    ours: Callable[[], Any],
+    copies: int,
+    own_copies: int | None,
+    figures: Callable[[], Sequence[Figure]] = tuple,
+) -> Iterator[Pair]:
     with contextlib.closing(ours()) as environment, contextlib.closing(_own(own_copies)) as own:
-        yield Pair(ours=_stepping(environment, copies), floor=_stepping(own, own_copies or 1))
+        yield Pair(
+            ours=_stepping(environment, copies),
+            floor=_stepping(own, own_copies or 1),
+            figures=lambda: [
+                Figure(name="steps per second of a core, with the servers'", value=_per_core(environment, copies)),
+                Figure(name="the floor's", value=_per_core(own, own_copies or 1)),
+                *figures(),
+            ],
+        )
+
+
+def _per_core(environment: Any, copies: int) -> float:
+    """Return steps for each second of processor time, of this process with all its threads and of its children."""
+    action = 0 * environment.action_space.sample()
+    environment.reset(seed=0)
+    taken, started = 0, _processor_s()
+    while (used := _processor_s() - started) < _PROCESSOR_S:
+        for _ in range(20):
+            environment.step(action)
+        taken += 20 * copies
+    return taken / used
+
+
+def _processor_s() -> float:
+    """Return the processor time of this process and of its children, seconds."""
+    total = time.process_time()
+    for child in _children():
+        with contextlib.suppress(OSError):
+            after_name = Path(f"/proc/{child}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+            total += (int(after_name[11]) + int(after_name[12])) / os.sysconf("SC_CLK_TCK")
+    return total
+
+
+def _proportional(process: int | str) -> float:
+    """Return the memory of a process in MB, shared pages divided among those that share them; 0 where unknown."""
+    with contextlib.suppress(OSError):
+        for line in Path(f"/proc/{process}/smaps_rollup").read_text(encoding="ascii").splitlines():
+            if line.startswith("Pss:"):
+                return int(line.split()[1]) / 1024
+    return 0.0
+
+
+def _children() -> list[str]:
+    found = [path.read_text(encoding="ascii") for path in Path("/proc/self/task").glob("*/children")]
+    return " ".join(found).split()
+
+
+def _of_servers() -> list[Figure]:
+    """Return the memory of a server, of those that run."""
+    used = [_proportional(child) for child in _children()]
+    return [Figure(name="MB of a server", value=sum(used) / max(len(used), 1))]
+
+
+def _of_copies() -> list[Figure]:
+    """Return what each further copy of a batch takes."""
+    from urlab_client.integrations.gym import URLabBatchEnv  # noqa: PLC0415  # an extra
+
+    with contextlib.closing(URLabBatchEnv(_address(), _BATCH, n_substeps=_SUBSTEPS)) as few:
+        few.reset(seed=0)
+        before = _proportional(os.getpid())
+        with contextlib.closing(URLabBatchEnv(_address(), _BATCH + _MORE, n_substeps=_SUBSTEPS)) as many:
+            many.reset(seed=0)
+            many.step(0 * many.action_space.sample())
+            return [Figure(name="MB of a copy", value=(_proportional(os.getpid()) - before) / _MORE)]
 
 
 def _address() -> str:
@@ -82,7 +154,7 @@ def _rows() -> tuple[Row, ...]:
             floor=floor,
             reach=0.35,
             kind="rate",
-            prepare=lambda: _against(_single, 1, None),
+            prepare=lambda: _against(_single, 1, None, _of_servers),
             count=100,
         ),
         Row(
@@ -91,7 +163,7 @@ def _rows() -> tuple[Row, ...]:
             floor=floor,
             reach=0.9,
             kind="rate",
-            prepare=lambda: _against(_vector, _SERVERS, None),
+            prepare=lambda: _against(_vector, _SERVERS, None, _of_servers),
             count=50,
         ),
         Row(
@@ -100,7 +172,7 @@ def _rows() -> tuple[Row, ...]:
             floor=f"{_BATCH} of them in Gymnasium's SyncVectorEnv, together",
             reach=1.5,
             kind="rate",
-            prepare=lambda: _against(_batch, _BATCH, _BATCH),
+            prepare=lambda: _against(_batch, _BATCH, _BATCH, _of_copies),
             count=20,
         ),
     )

@@ -13,7 +13,9 @@ import errno
 import hashlib
 import importlib
 import re
+import shutil
 import tempfile
+import uuid
 import zipfile
 from collections.abc import Callable, Generator, Iterable, Mapping
 from pathlib import Path
@@ -33,12 +35,14 @@ __all__ = [
     "asset_bytes",
     "batch_class",
     "check_copy",
+    "compiled_file",
     "control_counts",
     "control_starts",
     "copy_options",
     "export_model",
     "force_counts",
     "force_starts",
+    "forget_last_document",
     "merge_assets",
     "mujoco_version",
     "reset_controls",
@@ -54,6 +58,7 @@ Indices = NDArray[np.int32]
 
 MODEL_FILE = "model.xml"
 _ARCHIVE = "model.mjz"  # whose stem names the model in it
+_MARK_BYTES = 64  # more than a placeholder has
 
 
 # Actuators have had several controls and forces each since 3.11; before, `nu` counted both them and their controls.
@@ -169,6 +174,28 @@ def set_threads(data: mujoco.MjData, threads: int) -> None:
         mujoco.mju_threadpool(data, threads)
 
 
+def compiled_file(path: Path) -> mujoco.MjModel:
+    """Compile an MJCF file.
+
+    Raises:
+        ValueError, mujoco.FatalError: MuJoCo rejects it.
+    """
+    import mujoco  # noqa: PLC0415
+
+    model = mujoco.MjModel.from_xml_path(str(path))
+    forget_last_document()
+    return model
+
+
+def forget_last_document() -> None:
+    """Free what `MjModel.from_xml_path` and its like keep of the last model for `mj_saveLastXML`: it is larger than
+    the model.
+    """
+    import mujoco  # noqa: PLC0415
+
+    mujoco.MjModel.from_xml_string("<mujoco/>")
+
+
 def write_model(spec: mujoco.MjSpec, folder: Path) -> None:
     """Write a spec and every file it needs to a folder, as `model.xml` and what is beside it.
 
@@ -182,9 +209,10 @@ def write_model(spec: mujoco.MjSpec, folder: Path) -> None:
     compiler: Any = spec.compiler
     if _writes_archives(spec):
         compiler.savecompiled = False
-        # Beside the folder: a confined process can write nowhere else.
-        with _archive(spec, folder.with_name(_ARCHIVE)) as content:
-            content.extractall(folder)
+        if not _write_without_packing(spec, folder):
+            # Beside the folder: a confined process can write nowhere else.
+            with _archive(spec, folder.with_name(_ARCHIVE)) as content:
+                content.extractall(folder)
         return
     spec.to_xml()  # says whether it can be written, before anything is changed
     text, files = _written_by_hand(spec)
@@ -219,6 +247,63 @@ def flat_model(spec: mujoco.MjSpec) -> tuple[str, dict[str, bytes]]:
 def _writes_archives(spec: mujoco.MjSpec) -> bool:
     """Whether MuJoCo writes a spec with its files: before 3.16 it names those in folders of their own wrongly."""
     return hasattr(spec.compiler, "savecompiled")
+
+
+def _write_without_packing(spec: mujoco.MjSpec, folder: Path) -> bool:
+    """Do what extracting the archive of a spec does, without packing its files, which takes as long as compiling them.
+
+    Each file is marked by a placeholder in MuJoCo's virtual file system, and copied to where that is found in the
+    archive.
+
+    Returns:
+        False if it is not clear which file is meant, or anything fails; then nothing is written.
+    """
+    import mujoco  # noqa: PLC0415
+
+    sources = _plain_files(spec)
+    mark = uuid.uuid4().hex
+    marks = {f"{mark}{number}".encode(): source for number, source in enumerate(sources.values())}
+    marked = spec.copy()
+    marked.assets = dict(zip(sources, marks, strict=True))
+    try:
+        with _archive(marked, folder.with_name(_ARCHIVE)) as content:
+            found = {
+                entry: marks[content.read(entry)]
+                for entry in content.infolist()
+                if entry.file_size < _MARK_BYTES and content.read(entry) in marks
+            }
+            if len(found) != len(sources):
+                return False
+            for entry in content.infolist():
+                target = Path(content.extract(entry, folder))
+                if entry in found:
+                    shutil.copyfile(found[entry], target)
+    except (mujoco.FatalError, OSError):
+        shutil.rmtree(folder, ignore_errors=True)
+        return False
+    return True
+
+
+def _plain_files(spec: mujoco.MjSpec) -> dict[str, Path]:
+    """Return what a spec calls its files, and where they lie, of those of which both are beyond doubt."""
+    if spec.strippath or spec.assets:
+        return {}
+    elements = [(asset.file, asset.compiler.meshdir) for asset in (*spec.meshes, *spec.hfields, *spec.skins)]
+    for texture in spec.textures:
+        directory = texture.compiler.texturedir
+        elements += [(texture.file, directory), *((file, directory) for file in texture.cubefiles)]
+    # Placeholders are found by the last part of the path, too.
+    places: dict[str, set[tuple[str, str]]] = {}
+    for file, directory in elements:
+        if file:
+            places.setdefault(Path(file).name.casefold(), set()).add((file, directory))
+    sources = {
+        file: Path(spec.modelfiledir, directory, file)
+        for alike in places.values()
+        if len(alike) == 1
+        for file, directory in alike
+    }
+    return {file: source for file, source in sources.items() if source.is_file()}
 
 
 @contextlib.contextmanager
@@ -273,14 +358,23 @@ def _written_by_hand(spec: mujoco.MjSpec) -> tuple[str, dict[str, bytes]]:
     return spec.to_xml(), files
 
 
-def check_copy(original: mujoco.MjModel, copy: mujoco.MjModel) -> None:
+def check_copy(original: Path, copy: mujoco.MjModel) -> None:
     """Refuse what `write_model` writes wrongly: before 3.16 an attached model with files in a folder of its own.
+
+    Args:
+        original: The file that the model was made from.
+        copy: What was written of it, compiled.
 
     Raises:
         ValueError: It has other meshes, textures or height fields than the model it was made from.
     """
+    import mujoco  # noqa: PLC0415
+
+    if _writes_archives(mujoco.MjSpec()):
+        return
+    model = compiled_file(original)
     for name in ("mesh_vert", "tex_data", "hfield_data", "skin_vert"):
-        ours, theirs = getattr(copy, name), getattr(original, name)
+        ours, theirs = getattr(copy, name), getattr(model, name)
         if ours.shape != theirs.shape or not np.allclose(ours, theirs, atol=1e-4):
             raise _unwritable()
 

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from samples import filled
 from scripted import meta_ok
-from waiting import in_time, until
+from waiting import DEADLINE_S, in_time, until
 
 from urlab_client.aio import URLabClient, launch
 from urlab_client.protocol.base import Effect
@@ -47,7 +47,7 @@ async def test_the_call_after_a_fault_works(client: Any, scripted: Any, fault: s
     scripted.on("meta", meta_ok(op.dialects[0]))
     await client.discover()
     scripted.on(name, {"truncated": answer[:-1], "garbage": b"\xc1" * 40}.get(fault))
-    call = asyncio.create_task(client.call(filled(op.request), timeout=0.02 if fault == "timed out" else 5))
+    call = asyncio.create_task(client.call(filled(op.request), timeout=0.02 if fault == "timed out" else DEADLINE_S))
     if fault == "cancelled":
         await arrived(scripted, name)
         call.cancel()
@@ -55,7 +55,7 @@ async def test_the_call_after_a_fault_works(client: Any, scripted: Any, fault: s
             await call
     else:
         with pytest.raises(URLabTimeoutError if fault == "timed out" else ProtocolError):
-            await in_time(5, call)
+            await in_time(DEADLINE_S, call)
     other = OPS["list_actors" if name == "current_level" else "current_level"]
     scripted.on(other.name, encode_reply(filled(other.reply)))
     assert type(await client.call(filled(other.request))) is other.reply
@@ -69,17 +69,17 @@ async def test_a_server_that_dies_with_the_request_and_comes_back(client: Any, s
     scripted.on("meta", meta_ok(op.dialects[0]))
     await client.discover()
     scripted.on(name, None)
-    call = asyncio.create_task(client.call(filled(op.request), timeout=5))
+    call = asyncio.create_task(client.call(filled(op.request), timeout=DEADLINE_S))
     await arrived(scripted, name)
     await asyncio.to_thread(scripted.close)
     reborn = type(scripted)(scripted.port)
     reborn.on(name, answer)
     try:
         if op.effect is Effect.READ:
-            assert type(await in_time(5, call)) is op.reply
+            assert type(await in_time(DEADLINE_S, call)) is op.reply
         else:
             with pytest.raises(OutcomeUnknown):
-                await in_time(5, call)
+                await in_time(DEADLINE_S, call)
             assert type(await client.call(filled(op.request))) is op.reply
     finally:
         await asyncio.to_thread(reborn.close)

@@ -205,7 +205,7 @@ async def test_a_lost_reset_is_found_out(client: URLabClient, relay: Relay, lose
 @pytest.mark.parametrize("lose", [lose_the_reply, lose_the_request])
 async def test_a_lost_mode_change_is_made_certain(client: URLabClient, relay: Relay, lose: Any) -> None:
     await client.runtime.set_mode("live")
-    await lose(relay, asyncio.create_task(client.runtime.set_mode("direct", timeout=5)))
+    await lose(relay, asyncio.create_task(client.runtime.set_mode("direct", timeout=DEADLINE_S)))
     assert client.step_mode == "live"
     await client.resync()
     assert client.step_mode == "direct"

@@ -77,7 +77,7 @@ async def test_a_slow_op_waits_for_a_connection_no_longer_than_a_quick_one() -> 
             calling = asyncio.create_task(client.discover())
             await until(lambda: client._transport._waiting)  # type: ignore[attr-defined]
             pass_time(2.5)
-            await asyncio.wait((calling,), timeout=1.5)
+            await asyncio.wait((calling,), timeout=DEADLINE_S)
             assert calling.done()
             with pytest.raises(ServerUnreachable, match="no connection"):
                 await calling

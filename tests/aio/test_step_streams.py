@@ -9,10 +9,13 @@ from contextlib import asynccontextmanager
 import pytest
 from publisher import Publisher
 from scripted_beta import ScriptedBeta
-from waiting import pass_time, until
+from waiting import DEADLINE_S, pass_time, until
 
 from urlab_client.aio import URLabClient
+from urlab_client.protocol.errors import URLabTimeoutError
+from urlab_client.protocol.messages.session import StepOk
 from urlab_client.protocol.pixels import camera_header
+from urlab_client.server import Drop, Faults, SimulatedServer
 
 TOPIC = b"arm_a/wrist "
 SYNC = {"arm a/wrist": "sync"}
@@ -179,3 +182,29 @@ async def test_cameras_that_always_stream_are_received_from_the_first_older_pict
     finally:
         camera.close()
         beta.close()
+
+
+@pytest.mark.parametrize("renders", [True, False], ids=["renders for a step", "draws as it likes"])
+async def test_the_first_picture_of_a_step_may_wait_for_opengl(renders: bool) -> None:
+    faults, dialect = Faults(), "beta" if renders else "alpha"
+    with SimulatedServer("arm", play=True, camera_size=(64, 48), dialect=dialect, faults=faults) as server:
+        async with URLabClient(**server.client_options(), step_mode="direct") as client:
+            await client.discover(timeout=DEADLINE_S)
+
+            async def lost() -> asyncio.Task[StepOk]:
+                fault = faults.add(Drop("step", times=1))
+                step = asyncio.create_task(client.step(include_cameras={"arm/wrist": "sync"}))
+                await until(lambda: fault.applied)
+                pass_time(12.0)
+                return step
+
+            step = await lost()
+            assert not (await asyncio.wait((step,), timeout=0.05))[0]
+            pass_time(48.0)
+            with pytest.raises(URLabTimeoutError, match="step: no reply"):
+                await step
+            await client.resync(timeout=DEADLINE_S)  # the server looks for OpenGL meanwhile
+            await client.step(include_cameras={"arm/wrist": "sync"}, timeout=DEADLINE_S)
+            assert client.camera("wrist").latest_frame is not None
+            with pytest.raises(URLabTimeoutError, match="step: no reply"):
+                await (await lost())

@@ -7,6 +7,7 @@ import json
 import math
 import shutil
 import struct
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -171,8 +172,8 @@ def test_goes_on_without_opengl(
     monkeypatch.setenv("MUJOCO_GL", "disable")
     assert main(["demo", "arm", "--steps", "8", "--output", str(tmp_path)]) == 0
     text = capsys.readouterr().out
-    assert "libegl1" in text
-    assert "libosmesa6" in text
+    for advice in ("libegl1", "libosmesa6") if sys.platform == "linux" else ("install a graphics driver",):
+        assert advice in text
     assert not stale.exists()
     assert (tmp_path / "joints.png").exists()
 

@@ -15,6 +15,8 @@ from urlab_client import URLabClient
 from urlab_client._installation import install_command
 from urlab_client.cli import main
 from urlab_client.protocol.base import DialectName
+from urlab_client.protocol.enums import StepMode
+from urlab_client.protocol.messages.runtime import SetMode
 from urlab_client.server import SimulatedServer
 
 
@@ -89,11 +91,39 @@ def test_a_camera_of_a_paused_beta_whose_streams_are_silent() -> None:
 
 
 @pytest.mark.parametrize("dialect", ["alpha", "beta"])
-def test_a_stepped_server_publishes_nothing(dialect: DialectName, capsys: pytest.CaptureFixture[str]) -> None:
-    with SimulatedServer("arm", play=True, step_mode="direct", dialect=dialect) as server:
+def test_a_camera_of_a_server_that_somebody_steps(dialect: DialectName) -> None:
+    with (
+        SimulatedServer("arm", play=True, dialect=dialect) as server,
+        URLabClient(**server.client_options(), step_mode="direct", auto_promote_step_mode=False) as client,
+    ):
+        client.discover()
+        client.call(SetMode(mode="direct"))
         address = f"{server.address}:{server.step_port}"
-        assert main(["snapshot", address, "--camera", "arm/wrist", "--timeout", "2"]) == 2
-    assert "outside live mode it publishes no pictures" in capsys.readouterr().err
+        assert picture(address, "--camera", "arm/wrist").shape == (480, 640, 4)
+        # It is left as it was: in direct mode, where time stands still.
+        client.discover()
+        assert client.call(SetMode(mode="direct")).previous_mode == StepMode.DIRECT
+        assert client.sim.status().sim_time == 0
+        assert client.step().step == 1
+
+
+def test_a_server_that_is_pinned_to_steps_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    with SimulatedServer("arm", play=True, step_mode="direct") as server:
+        address = f"{server.address}:{server.step_port}"
+        assert main(["snapshot", address, "--camera", "arm/wrist"]) == 2
+    assert "Pictures come with steps here" in capsys.readouterr().err
+
+
+def test_a_picture_beside_the_client_that_drives(tmp_path: Path) -> None:
+    with (
+        SimulatedServer("arm", play=True, unpaused=True) as server,
+        URLabClient(**server.client_options(), step_mode="live") as driver,
+    ):
+        driver.discover()
+        (tmp_path / "arm.hello").write_bytes(driver.handshake())
+        options = ["--camera", "arm/wrist", "--handshake", "arm.hello", "--state-port", str(server.state_port)]
+        assert picture(f"{server.address}:{server.step_port}", *options).shape == (480, 640, 4)
+        driver.step()
 
 
 @pytest.mark.parametrize(
@@ -110,6 +140,7 @@ def test_a_stepped_server_publishes_nothing(dialect: DialectName, capsys: pytest
         (["amr"], ["amr", "Did you mean 'arm'?"]),
         (["tcp://localhost:1", "--mjcf-options"], ["sim://MODEL", "tcp://localhost:1"]),
         (["tcp://localhost:1", "arm"], ["one address"]),
+        (["arm", "--handshake", "x"], ["--handshake", "running server"]),
     ],
 )
 def test_refusals(arguments: list[str], words: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

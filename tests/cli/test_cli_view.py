@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import get_type_hints
 
 import pytest
 from commands import refusal, urlab
+
+from urlab_client.cli import console, main
+from urlab_client.cli._page_options import PageArguments
 
 NO_DISPLAY = {"DISPLAY": "", "WAYLAND_DISPLAY": ""}
 
@@ -44,3 +48,14 @@ def test_options_of_another_view_are_refused(tmp_path: Path) -> None:
     assert "go with --rerun" in refusal(urlab("view", "--foxglove", "--save", "a.rrd", cwd=tmp_path))
     assert "give one of" in refusal(urlab("view", "--rerun", "--page", "--save", "a.rrd", cwd=tmp_path))
     assert "--web shows everything" in refusal(urlab("view", "--web", "--seconds", "1", cwd=tmp_path))
+
+
+def test_the_console_is_told_all_that_it_asks_of_its_own_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[PageArguments] = []
+    monkeypatch.setattr(console, "run", lambda arguments: told.append(arguments) or 0)
+    assert main(["view", "sim://arm", "--web", "--port", "0"]) == 0
+    assert {name: getattr(told[0], name) for name in get_type_hints(PageArguments)} == {
+        "address": "sim://arm", "host": "127.0.0.1", "port": 0, "allow_host": [], "open": False, "handshake": None,
+        "recordings": Path("recordings"), "mjcf_options": False, "server_key": None, "client_key": None,
+        "step_port": 5559, "state_port": 5555,
+    }  # fmt: skip

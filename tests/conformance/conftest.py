@@ -1,8 +1,9 @@
 """The same tests for both flavours of the client and both dialects of the simulated server, over real transports.
 
 A test is written once, with `await`. For the façade its objects are wrapped so that blocking calls run in a thread.
-Each test runs over ZeroMQ, and on the alpha in both flavours; over shared memory, too, in `test_shared_memory`. The
-rest of the matrix runs with `-m long`.
+Each test runs over ZeroMQ, and on the alpha in both flavours; over shared memory, too, in `test_shared_memory`. With
+`-m long`, two combinations more make every pair of flavour, transport and dialect complete; with `-m matrix`, the rest
+of them runs.
 """
 
 from __future__ import annotations
@@ -124,12 +125,23 @@ Connect = Callable[..., Any]
 Serve = Callable[..., AbstractContextManager[SimulatedServer]]
 
 
+MARKED = {
+    ("aio", "shm", "alpha"): "long",
+    ("sync", "shm", "beta"): "long",
+    ("aio", "shm", "beta"): "matrix",
+    ("sync", "shm", "alpha"): "matrix",
+    ("sync", "zmq", "beta"): "matrix",
+}
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark what adds little: the façade knows nothing of dialects, and most of the client nothing of transports."""
     for item in items:
         chosen = item.callspec.params if isinstance(item, pytest.Function) and hasattr(item, "callspec") else {}
-        if chosen.get("transport") == "shm" or (chosen.get("connect"), chosen.get("dialect")) == ("sync", "beta"):
+        if combination := MARKED.get(tuple(chosen.get(name) for name in ("connect", "transport", "dialect"))):
+            item.add_marker(combination)
+        elif chosen.get("transport") == "shm" or (chosen.get("connect"), chosen.get("dialect")) == ("sync", "beta"):
             item.add_marker("long")
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from waiting import DEADLINE_S
 
 from urlab_client import NotSettled, URLabTimeoutError
 from urlab_client.enums import ControllerKind
@@ -249,8 +250,8 @@ async def test_a_joint_that_nothing_holds_is_refused(connect: Any, serve: Any, a
 
 async def test_time_that_stands_still_is_an_error_that_says_why(connect: Any, server: Any) -> None:
     client = connect(server, step_mode="live", rcv_timeout_ms=500)
-    await client.discover()
-    await client.runtime.set_paused(True)
+    await client.discover(timeout=DEADLINE_S)
+    await client.runtime.set_paused(True, timeout=DEADLINE_S)
     with pytest.raises(URLabTimeoutError, match=r"stood still .* paused"):
         await client.run_for(1.0)
 

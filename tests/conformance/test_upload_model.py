@@ -94,10 +94,10 @@ def test_the_alpha_takes_no_models(robot: Path) -> None:
 def test_a_model_goes_over_zmq_and_its_import_takes_its_time(robot: Path, memory: Path) -> None:
     """Beta statements 81, 82 and 85."""
     faults = Faults()
-    slow = faults.add(Delay(op="upload_model_commit", seconds=0.5))
+    slow = faults.add(Delay(op="upload_model_commit", seconds=2.5))
     with (
         SimulatedServer("arm", play=True, dialect="beta", shm_dir=memory, faults=faults) as server,
-        URLabClient(**server.client_options(), transport="shm", step_mode="direct", rcv_timeout_ms=250) as client,
+        URLabClient(**server.client_options(), transport="shm", step_mode="direct", rcv_timeout_ms=2000) as client,
     ):
         client.discover()
         client.step()
@@ -118,5 +118,5 @@ def test_a_chunk_whose_reply_was_lost_is_not_sent_again(robot: Path) -> None:
         client.discover()
         sent = client.transport_stats.sent
         with pytest.raises(URLabTimeoutError, match="upload_model_chunk"):
-            client.scene.upload_model(robot, timeout=0.5)
+            client.scene.upload_model(robot, timeout=3)
         assert client.transport_stats.sent == sent + 2, "the manifest and one chunk"

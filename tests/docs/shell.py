@@ -29,6 +29,9 @@ NOT_RUN = {
     r"urlab console( tcp://10\..*)?$": "goes to an editor",
     r"urlab mcp ": "tests/mcp run it",
     r"uvicorn fastapi_backend:app": "tests/examples/test_fastapi_backend.py serves it",
+    r"(python examples/clone_behaviour.py|urlab (evaluate|run-policy) clone/)": "takes long: "
+    "tests/examples/test_clone_behaviour.py runs its short form",
+    r"urlab teleop ": "takes keys from a terminal",
     r".* --python lerobot-env/": "needs LeRobot, which has an environment of its own",
     r"(KEY=\$\()?curl ": "test_docs_console.py makes these requests",
 }

@@ -14,13 +14,23 @@ import pytest
 # Examples that serve until they are told to stop, and the tests of which are elsewhere.
 SERVING = {"fastapi_backend"}
 
+# What a test of its own runs, with fewer episodes.
+SHORTENED = {"clone_behaviour"}
+
+# What no extra of the project installs. tools/check_learning.py runs them.
+FOREIGN = {"rllib_reach"}
+
 MARKED = {
     "ray_rollouts": pytest.mark.ray,
     "view_rerun": pytest.mark.view,
     **dict.fromkeys(("gym_env", "record_run", "run_policy", "vector_env"), pytest.mark.long),
 }
 
-EXAMPLES = sorted(path for path in (Path(__file__).parents[2] / "examples").glob("*.py") if path.stem not in SERVING)
+EXAMPLES = sorted(
+    path
+    for path in (Path(__file__).parents[2] / "examples").glob("*.py")
+    if path.stem not in SERVING | FOREIGN | SHORTENED
+)
 
 
 @pytest.mark.parametrize(

@@ -99,6 +99,83 @@ def test_episodes_are_whole_and_differ_by_seed(expected: dict[int, Any]) -> None
         assert episode.sim_time > 0 < episode.setup <= episode.duration
 
 
+def notes_children(folder: Path) -> Any:
+    """Return a policy that notes the children's process ids, in a file for each process."""
+    inner, name = noisy(), str(folder)
+
+    def policy(observation: Any, rng: np.random.Generator) -> Any:
+        children = [file.read_text() for file in Path("/proc/self/task").glob("*/children")]
+        Path(name, str(os.getpid())).write_text("".join(children))
+        return inner(observation, rng)
+
+    return policy
+
+
+def test_a_run_goes_on_with_what_is_missing_on_workers_that_stay_up(expected: dict[int, Any], tmp_path: Path) -> None:
+    from urlab_client import URLabError
+    from urlab_client.cluster import WorkerPool, load_episodes, missing_ids, rollouts, save_episode
+
+    saved, notes = tmp_path / "saved", tmp_path / "notes"
+    notes.mkdir()
+    run = (notes_children(notes), "sim://arm", 6)
+    servers = list[dict[str, str]]()
+    with WorkerPool(2) as workers:
+        for ids in ([0, 4], missing_ids):
+            missing = ids if isinstance(ids, list) else ids(saved, 6, seed=5)
+            for episode in rollouts(*run, ids=missing, workers=workers, **OPTIONS):
+                save_episode(episode, saved)
+            servers.append({path.name: path.read_text() for path in notes.iterdir()})
+        assert missing == [1, 2, 3, 5]
+        assert servers[0] == servers[1]  # the same processes, with the same servers
+        assert workers.size == len(servers[0]) == 2
+
+        dead = int(next(iter(servers[0])))
+        os.kill(dead, 9)
+        with rollouts(*run, workers=workers, **OPTIONS) as episodes:
+            first = next(episodes)
+            with pytest.raises(URLabError, match="Another run uses the worker pool"):
+                next(rollouts(*run, workers=workers, **OPTIONS))
+        assert first.attempt == 1
+        assert first.pid != dead
+    assert all(gone(path) for path in notes.iterdir())
+    got = list(load_episodes(saved))
+    assert [episode.id for episode in got] == list(range(6))
+    for episode in got:
+        same(episode, expected[episode.id])
+    assert missing_ids(saved, 6, seed=5) == []
+    with pytest.raises(ValueError, match=r"episode_000000\.npz is not of a run of 6 episodes with seed 4"):
+        missing_ids(saved, 6, seed=4)
+    (saved / "episode_000003.npz").write_bytes(b"PK")
+    with pytest.raises(ValueError, match=r"episode_000003\.npz holds no episode"):
+        missing_ids(saved, 6, seed=5)
+
+
+def test_dictionaries_and_pictures_come_back_as_they_were_seen(cluster: Any, tmp_path: Path) -> None:
+    from urlab_client.cluster import load_episodes, rollouts, save_episode
+    from urlab_client.integrations.gym import Reach
+
+    def policy(observation: Any, rng: np.random.Generator) -> Any:
+        shape = observation["cameras"]["arm/wrist"].shape
+        return {"arm": np.r_[observation["task"][:3] + observation["arm"]["qpos"][:3], shape, 0.0] / 1000}
+
+    options = {"task": Reach(), "space_mode": "dict", "observations": ["qpos"], "cameras": ["arm/wrist"]}
+    (episode,) = rollouts(policy, "sim://arm", 1, max_episode_steps=2, env_options=options)
+    seen, actions = episode.observations, episode.actions["arm"]
+    pictures = seen["cameras"]["arm/wrist"]
+    assert pictures.dtype == np.uint8
+    assert pictures.shape[0] == 3
+    assert len(np.unique(pictures)) > 2
+    assert actions.dtype == np.float32
+    assert np.array_equal(actions[:, :3], np.float32((seen["task"][:, :3] + seen["arm"]["qpos"][:, :3])[:-1] / 1000))
+    assert np.array_equal(actions[:, 3:6] * 1000, np.broadcast_to(pictures.shape[1:], (2, 3)))
+    assert episode.success is False
+    (back,) = load_episodes(save_episode(episode, tmp_path).parent)
+    assert back.observations.keys() == seen.keys()
+    assert np.array_equal(back.observations["cameras"]["arm/wrist"], pictures)
+    assert np.array_equal(back.actions["arm"], actions)
+    assert (back.id, back.duration, back.success) == (0, episode.duration, False)
+
+
 def dies_once(marker: Path) -> Any:
     """Return a policy that kills its process in the middle of one episode, having noted the children's process ids."""
     inner, path = noisy(), str(marker)
@@ -296,7 +373,8 @@ async def test_a_cancelled_run_leaves_no_worker_and_no_server(cluster: Any, tmp_
         ("tcp://editor", {}, "scenes must be one or more sim://"),
         ("sim://arm", {"retries": -1}, "retries are 0 or more"),
         ("sim://arm", {"episode_timeout": 0}, "above 0 seconds"),
-        ("sim://arm", {"env_options": {"space_mode": "dict"}}, "env_options cannot have space_mode"),
+        ("sim://arm", {"env_options": {"render_mode": "rgb_array"}}, "env_options cannot have render_mode"),
+        ("sim://arm", {"ids": [0, 1]}, "ids must be of the episodes 0 to 0, each once"),
     ],
 )
 def test_bad_options_are_named(cluster: Any, scenes: Any, options: dict[str, Any], problem: str) -> None:
@@ -307,7 +385,7 @@ def test_bad_options_are_named(cluster: Any, scenes: Any, options: dict[str, Any
 
 
 def test_a_removed_node_loses_and_doubles_no_episode(cluster: Any, expected: dict[int, Any], tmp_path: Path) -> None:
-    from urlab_client.cluster import rollouts
+    from urlab_client.cluster import WorkerPool, rollouts
 
     victim = cluster.list_all_nodes()[-1]
     inner, victim_id, fifo = noisy(), victim.node_id, str(tmp_path / "fifo")
@@ -320,14 +398,17 @@ def test_a_removed_node_loses_and_doubles_no_episode(cluster: Any, expected: dic
             os.close(os.open(fifo, os.O_RDONLY))  # waits here until the node is removed
         return inner(observation, rng)
 
-    with rollouts(policy, "sim://arm", 6, n_workers=2, **OPTIONS) as episodes:
-        got = [next(episodes)]
-        # Opening succeeds when the worker on the node has begun an episode and waits in its first step.
-        with open(fifo, "w"):
-            cluster.remove_node(victim, allow_graceful=False)
-        got += episodes
+    with WorkerPool(2) as workers:
+        with rollouts(policy, "sim://arm", 6, workers=workers, **OPTIONS) as episodes:
+            got = [next(episodes)]
+            # Opening succeeds when the worker on the node has begun an episode and waits in its first step.
+            with open(fifo, "w"):
+                cluster.remove_node(victim, allow_graceful=False)
+            got += episodes
+        again = list(rollouts(policy, "sim://arm", 6, ids=[1, 3], workers=workers, **OPTIONS))
     assert sorted(episode.id for episode in got) == list(range(6))
-    assert {episode.node_id for episode in got} == {got[0].node_id} != {victim_id}
+    assert {episode.node_id for episode in [*got, *again]} == {got[0].node_id} != {victim_id}
     assert max(episode.attempt for episode in got) == 2
-    for episode in got:
+    assert {episode.pid for episode in again} <= {episode.pid for episode in got}
+    for episode in [*got, *again]:
         same(episode, expected[episode.id])

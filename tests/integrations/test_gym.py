@@ -12,6 +12,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.envs.registration import EnvSpec, load_env_creator
 from gymnasium.utils.env_checker import check_env
 
 import urlab_client
@@ -71,6 +72,15 @@ def test_a_registered_task_passes_the_checker_and_closes_its_server(task_id: str
     env.close()
     with pytest.raises(urlab_client.ClientClosed):
         env.reset()
+
+
+@pytest.mark.parametrize("task_id", sorted(TASKS))
+def test_a_registered_tasks_specification_can_be_stored_and_made_again(task_id: str) -> None:
+    spec = gymnasium.spec(task_id)
+    stored = EnvSpec.from_json(spec.to_json())
+    assert stored == spec
+    assert callable(load_env_creator(str(stored.entry_point)))
+    assert callable(load_env_creator(str(stored.vector_entry_point)))
 
 
 def test_gymnasium_decides_how_long_the_episodes_of_a_registered_task_are() -> None:

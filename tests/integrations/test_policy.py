@@ -302,10 +302,69 @@ def test_position_servos_take_targets_as_they_are(arm: URLabClient) -> None:
     assert (found.distance, found.falls, found.reward) == (0.0, 0, 0.0)
 
 
+GOAL = """
+[[observation]]
+term = "goal"
+
+[[observation]]
+term = "goal"
+relative_to = "grip_position"
+
+[goal]
+default = [0.3, 0.0, 0.5]
+low = [0.0, -1.0, 0.0]
+high = [1.0, 1.0, 1.0]
+
+[action]"""
+
+
+def test_a_goal_and_the_way_to_it_are_observed_and_what_is_left_is_told(arm: URLabClient) -> None:
+    seen: list[Any] = []
+
+    def network(observation: Any) -> Any:
+        seen.append(observation)
+        return np.zeros(1)
+
+    policy = policy_of(REACH.replace("[action]", GOAL), network)
+    assert policy.goal.tolist() == [0.3, 0.0, 0.5]
+    policy.goal = [0.4, 0.2, 0.3]
+    found = run_blocking(arm, policy, seconds=0.04)
+    hand, goal, way = np.split(seen[0], 3)
+    assert goal.tolist() == [0.4, 0.2, 0.3]
+    assert way == pytest.approx(goal - hand)
+    assert found.goal_error == pytest.approx(np.linalg.norm(way), abs=1e-3)
+    assert run_blocking(arm, policy_of(REACH), seconds=0.04).goal_error is None
+    for bad in ([0.4, 0.2], [0.4, 0.2, 3.0], [0.4, 0.2, float("nan")]):
+        with pytest.raises(ValueError, match=r"a goal is from \[0.0, -1.0, 0.0\] to \[1.0, 1.0, 1.0\]"):
+            policy.goal = bad
+    with pytest.raises(ValueError, match=r"it\.toml has no goal"):
+        policy_of(REACH).goal = [0.0]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("high = [1.0, 1.0, 1.0]", "high = [1.0, 1.0]", "default, low and high need the same number of numbers"),
+        ("high = [1.0, 1.0, 1.0]", "high = [0.2, 1.0, 1.0]", "default .* is not between low and high"),
+        (GOAL.partition("[goal]")[2], "\n[action]", "missing required field `default`"),
+        ('relative_to = "grip_position"', 'relative_to = "grip_orientation"', "has 4 numbers, the goal 3"),
+        ('relative_to = "grip_position"', 'relative_to = "nose"', r"observation\[2\].relative_to: .*no sensor 'nose'"),
+    ],
+)
+def test_a_goal_that_cannot_work_is_refused(old: str, new: str, said: str, arm: URLabClient) -> None:
+    with pytest.raises((PolicyFileError, PolicyMismatch), match=said):
+        policy_of(REACH.replace("[action]", GOAL).replace(old, new)).bind(arm.articulations["arm"])
+
+
+def test_the_term_needs_a_goal() -> None:
+    with pytest.raises(PolicyFileError, match=r"the term 'goal' needs the table \[goal\]"):
+        policy_of(REACH.replace("[action]", '[[observation]]\nterm = "goal"\n[action]'))
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (WALK.replace('"quadruped"', '"dog"'), r"no articulation 'dog'; there are: quadruped"),
+        (WALK.replace('"quadruped"', '"dog"'), r"no articulation is called 'dog'; there are: quadruped"),
         (walk(('"direct", "live"', '"live"')), r"in 'direct' mode; step_modes requires 'live'.*step_mode='live'"),
         (walk(("0.002", "0.005")), r"timestep of 0.002 s; timestep requires 0.005 s.*set_sim_options\(timestep=0.005"),
         (walk(('"FR_thigh"', '"XX_thigh"')), r"action.joints\[1\]: .*no joint 'XX_thigh'; it has .*FR_thigh"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, ClassVar
@@ -13,7 +14,15 @@ import urlab_client
 from urlab_client.cli import main
 from urlab_client.integrations.gym import Reach, URLabBatchEnv, URLabEnv, URLabVectorEnv, Walk, batch
 from urlab_client.integrations.record import read_run, record
-from urlab_client.randomise import CameraLatency, Delay, Noise, Push, Randomisation, Vary
+from urlab_client.randomise import (
+    CameraLatency,
+    Delay,
+    Noise,
+    Push,
+    Randomisation,
+    UnsupportedRandomisation,
+    Vary,
+)
 from urlab_client.server import ControllerConfig, SimulatedServer
 
 EVERYTHING = Randomisation(
@@ -94,8 +103,47 @@ def test_servers_batches_and_single_environments_vary_bit_for_bit_alike(
             assert np.array_equal(ours[0], seen[0])
             assert ours[1] == rewards[0]
         assert ours[-1]["episode_seed"] == starts[0][1]["episode_seed"][0]
-        with pytest.raises(urlab_client.URLabError, match="does not vary its scene"):
+        with pytest.raises(UnsupportedRandomisation, match="no op of its protocol changes friction, mass") as refused:
             URLabEnv.connect(where(plain), randomise=EVERYTHING)
+        settable = {"gravity", "position", "base_position", "base_yaw", "kp", "kv"}
+        assert set(refused.value.quantities) == {vary.what for vary in EVERYTHING.vary} - settable
+        assert str(pickle.loads(pickle.dumps(refused.value))) == str(refused.value)
+        with pytest.raises(urlab_client.URLabError, match="varies its scene in another way"):
+            URLabEnv.connect(where(second), randomise=Randomisation())
+
+
+@pytest.mark.parametrize("dialect", ["alpha", "beta"])
+def test_a_server_that_varies_nothing_itself_varies_what_its_ops_reach(made: list[Any], dialect: Any) -> None:
+    settable = {"gravity", "position", "base_position", "base_yaw", "kp", "kv"}
+    declared = Randomisation(vary=tuple(vary for vary in EVERYTHING.vary if vary.what in settable))
+    pd = {"quadruped": ControllerConfig(kp=60.0, kv=2.0)}
+    options = {"randomise": declared, "max_episode_steps": 5, "reset_noise": 0.05}
+    with SimulatedServer("quadruped", play=True, controllers=pd, dialect=dialect) as server:
+        copies = URLabBatchEnv(where(server), 1, task=FreeWalk(), **options)
+        with urlab_client.URLabClient(**server.client_options(), step_mode="direct") as client:
+            client.discover()
+            robot = client.articulations["quadruped"]
+            before = dict(robot.controller.kp)
+            gravity = client.runtime.set_sim_options().gravity
+            env = URLabEnv(client, task=FreeWalk(), **options)
+            made += [copies, env]
+            for seed in (3, 4):
+                ours, (theirs, infos) = env.reset(seed=seed), copies.reset(seed=seed)
+                assert ours[1]["episode_seed"] == infos["episode_seed"][0]
+                assert env.draws() == copies.draws(0)
+                assert np.allclose(ours[0], theirs[0], rtol=0, atol=1e-6)
+                action = np.full(12, 0.3, dtype=np.float32)
+                for _ in range(3):
+                    ours, theirs = env.step(action), copies.step(action[None])[0]
+                assert np.allclose(ours[0], theirs[0], rtol=0, atol=1e-3)
+            assert robot.controller.kp != before
+            assert client.runtime.set_sim_options().gravity != gravity
+            env.close()
+            assert robot.controller.kp == before
+            assert client.runtime.set_sim_options().gravity == gravity
+        servo = Randomisation(vary=(Vary(what="kp", scale=(0.5, 2.0)),))
+        with SimulatedServer("arm", play=True) as arm, pytest.raises(UnsupportedRandomisation, match="changes kp"):
+            URLabEnv.connect(where(arm), randomise=servo)
 
 
 def fallen(client: urlab_client.URLabClient, seed: int | None) -> float:

@@ -73,6 +73,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Run:
         SimulatedServer("arm", str(mjcf), play=True, model_roots=[folder]) as server,
         urlab_client.URLabClient(**server.client_options(), step_mode="direct") as client,
     ):
+        assert server.can_render  # the first picture would wait for that
         client.discover()
         client.reset()
         with record(client, folder / "run.mcap", cameras=["eye/up"], camera_hz=25, image_format="png"):
@@ -201,6 +202,32 @@ def test_a_lerobot_dataset_is_written_by_the_other_interpreter(recorded: Run, tm
     assert frame["action"] == action.astype(np.float32).tolist()
     with pytest.raises(FileExistsError):
         export.write_lerobot(recorded, tmp_path / "spins", python=lerobot, fps=50, task="spin")
+
+
+def test_a_lerobot_dataset_holds_what_kept_episodes_were_about(tmp_path: Path, lerobot: str) -> None:
+    with (
+        SimulatedServer("arm", play=True) as server,
+        urlab_client.URLabClient(**server.client_options(), step_mode="direct") as client,
+    ):
+        client.discover()
+        with record(client, tmp_path / "run.mcap", pose_hz=0) as recorder:
+            for outcome in ("success", "discarded", "failure"):
+                client.reset()
+                for _ in range(3):
+                    client.step(10)
+                number = float(len(outcome))
+                recorder.mark(outcome, goal={"place": np.array([number, 0.5]), "height": number})
+            client.reset()
+            client.step(10)
+    run = read_run(tmp_path / "run.mcap")
+    assert export.write_lerobot(run, tmp_path / "dataset", python=lerobot, task="go there", fps=50) == 6
+    log = json.loads((tmp_path / "dataset" / "log.json").read_text(encoding="utf-8"))
+    feature = log["features"]["observation.environment_state"]
+    assert feature == ["float32", [3], ["place.0", "place.1", "height.0"]]
+    abouts = [[frame["observation.environment_state"] for frame in frames] for frames in log["episodes"]]
+    assert abouts == [[[7.0, 0.5, 7.0]] * 3] * 2
+    one = export.write_lerobot(run, tmp_path / "good", python=lerobot, task="go there", fps=50, episodes="success")
+    assert one == 3
 
 
 def test_a_frame_never_shows_an_older_picture_unasked(recorded: Run, tmp_path: Path, lerobot: str) -> None:

@@ -62,6 +62,7 @@ def pushers() -> Iterator[list[str]]:
         SimulatedServer(*models, play=True, camera_size=(96, 72)) as one,
         SimulatedServer(*models, play=True, camera_size=(96, 72)) as two,
     ):
+        assert one.can_render  # the first picture would wait for that
         yield [f"{server.address}:{server.step_port}" for server in (one, two)]
 
 

@@ -25,7 +25,7 @@ from urlab_client import UnknownKeyframe
 from urlab_client.integrations.telemetry import OpenTelemetryObserver, PrometheusObserver, PrometheusServerMetrics
 from urlab_client.protocol.messages.session import Reset
 from urlab_client.server import ServedRequest, SimulatedServer
-from urlab_client.web import Access, app
+from urlab_client.web import Access, app, apps
 
 
 @pytest.fixture(scope="module")
@@ -114,6 +114,14 @@ def test_the_console_shows_the_metrics_of_its_client_to_those_who_may_come_in(se
     assert read["urlab_client_received_bytes_total", ("hello",)] > 1000
     assert read["urlab_client_round_trip_seconds_count", ("meta",)] == 2
     assert read["urlab_client_queue_seconds_sum", ("meta",)] == 0
+    for root, metrics in ((site, registry), (app(urlab_client.aio.URLabClient(), access=Access(tokens=False)), None)):
+        http = TestClient(root, base_url="http://localhost", headers={"authorization": f"Bearer {key}"})
+        paths = http.get("/api/openapi.json").json()["paths"]
+        assert ("/metrics" in paths) == (metrics is not None) == (http.get("/metrics").status_code == 200)
+    several = apps({"one": urlab_client.aio.URLabClient()}, access=site.state.access, metrics=registry)
+    http = TestClient(several, base_url="http://localhost")
+    assert http.get("/metrics").status_code == 401
+    assert http.get("/metrics", headers={"authorization": f"Bearer {key}"}).text == answer.text
 
 
 def test_a_server_counts_what_it_answers_and_bears_callbacks_that_fail(

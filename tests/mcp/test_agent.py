@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import io
 import math
 from collections.abc import AsyncGenerator, Iterator
@@ -16,8 +17,9 @@ from mcp.shared.exceptions import MCPError
 from PIL import Image
 from waiting import until
 
+from urlab_client.aio import URLabClient
 from urlab_client.integrations.record import read_run
-from urlab_client.mcp import Limits
+from urlab_client.mcp import Agent, Limits
 from urlab_client.server import SimulatedServer
 from urlab_client.server.assets.bundled_robots import bundled_models
 from urlab_client.web.driving_lease import Viewer
@@ -61,21 +63,20 @@ async def test_an_agent_finds_out_why_nothing_moves_mends_it_and_records(tmp_pat
             assert "stood still" in said
             assert "play with action='resume'" in said, "it names a tool, not a method"
             found = await one.call("explain")
-            assert found["problems"] == 1
+            assert sum(one["verdict"] == "problem" for one in found["findings"]) == 1
             assert any("paused. Call play with action='resume'" in finding["text"] for finding in found["findings"])
             await one.call("play", action="resume")
             assert "settled" in (await one.call("move_to", **order))["done"]
 
             camera = f"{robot['name']}/{robot['cameras'][0]['name']}"
             picture = await one.mcp.call_tool("picture", {"camera": camera, "size": 32})
-            assert picture.structured_content is not None
-            assert (picture.structured_content["width"], picture.structured_content["height"]) == (32, 24)
+            assert (picture.structured_content or {})["camera"] == camera
 
             await one.call("record", action="start")
             await one.call("move_to", robot=robot["name"], joints={"elbow": 0.0})
             episode = await one.call("record", action="stop")
     assert (episode["robots"], episode["lost"]) == (["arm"], 0)
-    assert len(read_run(tmp_path / episode["file"]).table()) > 10
+    assert len(read_run(tmp_path / episode["name"]).table()) > 10
 
 
 async def test_tools_say_what_they_take_give_and_do(direct: Desk) -> None:
@@ -107,9 +108,45 @@ async def test_without_leave_an_agent_only_looks(server: SimulatedServer) -> Non
         assert "--allow-drive, --allow-edit" in (one.mcp.instructions or "")
 
 
+async def test_an_agent_that_looks_on_takes_nothing_from_whoever_drives() -> None:
+    with SimulatedServer("arm", play=True, unpaused=True, camera_size=(64, 48)) as server:
+        async with (
+            URLabClient(**server.client_options(), step_mode="live") as driver,
+            contextlib.AsyncExitStack() as stack,
+        ):
+            await driver.discover()
+            one = await stack.enter_async_context(desk(server, Limits(), handshake=driver.handshake))
+            names = {tool.name for tool in (await one.mcp.list_tools()).tools}
+            assert names == {"look", "state", "picture", "explain", "log"}
+            assert "--take-over" in await one.refused("contacts")
+            assert (await one.call("look"))["scene"]["articulations"][0]["joints"][2]["name"] == "elbow"
+            driver.articulations["arm"].set_ctrl({"elbow": 1.0})
+            await driver.step()
+
+            async def elbow() -> float:
+                return float((await one.call("state", robot="arm"))["joints"]["elbow"])
+
+            await until(lambda: one.client.articulations["arm"].joints["elbow"].position > 0.5)
+            assert await elbow() > 0.5
+            assert not (await one.mcp.call_tool("picture", {"camera": "arm/overview"})).is_error
+            assert "read-only" in str(await one.call("explain"))
+            # What it knows follows the driver's next play.
+            await driver.sim.stop()
+            await driver.sim.start()
+            await driver.runtime.set_paused(False)
+            await until(
+                lambda: one.client.sim_time < 1 and abs(one.client.articulations["arm"].joints["elbow"].position) < 0.1
+            )
+            assert (await one.call("look"))["scene"]["playing"]
+            assert one.client.session_id == ""
+            await driver.step()
+            with pytest.raises(ValueError, match="read-only"):
+                Agent(one.console, Limits(drive=True))
+
+
 async def test_what_an_agent_gets_wrong_is_said_and_nothing_is_done(direct: Desk) -> None:
     for tool, arguments, words in (
-        ("nothing", {}, ["no tool 'nothing'", "move_to"]),
+        ("nothing", {}, ["No tool is called 'nothing'", "move_to"]),
         ("state", {"robot": "arn"}, ["'arm'"]),
         ("state", {}, ["robot"]),
         ("run", {}, ["seconds", "steps"]),
@@ -127,8 +164,8 @@ async def test_what_an_agent_gets_wrong_is_said_and_nothing_is_done(direct: Desk
         ("reset", {"joints": {"arm": {"elbow": 9}}}, ["got 9"]),
         ("play", {"action": "pause"}, ["direct", "run"]),
         ("record", {"action": "stop"}, ["no recording runs"]),
-        ("import_model", {"model": "/etc/passwd"}, ["no model"]),
-        ("spawn", {"blueprint": "../arm", "actor_id": "b", "position": [0, 0, 0]}, ["no blueprint"]),
+        ("import_model", {"model": "/etc/passwd"}, ["No model is called"]),
+        ("spawn", {"blueprint": "../arm", "actor_id": "b", "position": [0, 0, 0]}, ["No blueprint is called"]),
         ("spawn", {"blueprint": "arm", "actor_id": "b", "position": [0, 0]}, ["position"]),
         ("remove", {"actor": "nobody"}, ["There are: arm"]),
         ("picture", {"camera": "arm/nothing"}, ["nothing"]),
@@ -187,7 +224,7 @@ async def test_a_call_that_takes_too_long_is_broken_off() -> None:
         async with desk(server, Limits(drive=True, wall_seconds=0.3), step_mode="live") as one:
             said = await one.refused("run", seconds=10)
             assert "longer than 0.3 s" in said
-            assert (await one.call("explain"))["problems"] == 1, "it is paused"
+            assert any("paused" in finding["text"] for finding in (await one.call("explain"))["findings"])
 
 
 async def test_a_person_takes_over_and_the_agent_waits(direct: Desk) -> None:
@@ -253,7 +290,7 @@ async def test_a_person_sees_what_an_agent_records(server: SimulatedServer, tmp_
         second = await one.call("record", action="start")
         await one.call("run", seconds=0.1)
     # What is not stopped is finished when the console closes.
-    assert [len(read_run(tmp_path / made["file"]).table()) for made in (first, second)] == [5, 5]
+    assert [len(read_run(tmp_path / made["name"]).table()) for made in (first, second)] == [5, 5]
 
 
 async def test_resources(direct: Desk) -> None:

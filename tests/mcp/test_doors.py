@@ -86,9 +86,9 @@ async def test_over_http_a_token_is_needed_which_is_not_the_console_s() -> None:
             access = Access()
             site = app(client, access=access)
             agent = Agent(site, ALL)
-            application = http_application(agent, site, TOKEN, Access(tokens=False))
+            application = http_application(agent, site, Access(keys=[TOKEN]))
             async with site.router.lifespan_context(site), served(application) as http:
-                assert (await http.post("/mcp")).json()["error"]["code"] == "bad_token"
+                assert (await http.post("/mcp")).json()["error"]["code"] == "no_key"
                 bearer = {"authorization": f"Bearer {TOKEN}"}
                 for name, value in (("host", "evil.example"), ("origin", "http://evil.example")):
                     refused = await http.post("/mcp", headers={**bearer, name: value})
@@ -118,10 +118,17 @@ async def test_over_http_a_token_is_needed_which_is_not_the_console_s() -> None:
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
-    [(["--host", "0.0.0.0"], "--allow-host NAME"), (["--models", "nowhere"], "there is no such folder")],
+    [
+        (["sim://arm", "--host", "0.0.0.0"], "--allow-host NAME"),
+        (["sim://arm", "--models", "nowhere"], "there is no such folder"),
+        (["sim://arm", "--handshake", "file"], "not for sim://MODEL"),
+        (["tcp://localhost"], "takes a server over from nobody. Pass --handshake FILE"),
+        (["tcp://localhost", "--handshake", "file", "--allow-drive"], "leave out"),
+        (["tcp://localhost", "--handshake", "file", "--step-mode", "live"], "the driving client's to choose"),
+    ],
 )
 def test_what_cannot_be_honoured_is_said(arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["mcp", "sim://arm", *arguments]) == 2
+    assert main(["mcp", *arguments]) == 2
     assert words in capsys.readouterr().err
 
 

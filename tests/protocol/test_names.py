@@ -61,6 +61,14 @@ class TestLookUp:
         with pytest.raises(KeyError, match=r"^no entry 'x'\. There are none\.$"):
             NameMap[int]()["x"]
 
+    def test_a_miss_says_what_has_no_such_name(self) -> None:
+        joints = NameMap({"elbow": 1}, {"bend": ["elbow"]}, kind="joint", owner="arm")
+        for twin in (joints, pickle.loads(pickle.dumps(joints))):
+            with pytest.raises(UnknownName, match=r"^arm has no joint 'elbo'\. Did you mean 'elbow'\?") as caught:
+                twin["elbo"]
+            again = pickle.loads(pickle.dumps(caught.value))
+            assert (str(again), again.kind, again.owner) == (str(caught.value), "joint", "arm")
+
     def test_a_miss_among_many_names_stays_readable(self) -> None:
         joints = NameMap({f"joint{i}": i for i in range(500)}, kind="joint")
         with pytest.raises(KeyError) as caught:

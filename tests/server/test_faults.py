@@ -11,6 +11,7 @@ import pytest
 import zmq
 from hypothesis import given
 from hypothesis import strategies as st
+from wire import Wire
 
 from urlab_client import (
     OutcomeUnknown,
@@ -176,7 +177,7 @@ def test_seeds_differ() -> None:
 @pytest.mark.parametrize(
     ("kind", "options", "complaint"),
     [
-        (Drop, {"op": "fly"}, "no op 'fly'"),
+        (Drop, {"op": "fly"}, "no op is called 'fly'"),
         (Drop, {"op": "step", "topic": "state/full"}, "not both"),
         (Cut, {"topic": "state/full"}, "Cut concerns requests"),
         (Refuse, {"code": ""}, "needs a code"),
@@ -255,3 +256,11 @@ def test_shared_memory_gets_what_subscribers_do_not(models: Path, tmp_path: Path
             (drop, _) = faults.active
             assert drop.wait(timeout=30.0)
             assert states.receive(timeout=30.0).per_articulation
+
+
+def test_a_missed_deadline_costs_these_tests_no_other_request(server: SimulatedServer, faults: Faults) -> None:
+    with Wire(server) as wire, faults.add(Drop("hello", times=1)):
+        wire._socket.rcvtimeo = 10
+        with pytest.raises(AssertionError, match=r"no reply within 30 s to .*hello"):
+            wire.hello()
+        assert wire.hello()["session_id"]

@@ -35,7 +35,7 @@ def test_a_folder_goes_with_its_owner(temporary: Path) -> None:
     with TemporaryFolder() as scratch:
         (scratch.path / "level.json").write_text("{}")
         assert scratch.path.parent == temporary
-        assert scratch.path.stat().st_mode & 0o077 == 0
+        assert sys.platform == "win32" or scratch.path.stat().st_mode & 0o077 == 0
     scratch.close()
     assert not list(temporary.iterdir())
 

@@ -101,12 +101,11 @@ def server_threads() -> set[threading.Thread]:
 class Wire:
     """Talks to a server; checks of every reply what holds for all."""
 
-    def __init__(self, server: SimulatedServer, *, encoding: str = "") -> None:
+    def __init__(self, server: SimulatedServer, *, encoding: str = "", timeout_s: float = 30) -> None:
         self._context = zmq.Context()
-        self._socket = self._context.socket(zmq.REQ)
-        self._socket.linger = 0
-        self._socket.rcvtimeo = 30_000
-        self._socket.connect(f"{server.address}:{server.step_port}")
+        self._endpoint = f"{server.address}:{server.step_port}"
+        self._timeout_s = timeout_s
+        self._socket = self._connect()
         self._encoding = encoding
         self.session_id = ""
 
@@ -117,10 +116,23 @@ class Wire:
         self._socket.close()
         self._context.term()
 
+    def _connect(self) -> zmq.Socket[bytes]:
+        socket = self._context.socket(zmq.REQ)
+        socket.linger = 0
+        socket.rcvtimeo = int(1000 * self._timeout_s)
+        socket.connect(self._endpoint)
+        return socket
+
     def exchange(self, *frames: bytes) -> bytes:
         """Send a request as it is and return the reply as it is."""
         self._socket.send_multipart(frames)
-        reply = self._socket.recv_multipart()
+        try:
+            reply = self._socket.recv_multipart()
+        except zmq.Again:
+            # A REQ socket that was promised a reply takes no other request: what shares it would fail, too.
+            self._socket.close()
+            self._socket = self._connect()
+            raise AssertionError(f"no reply within {self._timeout_s} s to {frames!r:.200}") from None
         assert len(reply) == 1
         return reply[0]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Callable
 from pathlib import Path
 from typing import Any
 
@@ -62,11 +62,13 @@ async def desk(
     step_mode: str = "direct",
     recordings: Path = Path("recordings"),
     models: dict[str, Path] | None = None,
+    handshake: Callable[[], bytes] | None = None,
 ) -> AsyncGenerator[Desk]:
-    """Put an agent at a server."""
+    """Put an agent at a server; with a handshake it looks on."""
     # Patience with a time that stands still is the client's own deadline.
-    client = URLabClient(**server.client_options(), step_mode=step_mode, live_pictures=False, rcv_timeout_ms=1000)
-    site = app(client, access=Access(tokens=False), recordings=recordings)
+    options = {"step_mode": step_mode} if handshake is None else {"read_only": True}
+    client = URLabClient(**server.client_options() | options, live_pictures=False, rcv_timeout_ms=1000)
+    site = app(client, access=Access(tokens=False), handshake=handshake, recordings=recordings)
     agent = Agent(site, limits, models=models)
     async with (
         client,

@@ -102,7 +102,7 @@ def test_each_server_has_a_console_and_one_key_opens_all() -> None:
             assert not http.get("/right/api/status").json()["mine"]
 
 
-@pytest.mark.parametrize("name", ["a/b", "", "api", "..", "a b"])
+@pytest.mark.parametrize("name", ["a/b", "", "api", "metrics", "..", "a b"])
 def test_a_server_has_a_name_that_can_stand_in_a_path(name: str) -> None:
     with pytest.raises(ValueError, match="cannot be the name of a server"):
         apps({name: URLabClient("tcp://localhost")})

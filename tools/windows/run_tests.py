@@ -3,14 +3,15 @@
 run_tests.py INTERPRETER PYTHON [--limit SECONDS] [--workers N] [--logs FOLDER] PATH...
 
 INTERPRETER is what make_python.sh made, PYTHON one of this system that has the project's test dependencies: it says
-which tests run on Linux. A test that ends or hangs the interpreter fails; the rest of its file runs in another one.
-Where Wine does not start, one line says so, and where the time is up, what has not run; neither is a failure.
+which tests run on Linux. A PATH is a folder, a file, or FILE::TEST. A test that ends or hangs the interpreter fails,
+and the rest of its file runs in another one. Every test that runs on Linux and that `tests/not_on_windows.toml` does
+not list has a result: it failed, too, if it was skipped, or if no interpreter came to it. Where Wine does not start,
+one line says so, and where the time is up, what has not run; neither is a failure.
 """
 
 from __future__ import annotations
 
 import argparse
-import collections
 import concurrent.futures
 import contextlib
 import dataclasses
@@ -29,35 +30,67 @@ from pathlib import Path
 from wine import NotStarted, Prefix, prefixes, screen
 
 ROOT = Path(__file__).resolve().parents[2]
-RESULT = re.compile(r"(tests/\S.*?)(?: (PASSED|FAILED|ERROR|SKIPPED)\b.*| \++ Timeout \++)?")
+sys.path.append(str(ROOT / "tests" / "support"))
+
+from not_on_windows import listed, names  # noqa: E402
+
+RESULT = re.compile(r"((?:tests/\S.*?)?)(?: (PASSED|FAILED|ERROR|SKIPPED)\b.*| \++ Timeout \++)?")
 TEST_S = 200
 SILENCE_S = 40  # beyond a test's time: the interpreter does not start, or end
 FILE_S = 1200
 COLLECT_S = 120
 LEFTOVER_S = 3  # what a test leaves behind may keep the interpreter's output open
 ATTEMPTS = 4
-NOT_COLLECTED, NOTHING_LEFT, CRASHED, STOPPED = 2, 5, -1, -2  # exit codes: the first two are pytest's
+NOT_COLLECTED, NOT_FOUND, NOTHING_LEFT, CRASHED, STOPPED = 2, 4, 5, -1, -2  # exit codes: the first three are pytest's
+RAN_AND_FAILED = ("FAILED", "ERROR")
+FAILED = (*RAN_AND_FAILED, "SKIPPED", "NOT RUN")
 
 
 @dataclasses.dataclass
 class Outcome:
-    """How the tests of a file ended, and how often the interpreter did between them."""
+    """How the tests of a file ended: what was asked for of it, those that run on Linux, and those meant to run here."""
 
     file: str
+    asked: list[str]
+    on_linux: list[str]
+    meant: list[str]
     results: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
     problems: list[str] = dataclasses.field(default_factory=list[str])
     seconds: float = 0.0
-    crashes: int = 0
     broken_off: bool = False
 
+    @property
+    def rest(self) -> list[str]:
+        """The tests that are meant to run and have no result."""
+        return [test for test in self.meant if test not in self.results]
+
+    def result(self, line: str) -> tuple[str, str] | None:
+        """Return the test that a line of pytest's is about, and how it ended, or nothing as long as it runs."""
+        # What ends the interpreter may print its last words behind the test's name.
+        test = max((test for test in self.meant if f"{line} ".startswith(f"{test} ")), key=len, default="")
+        found = RESULT.fullmatch(line.removeprefix(test))
+        if test:
+            return test, (found[2] or "") if found else ""
+        return (found[1], found[2] or "") if found and "::" in found[1] else None
+
     def count(self, *words: str) -> int:
-        """Return how many tests ended in one of these ways."""
-        return sum(result in words for result in self.results.values())
+        """Return how many of the tests that are meant to run ended in one of these ways."""
+        return sum(self.results.get(test) in words for test in self.meant)
+
+    @property
+    def passed(self) -> int:
+        """The number of tests that passed."""
+        return self.count("PASSED")
 
     @property
     def ran(self) -> int:
         """The number of tests that ran, however they ended."""
-        return self.count("PASSED", "FAILED", "ERROR")
+        return self.count("PASSED", *RAN_AND_FAILED)
+
+    @property
+    def failed(self) -> int:
+        """The number of tests that failed, or did not run although there was time."""
+        return self.count(*FAILED)
 
 
 class Clock:
@@ -84,8 +117,8 @@ class Clock:
         self._ended.set()
 
 
-def on_linux(python: str, paths: list[str]) -> collections.Counter[str]:
-    """Return the number of tests that run on Linux, by file."""
+def on_linux(python: str, paths: list[str]) -> list[Outcome]:
+    """Return what is to be found out: by file, the tests that run on Linux."""
     command = [python, "-m", "pytest", "--collect-only", "-q", "-n", "0", "-p", "no:cacheprovider", *paths]
     try:
         done = subprocess.run(  # noqa: S603
@@ -95,15 +128,31 @@ def on_linux(python: str, paths: list[str]) -> collections.Counter[str]:
         sys.exit(f"the tests could not be collected here within {COLLECT_S} s")
     if done.returncode:
         sys.exit(f"the tests cannot be collected here:\n{done.stdout}{done.stderr}")
-    return collections.Counter(line.partition("::")[0] for line in done.stdout.splitlines() if "::" in line)
+    files: dict[str, list[str]] = {}
+    for line in done.stdout.splitlines():
+        if "::" in line:
+            files.setdefault(line.partition("::")[0], []).append(line)
+    entries = listed(wine=True)
+    return [
+        Outcome(file, asked_of(file, paths), tests, [test for test in tests if not names(entries, test)])
+        for file, tests in files.items()
+    ]
 
 
-def run(file: str, prefix: Prefix, log: Path, clock: Clock) -> Outcome:
+def asked_of(file: str, paths: list[str]) -> list[str]:
+    """Return what to run of a file: all, or the tests of it that the paths name."""
+    plain = {path: Path(os.path.relpath(path.partition("::")[0], ROOT)) for path in paths}
+    if any("::" not in path and Path(file).is_relative_to(plain[path]) for path in paths):
+        return [file]
+    return [file + path[path.index("::") :] for path in paths if "::" in path and plain[path] == Path(file)]
+
+
+def run(outcome: Outcome, prefix: Prefix, log: Path, clock: Clock) -> Outcome:
     """Run a file's tests."""
-    outcome = Outcome(file)
     started = time.monotonic()
     log.unlink(missing_ok=True)
-    for _ in range(ATTEMPTS):
+    crashes = 0
+    while outcome.rest and not outcome.broken_off:
         met, code = run_rest(outcome, prefix, log, clock)
         interrupted = [test for test, result in outcome.results.items() if not result]
         if code == STOPPED and clock.up:
@@ -112,16 +161,15 @@ def run(file: str, prefix: Prefix, log: Path, clock: Clock) -> Outcome:
         outcome.results |= dict.fromkeys(interrupted, "ERROR")
         if (code in {0, 1} and not interrupted) or (code == NOTHING_LEFT and not met):
             break
-        if code == NOT_COLLECTED or time.monotonic() - started > FILE_S:
-            outcome.problems.append(f"the interpreter ended with {code} before all tests had run")
+        crashes += 1
+        if not interrupted:
+            outcome.problems.append(f"the interpreter ended with {code} outside tests")
+        if code in {NOT_COLLECTED, NOT_FOUND} or crashes == ATTEMPTS or time.monotonic() - started > FILE_S:
             break
-        outcome.crashes += not interrupted
-    else:
-        outcome.problems.append(f"the interpreter crashed {ATTEMPTS} times before all tests had run")
+    if not outcome.broken_off:
+        outcome.results |= dict.fromkeys(outcome.rest, "NOT RUN")
     outcome.seconds = time.monotonic() - started
-    outcome.problems += [
-        f"{result} {test}" for test, result in outcome.results.items() if result in {"FAILED", "ERROR"}
-    ]
+    outcome.problems += [f"{result} {test}" for test, result in outcome.results.items() if result in FAILED]
     return outcome
 
 
@@ -129,11 +177,10 @@ def run_rest(outcome: Outcome, prefix: Prefix, log: Path, clock: Clock) -> tuple
     """Run those of a file's tests that have no result yet; return how many were met, and the exit code."""
     options = ["-v", "--tb=short", "-n", "0", "-p", "no:cacheprovider", "-o", "timeout_method=thread"]
     with tempfile.NamedTemporaryFile("w", encoding="utf-8", suffix=".txt") as arguments:
-        arguments.writelines(f"--deselect={test}\n" for test in outcome.results)
+        arguments.writelines(f"{test}\n" for test in (outcome.rest if outcome.results else outcome.asked))
         arguments.flush()
-        listed = [f"@Z:{arguments.name}"] if outcome.results else []
         process = subprocess.Popen(  # noqa: S603
-            [prefix.interpreter, "-m", "pytest", *options, f"--timeout={clock.test_s:.0f}", *listed, outcome.file],
+            [prefix.interpreter, "-m", "pytest", *options, f"--timeout={clock.test_s:.0f}", f"@Z:{arguments.name}"],
             cwd=ROOT,
             env=prefix.environment,
             stdin=subprocess.DEVNULL,
@@ -149,11 +196,9 @@ def run_rest(outcome: Outcome, prefix: Prefix, log: Path, clock: Clock) -> tuple
                 for line in lines(process, clock):
                     written.write(line)
                     crashed = crashed or line.startswith("wine: Unhandled ")
-                    if found := RESULT.fullmatch(line.rstrip().replace("\\", "/")):
-                        test, result = found.groups()
-                        if "::" in test:
-                            met += 1
-                            outcome.results[test] = result or ""
+                    if found := outcome.result(line.rstrip()):
+                        met += 1
+                        outcome.results |= [found]
             stopped = process.poll() is None
         finally:
             with contextlib.suppress(ProcessLookupError):
@@ -203,7 +248,7 @@ def main() -> int:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that nothing stays
     clock = Clock(arguments.limit)
     print(f"Windows: looking for the tests that run on Linux, at most {COLLECT_S} s", flush=True)
-    linux = on_linux(arguments.python, arguments.paths)
+    outcomes = on_linux(arguments.python, arguments.paths)
     with contextlib.ExitStack() as stack:
         logs = arguments.logs or Path(stack.enter_context(tempfile.TemporaryDirectory()))
         logs.mkdir(parents=True, exist_ok=True)
@@ -213,52 +258,70 @@ def main() -> int:
         except NotStarted as problem:
             print(f"the tests on Windows were not run: {problem}")
             return 0
-        print(f"Windows: running {linux.total()} tests of {len(linux)} files", flush=True)
-        outcomes = run_all(linux, running, logs, clock)
-    if left := [file for file in linux if file not in {done.file for done in outcomes if not done.broken_off}]:
+        meant = sum(len(outcome.meant) for outcome in outcomes)
+        print(f"Windows: running {meant} tests of {len(outcomes)} files", flush=True)
+        run_all(outcomes, running, logs, clock)
+    if left := [outcome.file for outcome in outcomes if outcome.broken_off]:
         print(f"the time of {clock.seconds:.0f} s was up; not run, or not to the end: {', '.join(left)}")
-    ran, total = sum(outcome.ran for outcome in outcomes), linux.total()
-    passed = sum(outcome.count("PASSED") for outcome in outcomes)
+    print(table(outcomes))
+    ran, total = sum(outcome.ran for outcome in outcomes), sum(len(outcome.on_linux) for outcome in outcomes)
     print(
-        f"{ran} of {total} tests that run on Linux ran here: {100 * ran / total:.1f} %, {passed} passed, "
-        f"{ran - passed} failed, in {clock.passed:.0f} s"
+        f"{ran} of {total} tests that run on Linux ran here: {100 * ran / total:.1f} %, "
+        f"{sum(outcome.passed for outcome in outcomes)} passed; {sum(outcome.failed for outcome in outcomes)} failed, "
+        f"were skipped or were not come to, in {clock.passed:.0f} s"
     )
     return 1 if any(outcome.problems for outcome in outcomes) else 0
 
 
-def run_all(linux: collections.Counter[str], running: list[Prefix], logs: Path, clock: Clock) -> list[Outcome]:
+def table(outcomes: list[Outcome]) -> str:
+    """Return the numbers by folder, as a table in Markdown."""
+    folders: dict[str, list[Outcome]] = {}
+    for outcome in sorted(outcomes, key=lambda outcome: outcome.file):
+        parts = Path(outcome.file).parts
+        folders.setdefault("/".join(parts[:2]) if len(parts) > 2 else "tests/test_*.py", []).append(outcome)
+    lines = ["| tests | on Linux | listed | ran | passed | minutes |", "|---|---|---|---|---|---|"]
+    for folder, those in [*((f"`{name}`", those) for name, those in folders.items()), ("together", outcomes)]:
+        everywhere, meant = sum(len(one.on_linux) for one in those), sum(len(one.meant) for one in those)
+        ran, passed = sum(one.ran for one in those), sum(one.passed for one in those)
+        minutes = sum(one.seconds for one in those) / 60
+        lines.append(f"| {folder} | {everywhere} | {everywhere - meant} | {ran} | {passed} | {minutes:.1f} |")
+    return "\n".join(lines)
+
+
+def run_all(outcomes: list[Outcome], running: list[Prefix], logs: Path, clock: Clock) -> None:
     """Run the files' tests, as many files at a time as there are Wines, and print how they ended."""
     free: queue.SimpleQueue[Prefix] = queue.SimpleQueue()
     for prefix in running:
         free.put(prefix)
 
-    def one(file: str) -> Outcome | None:
+    def one(outcome: Outcome) -> Outcome:
         prefix = free.get()
         try:
-            return None if clock.up else run(file, prefix, logs / f"{file.replace('/', '_')}.log", clock)
+            if clock.up:
+                outcome.broken_off = True
+                return outcome
+            return run(outcome, prefix, logs / f"{outcome.file.replace('/', '_')}.log", clock)
         finally:
             free.put(prefix)
 
-    outcomes: list[Outcome] = []
     with concurrent.futures.ThreadPoolExecutor(len(running)) as pool:
         try:
-            for done in concurrent.futures.as_completed([pool.submit(one, file) for file in linux]):
-                if outcome := done.result():
-                    outcomes.append(outcome)
-                    show(outcome, linux[outcome.file])
+            for done in concurrent.futures.as_completed([pool.submit(one, outcome) for outcome in outcomes]):
+                show(done.result())
         except BaseException:
             clock.end()
             raise
-    return outcomes
 
 
-def show(outcome: Outcome, number: int) -> None:
-    """Print how a file's tests ended, of so many on Linux."""
-    end = ", broken off" if outcome.broken_off else ""
-    counts = f"{outcome.count('PASSED')} passed, {number} on Linux"
-    print(f"{outcome.file}: {counts}, {outcome.seconds:.0f} s{end}", flush=True)
-    if outcome.crashes:
-        print(f"    the interpreter crashed {outcome.crashes} times outside tests", flush=True)
+def show(outcome: Outcome) -> None:
+    """Print how a file's tests ended."""
+    if outcome.broken_off and not outcome.results:
+        return
+    numbers = [f"{outcome.passed} passed"]
+    numbers += [f"{outcome.failed} failed"] if outcome.failed else []
+    numbers += [f"{len(outcome.on_linux)} on Linux", f"{outcome.seconds:.0f} s"]
+    numbers += ["broken off"] if outcome.broken_off else []
+    print(f"{outcome.file}: {', '.join(numbers)}", flush=True)
     for problem in outcome.problems:
         print(f"    {problem}", flush=True)
 

@@ -240,7 +240,7 @@ class URLabArticulation(URLabEntity):
             }
             for name, info in topics.items():
                 views[name].info = info
-            self._cameras = NameMap(views, kind=f"camera of {self.prefix}")
+            self._cameras = NameMap(views, kind="camera", owner=self.prefix)
         return self._cameras
 
     @property

@@ -42,6 +42,7 @@ _COMMANDS = (
     "plot",
     "run-policy",
     "evaluate",
+    "teleop",
     "view",
 )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Sequence
 from enum import StrEnum
+from pathlib import Path
 from typing import Any, Literal, NoReturn, Protocol, TypeVar, cast
 
 from urlab_client.cli._failure import CommandError
@@ -20,12 +21,14 @@ __all__ = [
     "add_address",
     "add_cameras",
     "add_dialect",
+    "add_handshake",
     "add_keys",
     "add_mjcf_options",
     "add_ports",
     "add_step_mode",
     "cameras",
     "count",
+    "handshake",
     "hertz",
     "image_size",
     "index",
@@ -114,8 +117,9 @@ class Commands(Protocol):
 
 
 class ServerArguments(argparse.Namespace):
-    """How to reach a server, besides its address; see `add_ports`, `add_keys` and `add_mjcf_options`."""
+    """How to reach a server, besides its address; see `add_ports`, `add_keys`, `add_mjcf_options`, `add_handshake`."""
 
+    handshake: Path | None
     mjcf_options: bool
     step_port: int
     state_port: int
@@ -137,6 +141,10 @@ def make_client(flavour: Callable[..., C], address: str, arguments: ServerArgume
                 f"--mjcf-options is for sim://MODEL; a server that runs already, as {address}, takes it when it starts"
             )
         address = f"{address}{'&' if '?' in address else '?'}mjcf-options"
+    if arguments.handshake is not None:
+        if address.startswith("sim://"):
+            raise CommandError("--handshake is for a server that another client drives, not for sim://MODEL")
+        options = {**options, "read_only": True}
     try:
         return flavour(
             address,
@@ -201,6 +209,7 @@ def add_ports(parser: argparse.ArgumentParser, *, state: bool = True) -> None:
         parser: The command's parser.
         state: Whether the command uses the state stream.
     """
+    parser.set_defaults(handshake=None)  # which only some commands take
     parser.add_argument(
         "--step-port",
         type=port,
@@ -260,6 +269,26 @@ def add_keys(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--client-key", metavar="FILE", help="own secret key, if the server knows its clients ($URLAB_CLIENT_KEY)"
     )
+
+
+def add_handshake(parser: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:  # pyright: ignore[reportPrivateUsage]
+    """Add the option of a command that can look on beside the client that drives; see `handshake`."""
+    parser.add_argument(
+        "--handshake",
+        type=Path,
+        metavar="FILE",
+        help="look on beside the client that drives, and take nothing over: the file has what client.handshake() "
+        "returns there, or GET /api/handshake of its console",
+    )
+
+
+def handshake(arguments: ServerArguments) -> bytes | None:
+    """Return what a command's client passes to `discover()`.
+
+    Raises:
+        OSError: The file cannot be read.
+    """
+    return None if arguments.handshake is None else arguments.handshake.read_bytes()
 
 
 def address(text: str) -> str:

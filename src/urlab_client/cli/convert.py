@@ -14,7 +14,7 @@ from urlab_client.cli._files import replaced
 from urlab_client.cli._output import progress_bar
 
 if TYPE_CHECKING:
-    from urlab_client.integrations.record import Run
+    from urlab_client.integrations.record import Episodes, Run
 
 __all__ = ["add_parser", "run"]
 
@@ -34,6 +34,7 @@ class ConvertArguments(argparse.Namespace):
     images: bool
     max_picture_age: float | None
     python: str | None
+    episodes: Episodes
     overwrite: bool
 
 
@@ -66,6 +67,13 @@ def add_parser(commands: Commands) -> None:
         metavar="NAME",
         help="a camera, as ARTICULATION/CAMERA: for mp4 the one to show, for npz and lerobot those to add; may be "
         "repeated",
+    )
+    parser.add_argument(
+        "--episodes",
+        choices=("kept", "success", "all"),
+        default="kept",
+        help="of marked episodes in tables and LeRobot datasets those that were not discarded, successes, or all "
+        "(default: %(default)s)",
     )
     lerobot = parser.add_argument_group("LeRobot datasets")
     lerobot.add_argument(
@@ -125,9 +133,9 @@ def _writer(kind: str, recording: Run, arguments: ConvertArguments) -> tuple[Cal
     cameras = arguments.camera
     match kind:
         case "csv":
-            return partial(export.write_csv, recording), "rows"
+            return partial(export.write_csv, recording, episodes=arguments.episodes), "rows"
         case "parquet":
-            return partial(export.write_parquet, recording), "rows"
+            return partial(export.write_parquet, recording, episodes=arguments.episodes), "rows"
         case "npz":
             return partial(export.write_npz, recording, cameras=cameras), "states"
         case "mp4":
@@ -153,5 +161,6 @@ def _writer(kind: str, recording: Run, arguments: ConvertArguments) -> tuple[Cal
                 robot_type=arguments.robot_type,
                 video=not arguments.images,
                 max_picture_age=arguments.max_picture_age,
+                episodes=arguments.episodes,
                 cameras=cameras or None,
             ), "frames"

@@ -14,8 +14,10 @@ from urlab_client.cli._arguments import (
     Commands,
     ServerArguments,
     add_address,
+    add_handshake,
     add_keys,
     add_ports,
+    handshake,
     make_client,
     one_of,
     seconds,
@@ -47,8 +49,8 @@ def add_parser(commands: Commands) -> None:
         "doctor",
         help="find out why a robot does not move",
         description="Check a server from its sockets to the set-points, and say what keeps robots from moving. This "
-        "opens a session, which takes the server over from the client that drives it; in your own program, "
-        "client.explain() does the same without that. Exit code 0 if nothing is wrong, 1 if something is.",
+        "opens a session, which takes the server over from the client that drives it, unless you pass --handshake; in "
+        "your own program, client.explain() does the same. Exit code 0 if nothing is wrong, 1 if something is.",
         examples=(
             ("urlab doctor", "the server on this machine"),
             ("urlab doctor 'sim://arm?unpaused'", "a simulated server, started for this command"),
@@ -67,6 +69,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("--timeout", type=seconds, default=2.0, metavar="S", help="deadline (default: %(default)s)")
     parser.add_argument("--json", action="store_true", help="print JSON")
     add_keys(parser)
+    add_handshake(parser)
     parser.set_defaults(run=run)
 
 
@@ -94,5 +97,5 @@ async def _diagnose(arguments: DoctorArguments) -> Diagnosis:
     )
     async with client:
         with contextlib.suppress(URLabError):  # the diagnosis says it
-            await client.discover()
+            await client.discover(handshake=handshake(arguments))
         return await client.explain()

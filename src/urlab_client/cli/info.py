@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -85,6 +86,10 @@ def _print(summary: Summary) -> None:
             f"dropped: {counted(summary.dropped_states, 'state')}, {counted(summary.dropped_frames, 'picture')}, "
             "which came faster than the file could be written"
         )
+    if summary.outcomes:
+        counts = Counter(mark.outcome for mark in summary.outcomes)
+        unmarked = summary.episodes - len(summary.outcomes)
+        print("outcomes: " + ", ".join(f"{n} {what}" for what, n in (*counts.items(), ("unmarked", unmarked)) if n))
     _print_varied(summary)
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
     table.add_column("topic", overflow="fold")

@@ -10,25 +10,16 @@ import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from urlab_client.cli._arguments import (
-    Commands,
-    ServerArguments,
-    add_address,
-    add_keys,
-    add_ports,
-    make_client,
-    one_of,
-    port,
-    seconds,
-)
+from urlab_client.cli._arguments import Commands, add_address, add_keys, add_ports, make_client, one_of, seconds
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._mujoco import import_mujoco
+from urlab_client.cli._page_options import PageArguments, add_page, check_page, host_names, page_url
 from urlab_client.protocol.enums import StepMode
 
 if TYPE_CHECKING:
     from starlette.applications import Starlette
 
-    from urlab_client.mcp import Agent, Limits
+    from urlab_client.mcp import Agent
     from urlab_client.web import Access
 
 __all__ = ["AGENT_PORT", "McpArguments", "add_parser", "run"]
@@ -37,23 +28,18 @@ AGENT_PORT = 8356
 _TOKEN = "URLAB_MCP_TOKEN"  # noqa: S105 - a variable's name
 
 
-class McpArguments(ServerArguments):
+class McpArguments(PageArguments):
     """What the command line says."""
 
-    address: str
     allow_drive: bool
     allow_edit: bool
+    take_over: bool
     step_mode: StepMode | None
     max_seconds: float
     max_wall: float
     models: Path | None
-    recordings: Path
     http: bool
-    host: str
-    port: int
-    allow_host: list[str]
     console: bool
-    open: bool
 
 
 def add_parser(commands: Commands) -> None:
@@ -62,13 +48,17 @@ def add_parser(commands: Commands) -> None:
         "mcp",
         help="let an agent look at a simulation, and drive it if you allow that",
         description="Serve tools for agents over the Model Context Protocol, on standard input and output or, with "
-        "--http, at an address on this machine. Without --allow-drive and --allow-edit an agent can only look. The "
-        "console shows what it does; whoever acts there takes the controls from the agent. Messages for you, as the "
-        "console's link, are on standard error. Ends with exit code 0 when its input ends, on SIGINT (Ctrl-C) and on "
-        "SIGTERM.",
+        "--http, at an address on this machine. Without --allow-drive and --allow-edit an agent can only look, and "
+        "takes a running server over from nobody. The console shows what it does; whoever acts there takes the "
+        "controls from the agent. Messages for you, as the console's link, are on standard error. Ends with exit code "
+        "0 when its input ends, on SIGINT (Ctrl-C) and on SIGTERM.",
         examples=(
             ("urlab mcp sim://quadruped --allow-drive", "a simulated robot for an agent that starts this command"),
-            ("urlab mcp tcp://localhost", "look at a server that runs already; another client's session ends"),
+            ("urlab mcp tcp://localhost --handshake robot.hello", "look on beside the client that drives"),
+            (
+                "urlab mcp tcp://localhost --allow-drive",
+                "drive a running server; another client's session ends",
+            ),
             ("urlab mcp --http --allow-drive --allow-edit", "at an address, with all tools"),
         ),
     )
@@ -78,6 +68,11 @@ def add_parser(commands: Commands) -> None:
     allowed = parser.add_argument_group("what the agent may do")
     allowed.add_argument("--allow-drive", action="store_true", help="move robots, reset, pause, record")
     allowed.add_argument("--allow-edit", action="store_true", help="import, place, move and remove robots and bodies")
+    allowed.add_argument(
+        "--take-over",
+        action="store_true",
+        help="without those: look at a running server that no other client drives, or end that client's session",
+    )
     allowed.add_argument(
         "--max-seconds", type=seconds, default=10.0, metavar="S", help="simulation time per call (default: %(default)g)"
     )
@@ -96,33 +91,14 @@ def add_parser(commands: Commands) -> None:
         metavar="FOLDER",
         help="folder of MJCF files that may be imported by name, besides the robots that are included",
     )
-    allowed.add_argument(
-        "--recordings", type=Path, default=Path("recordings"), metavar="FOLDER", help="default: %(default)s"
-    )
-    network = parser.add_argument_group("network")
-    network.add_argument(
+    add_page(parser, AGENT_PORT)
+    parser.add_argument(
         "--http",
         action="store_true",
-        help=f"serve streamable HTTP at /mcp, for whoever brings the printed token, or that of ${_TOKEN}",
+        help="serve streamable HTTP at /mcp, for whoever brings the printed token, or that of "
+        f"${_TOKEN}; without it the console's port is any free one unless you name one",
     )
-    network.add_argument(
-        "--port",
-        type=port,
-        default=AGENT_PORT,
-        help="port of /mcp and the console; 0: any free one (default: %(default)s, or any free one without --http)",
-    )
-    network.add_argument(
-        "--host", default="127.0.0.1", help="interface to bind (default: %(default)s); others need --allow-host"
-    )
-    network.add_argument(
-        "--allow-host",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="host name under which agents and browsers come, besides this machine's own; repeatable",
-    )
-    network.add_argument("--no-console", dest="console", action="store_false", help="do not show the console")
-    network.add_argument("--open", action="store_true", help="open the console in the browser")
+    parser.add_argument("--no-console", dest="console", action="store_false", help="do not show the console")
     parser.set_defaults(run=run)
 
 
@@ -134,40 +110,57 @@ def run(arguments: McpArguments) -> int:
         CommandError: An option cannot be honoured.
         OSError: The port is in use.
     """
-    from urlab_client.mcp import Limits  # noqa: PLC0415
+    import urlab_client.mcp  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]  # says what is missing
 
-    if arguments.host not in {"127.0.0.1", "::1", "localhost"} and not arguments.allow_host:
-        raise CommandError(f"--host {arguments.host}: pass --allow-host NAME, the name under which agents come")
+    check_page(arguments)
+    _check_leave(arguments)
     if arguments.models is not None and not arguments.models.is_dir():
         raise CommandError(f"--models {arguments.models}: there is no such folder")
     import_mujoco()
-    limits = Limits(
-        drive=arguments.allow_drive,
-        edit=arguments.allow_edit,
-        sim_seconds=arguments.max_seconds,
-        wall_seconds=arguments.max_wall,
-    )
     from urlab_client.cli._pages import ending_well  # noqa: PLC0415
 
     with ending_well():
-        asyncio.run(_serve(arguments, limits))
+        asyncio.run(_serve(arguments))
     return 0
 
 
-async def _serve(arguments: McpArguments, limits: Limits) -> None:
-    from urlab_client.aio import URLabClient  # noqa: PLC0415
-    from urlab_client.mcp import Agent  # noqa: PLC0415
-    from urlab_client.web import Access, app  # noqa: PLC0415
-    from urlab_client.web.access import LOOPBACK  # noqa: PLC0415
+def _check_leave(arguments: McpArguments) -> None:
+    """Refuse to end another client's session for an agent that only looks, unless that is wanted."""
+    takes = arguments.allow_drive or arguments.allow_edit or arguments.take_over
+    if arguments.handshake is not None and takes:
+        raise CommandError("--handshake is for an agent that only looks on: leave out --allow-… and --take-over")
+    if arguments.handshake is not None and arguments.step_mode is not None:
+        raise CommandError("--step-mode is the driving client's to choose: leave it out with --handshake")
+    if arguments.handshake is None and not takes and not arguments.address.startswith("sim://"):
+        raise CommandError(
+            f"{arguments.address}: an agent that only looks takes a server over from nobody. Pass --handshake FILE "
+            "to look on beside the client that drives, --take-over if none does, or --allow-drive"
+        )
 
-    hosts = [*LOOPBACK, *(name.lower() for name in arguments.allow_host)]
-    access = Access(hosts=hosts)
+
+async def _serve(arguments: McpArguments) -> None:
+    from urlab_client.aio import URLabClient  # noqa: PLC0415
+    from urlab_client.mcp import Agent, Limits  # noqa: PLC0415
+    from urlab_client.web import Access, app  # noqa: PLC0415
+
+    access = Access(hosts=host_names(arguments))
     mode = arguments.step_mode or (StepMode.DIRECT if arguments.allow_drive else StepMode.AUTO)
     client = make_client(URLabClient, arguments.address, arguments, live_pictures=False, step_mode=mode)
     async with client:
         if arguments.address.startswith("sim://"):  # which fails for good reasons; a server may still come
             await client.discover()
-        console = app(client, access=access, recordings=arguments.recordings)
+        console = app(
+            client,
+            access=access,
+            handshake=None if arguments.handshake is None else arguments.handshake.read_bytes,
+            recordings=arguments.recordings,
+        )
+        limits = Limits(
+            drive=arguments.allow_drive,
+            edit=arguments.allow_edit,
+            sim_seconds=arguments.max_seconds,
+            wall_seconds=arguments.max_wall,
+        )
         agent = Agent(console, limits, models=_models(arguments.models))
         async with console.router.lifespan_context(console):
             if arguments.http:
@@ -190,8 +183,8 @@ async def _serve_stdio(arguments: McpArguments, agent: Agent, console: Starlette
         ended = asyncio.Event()
         served.add_done_callback(lambda _: ended.set())
         try:
-            link = _link(arguments, listener.getsockname()[1], access)
-            await serve(console, listener, lambda: _tell(arguments, link), ended, lifespan=False)
+            url = page_url(arguments, listener.getsockname()[1])
+            await serve(console, listener, lambda: _tell(arguments, url, access), ended, lifespan=False)
         finally:
             served.cancel()
             await asyncio.wait((served,))
@@ -204,34 +197,26 @@ async def _serve_http(arguments: McpArguments, agent: Agent, console: Starlette,
     from urlab_client.mcp.doors import http_application  # noqa: PLC0415
     from urlab_client.web import Access  # noqa: PLC0415
 
-    token = os.environ.get(_TOKEN, "") or secrets.token_urlsafe(32)
-    own = Access(hosts=access.hosts, tokens=False)
+    given = os.environ.get(_TOKEN, "")
+    token = given or secrets.token_urlsafe(32)
     with bound(arguments.host, arguments.port) as listener:
-        number = listener.getsockname()[1]
-        link = _link(arguments, number, access)
+        url = page_url(arguments, listener.getsockname()[1])
 
         def started() -> None:
-            shown = f"the token in ${_TOKEN}" if os.environ.get(_TOKEN) else f"Authorization: Bearer {token}"
-            print(f"Agents: {_url(arguments, number)}/mcp with {shown}", file=sys.stderr, flush=True)
+            shown = f"the token in ${_TOKEN}" if given else f"Authorization: Bearer {token}"
+            print(f"Agents: {url}/mcp with {shown}", file=sys.stderr, flush=True)
             if arguments.console:
-                _tell(arguments, link)
+                _tell(arguments, url, access)
 
-        application = http_application(agent, console if arguments.console else None, token, own)
-        await serve(application, listener, started)
+        own = Access(hosts=access.hosts, keys=[token])
+        await serve(http_application(agent, console if arguments.console else None, own), listener, started)
 
 
-def _tell(arguments: McpArguments, link: str) -> None:
+def _tell(arguments: McpArguments, url: str, access: Access) -> None:
+    link = f"{url}/?token={access.invite()}"
     print(f"Console: {link} (good for one browser); Ctrl-C ends it.", file=sys.stderr, flush=True)
     if arguments.open:
         webbrowser.open(link)
-
-
-def _link(arguments: McpArguments, number: int, access: Access) -> str:
-    return f"{_url(arguments, number)}/?token={access.invite()}"
-
-
-def _url(arguments: McpArguments, number: int) -> str:
-    return f"http://{arguments.allow_host[0] if arguments.allow_host else '127.0.0.1'}:{number}"
 
 
 def _models(folder: Path | None) -> dict[str, Path]:

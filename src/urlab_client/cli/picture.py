@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from urlab_client.cli._files import replaced
 from urlab_client.server.editor.geometry import Box, box_around
+from urlab_client.server.render.opengl import ADVICE
 
 if TYPE_CHECKING:
     import mujoco
@@ -76,8 +77,7 @@ def draw_state(model: mujoco.MjModel, data: mujoco.MjData, path: Path) -> str:
     problem = (
         f"OpenGL does not work with {_CHOICE}={chosen}: unset it, or" if chosen else "No OpenGL library works here:"
     )
-    advice = "apt install libegl1 libgl1-mesa-dri, or libosmesa6" if sys.platform == "linux" else "install one"
-    raise NoPicture(f"{problem} {advice} ({'; '.join(reasons)})")
+    raise NoPicture(f"{problem} {ADVICE} ({'; '.join(reasons)})")
 
 
 def _platforms() -> Sequence[str]:

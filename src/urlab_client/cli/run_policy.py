@@ -52,6 +52,7 @@ class RunPolicyArguments(ServerArguments):
     robot: str | None
     seconds: float
     twist: list[float] | None
+    goal: list[float] | None
     step_mode: StepMode | None
     compare: bool
     record: Path | None
@@ -105,6 +106,13 @@ def add_parser(commands: Commands) -> None:
         help="what to do: m/s forward, m/s to the left, rad/s to the left (default: what the declaration says)",
     )
     parser.add_argument(
+        "--goal",
+        type=float,
+        nargs="+",
+        metavar="NUMBER",
+        help="what to reach, as many numbers as the declaration's table [goal] has (default: what it says)",
+    )
+    parser.add_argument(
         "--step-mode",
         type=one_of(StepMode.DIRECT, StepMode.LIVE),
         metavar="MODE",
@@ -140,6 +148,11 @@ def run(arguments: RunPolicyArguments) -> int:
             policy.command = arguments.twist
         except ValueError as error:
             raise CommandError(f"--command: {error}") from None
+    if arguments.goal is not None:
+        try:
+            policy.goal = arguments.goal
+        except ValueError as error:
+            raise CommandError(f"--goal: {error}") from None
     runs = asyncio.run(_run(arguments, policy))
     if arguments.json:
         sys.stdout.write(f"{msgspec.json.encode(runs).decode()}\n")
@@ -211,9 +224,11 @@ def _others(policy: Policy) -> dict[str, Policy]:
         return rng.uniform(low, high, size)
 
     others = {name: Policy(policy.spec, network, source=name) for name, network in (("zero", zero), ("random", random))}
-    if policy.spec.command is not None:
-        for other in others.values():
+    for other in others.values():
+        if policy.spec.command is not None:
             other.command = policy.command
+        if policy.spec.goal is not None:
+            other.goal = policy.goal
     return others
 
 
@@ -246,7 +261,9 @@ def _print(runs: dict[str, PolicyRun]) -> None:
     table.add_column("outputs")
     live = last.step_mode is StepMode.LIVE
     speed = "late\nactions" if live else "physics\nsteps/s"
-    for heading in ("mean\nreward", "forward\n(m)", "velocity\nerror (m/s)", "falls", "actions/s", speed):
+    reaches = last.goal_error is not None
+    goal = ("goal\nerror",) if reaches else ()
+    for heading in ("mean\nreward", "forward\n(m)", "velocity\nerror (m/s)", "falls", *goal, "actions/s", speed):
         table.add_column(heading, justify="right")
     for name, found in runs.items():
         table.add_row(
@@ -255,6 +272,7 @@ def _print(runs: dict[str, PolicyRun]) -> None:
             f"{found.forward:.2f}",
             f"{found.velocity_error:.3f}",
             str(found.falls),
+            *((f"{found.goal_error:.4f}",) if found.goal_error is not None else ()),
             f"{found.actions / found.wall_time:.0f}",
             str(found.late) if live else f"{found.steps_per_second:.0f}",
         )

@@ -12,9 +12,11 @@ from urlab_client._extras import need
 from urlab_client.cli._arguments import (
     Commands,
     ServerArguments,
+    add_handshake,
     add_keys,
     add_mjcf_options,
     add_ports,
+    handshake,
     image_size,
     make_client,
     seconds,
@@ -57,8 +59,8 @@ def add_parser(commands: Commands) -> None:
         "snapshot",
         help="write a picture of a model, a level or a camera",
         description="Write a picture of models or of a saved level, in a server of its own; or of what a camera of a "
-        "running server in live mode sees, which opens a session and so takes the server over from the client that "
-        "drives it. Needs the extra 'urlab-client[demo]'.",
+        "running server sees, in any mode and without a step. That opens a session, which takes the server over from "
+        "the client that drives it, unless you pass --handshake. Needs the extra 'urlab-client[demo]'.",
         examples=(
             ("urlab snapshot quadruped -o quadruped.png", "a bundled robot"),
             (
@@ -67,6 +69,7 @@ def add_parser(commands: Commands) -> None:
             ),
             ("urlab snapshot arm --camera arm/wrist --mode depth", "what a camera of the model sees"),
             ("urlab snapshot tcp://localhost --camera arm/overview", "what a camera of a running server sees"),
+            ("urlab snapshot tcp://localhost --camera arm/overview --handshake robot.hello", "beside the driver"),
         ),
     )
     parser.add_argument(
@@ -103,7 +106,7 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument("--keyframe", metavar="NAME", help="start play at this keyframe")
     parser.add_argument("--seconds", type=seconds, metavar="S", help="simulate for this long before")
     add_mjcf_options(parser, "for models")
-    add_ports(parser, state=False)
+    add_ports(parser)
     parser.add_argument(
         "--timeout",
         type=seconds,
@@ -111,6 +114,7 @@ def add_parser(commands: Commands) -> None:
         help="to wait for a running server (default: 5, and 30 for its first picture)",
     )
     add_keys(parser)
+    add_handshake(parser)
     parser.set_defaults(run=run)
 
 
@@ -153,6 +157,8 @@ def _of_models(arguments: SnapshotArguments) -> NDArray[np.uint8]:
     from urlab_client.server import SimulatedServer  # noqa: PLC0415
     from urlab_client.server.render.opengl import need_backend  # noqa: PLC0415
 
+    if arguments.handshake is not None:
+        raise CommandError("--handshake is for the address of a running server")
     need_backend()
     camera = arguments.camera
     play = bool(camera or arguments.keyframe or arguments.seconds)
@@ -195,7 +201,7 @@ def _of_running_server(arguments: SnapshotArguments) -> NDArray[np.uint8]:
     (address,) = arguments.sources
     timeout_ms = round(1e3 * (arguments.timeout or _TIMEOUT_S))
     with make_client(URLabClient, address, arguments, rcv_timeout_ms=timeout_ms) as client:
-        client.discover()
+        client.discover(handshake=handshake(arguments))
         if arguments.camera is None:
             raise CommandError(
                 f"{address}: the plugin has no op for the viewport's picture; give --camera, one of "

@@ -23,6 +23,7 @@ from urlab_client.cli._arguments import (
 )
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._mujoco import import_mujoco
+from urlab_client.cli._page_options import PageArguments
 from urlab_client.cli._watching import go_on, interruptible
 from urlab_client.protocol.enums import StepMode
 
@@ -133,15 +134,17 @@ def run(arguments: ViewArguments) -> int:
     return 0
 
 
-def _console_arguments(arguments: ViewArguments) -> console.ConsoleArguments:
+def _console_arguments(arguments: ViewArguments) -> PageArguments:
     if arguments.camera or arguments.sensors or arguments.seconds is not None:
         raise CommandError("--web shows everything until Ctrl-C: --camera, --sensors and --seconds do not go with it")
-    return console.ConsoleArguments(
+    return PageArguments(
         address=arguments.address,
         host="127.0.0.1",
         port=console.PAGE_PORT if arguments.port is None else arguments.port,
         allow_host=[],
         open=False,
+        recordings=Path("recordings"),
+        handshake=None,
         mjcf_options=arguments.mjcf_options,
         step_port=arguments.step_port,
         state_port=arguments.state_port,

@@ -14,7 +14,9 @@ for _module in ("ray", "gymnasium"):
 from urlab_client.cluster.episodes import Episode, Policy, RolloutError  # noqa: E402
 from urlab_client.cluster.leases import Lease, LeaseLost, LeasePool  # noqa: E402
 from urlab_client.cluster.rollouts import Rollouts, rollouts  # noqa: E402
+from urlab_client.cluster.saved import load_episodes, missing_ids, save_episode  # noqa: E402
 from urlab_client.cluster.worker import run_episode  # noqa: E402
+from urlab_client.cluster.worker_pool import WorkerPool  # noqa: E402
 
 __all__ = [
     "Episode",
@@ -24,6 +26,10 @@ __all__ = [
     "Policy",
     "RolloutError",
     "Rollouts",
+    "WorkerPool",
+    "load_episodes",
+    "missing_ids",
     "rollouts",
     "run_episode",
+    "save_episode",
 ]

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import hashlib
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from importlib import import_module
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +14,12 @@ from numpy.typing import NDArray
 from urlab_client.cluster.leases import LeasePool
 from urlab_client.protocol.errors import URLabError
 
-__all__ = ["Episode", "Job", "Policy", "RolloutError", "seed_of"]
+__all__ = ["Episode", "Job", "Policy", "RolloutError", "Setup", "seed_of"]
 
-Policy = Callable[[NDArray[Any], np.random.Generator], Any]
-"""`(observation, rng) -> action`, with flat arrays. Each episode gets a copy of its own, as it was when sent."""
+Policy = Callable[[Any, np.random.Generator], Any]
+"""`(observation, rng) -> action`, as the spaces of the environment have them: flat arrays, or dictionaries of arrays
+with `space_mode="dict"`. Each episode gets a copy of its own, as it was when sent.
+"""
 
 
 class RolloutError(URLabError):
@@ -37,11 +41,13 @@ class Episode:
         attempt: 1, or more after failures.
         node_id: Ray's id of the node, hexadecimal.
         pid: Process id of the worker.
-        observations: Float64, shape (T + 1, observation size).
-        actions: Float32, shape (T, action size).
+        observations: Float64, shape (T + 1, observation size); with `space_mode="dict"` dictionaries as the
+            environment's, of such arrays, those of cameras uint8 with shape (T + 1, H, W, 3).
+        actions: Float32, shape (T, action size), or a dictionary of such arrays.
         rewards: Float64, shape (T,).
         terminated: Whether the termination function ended it.
         truncated: Whether the step limit ended it.
+        success: What the task says of the end; None without a task that says so.
         sim_time: Simulated seconds at the end.
         started: Unix time in seconds, by the worker's clock.
         setup: Seconds for lease, server and reset.
@@ -55,11 +61,12 @@ class Episode:
     attempt: int
     node_id: str
     pid: int
-    observations: NDArray[Any]
-    actions: NDArray[Any]
+    observations: Any
+    actions: Any
     rewards: NDArray[np.float64]
     terminated: bool
     truncated: bool
+    success: bool | None
     sim_time: float
     started: float
     setup: float
@@ -76,6 +83,30 @@ class Job:
     attempt: int
     holder: str
     leases: LeasePool | None
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """What the environments of a run are like.
+
+    Attributes:
+        key: Equal for equal options: an environment that has it may be used again.
+        env_options: Options of `URLabEnv`.
+        client_options: Options of the client.
+        lease_timeout: Seconds that an attempt waits for a free address.
+    """
+
+    key: str
+    env_options: Mapping[str, Any]
+    client_options: Mapping[str, Any]
+    lease_timeout: float
+
+    @classmethod
+    def of(cls, env_options: Mapping[str, Any], client_options: Mapping[str, Any], lease_timeout: float) -> Self:
+        """Describe environments."""
+        options = dict(env_options), dict(client_options)
+        dumps: Any = import_module("ray").cloudpickle.dumps  # functions, too, by their code
+        return cls(hashlib.sha256(dumps(options)).hexdigest(), *options, lease_timeout)
 
 
 def seed_of(seed: int, episode: int) -> int:

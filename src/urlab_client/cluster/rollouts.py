@@ -6,18 +6,17 @@ import logging
 import time
 import uuid
 from collections import deque
-from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from importlib import import_module
 from types import MappingProxyType, TracebackType
 from typing import Any, Final, Self
 
 import anyio.to_thread
 
-from urlab_client.cluster.episodes import Episode, Job, Policy, RolloutError, seed_of
+from urlab_client.cluster.episodes import Episode, Job, Policy, RolloutError, Setup, seed_of
 from urlab_client.cluster.leases import LeasePool
-from urlab_client.cluster.worker import Worker
+from urlab_client.cluster.worker_pool import WorkerPool
 from urlab_client.protocol.errors import URLabError
 
 __all__ = ["Rollouts", "rollouts"]
@@ -36,33 +35,46 @@ class _Running:
     deadline: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Starting:
+    worker: Any
+    kept: bool
+    """From an earlier run: it may have died since, which is no failure of this one."""
+
+
 class Rollouts(Iterator[Episode], AsyncIterator[Episode]):
     """The episodes of a run, in the order in which they finish; iterate with `for` or `async for`, once.
 
     Work is done while somebody iterates: each worker has one episode, finished or not, that nobody took yet, and gets
     the next one when that was taken. Closing ends the workers and their servers and gives back the leases; it happens
-    by itself after the last episode and after an error. Use it as a context manager when leaving early.
+    by itself after the last episode and after an error. Use it as a context manager when leaving early. Workers of a
+    `WorkerPool` go back to it, except those that are in the middle of an episode.
     """
 
     def __init__(
         self,
         policy: Policy,
+        setup: Setup,
         jobs: Sequence[Job],
         *,
+        workers: WorkerPool,
+        owns_workers: bool,
         n_workers: int,
         retries: int,
         episode_timeout: float,
         start_timeout: float,
-        make_worker: partial[Any],
     ) -> None:
         self._policy: Any = _ray.put(policy)
+        self._setup: Any = _ray.put(setup)
         self._todo = deque(jobs)
         self._n_workers = n_workers
         self._retries = retries
         self._episode_timeout = episode_timeout
         self._start_timeout = start_timeout
-        self._make_worker = make_worker
-        self._starting: dict[Any, Any] = {}
+        self._workers = workers
+        self._owns_workers = owns_workers
+        self._kept: list[Any] | None = None  # none lent yet
+        self._starting: dict[Any, _Starting] = {}
         self._idle: list[Any] = []
         self._running: dict[Any, _Running] = {}
         self._finished: deque[Episode] = deque()
@@ -110,12 +122,18 @@ class Rollouts(Iterator[Episode], AsyncIterator[Episode]):
 
     def close(self) -> None:
         """End the workers with their servers, and give back the leases. Idempotent; waits for nothing."""
+        if self._closed:
+            return
         self._closed = True
         self._todo.clear()
         for running in self._running.values():
             self._end(running.worker, running.job)
-        for worker in [*self._starting.values(), *self._idle]:
-            self._end(worker)
+        if self._kept is not None:
+            left = [*self._kept, *(each.worker for each in self._starting.values()), *self._idle]
+            self._workers.give_back(left)
+            self._kept = None
+        if self._owns_workers:
+            self._workers.close()
         self._running.clear()
         self._starting.clear()
         self._idle.clear()
@@ -149,29 +167,35 @@ class Rollouts(Iterator[Episode], AsyncIterator[Episode]):
             self._reading = False
 
     def _hand_out(self) -> None:
+        if self._kept is None:
+            self._kept = self._workers.lend(self)
         while self._idle and self._todo:
             worker, job = self._idle.pop(), self._todo.popleft()
-            ref = worker.run.remote(self._policy, job)
+            ref = worker.run.remote(self._policy, self._setup, job)
             self._running[ref] = _Running(worker, job, time.monotonic() + self._episode_timeout)
         while self._todo and len(self._running) + len(self._starting) < min(
             self._n_workers, len(self._running) + len(self._todo)
         ):
-            worker = self._make_worker()
-            self._starting[worker.node_id.remote()] = worker
+            kept = bool(self._kept)
+            worker = self._kept.pop() if kept else self._workers.start()
+            self._starting[worker.node_id.remote()] = _Starting(worker, kept)
 
     def _take_worker(self, ref: Any) -> None:
-        worker = self._starting.pop(ref)
+        starting = self._starting.pop(ref)
         try:
             _ray.get(ref, timeout=_FETCH_S)
         except _ray.exceptions.RayError as error:
-            self._end(worker)
+            self._end(starting.worker)
+            if starting.kept:
+                log.info("a worker ended since the last run: %s", error)
+                return
             self._failed_starts += 1
             log.warning("a worker did not start: %s", error)
             if self._failed_starts > self._retries:
                 raise RolloutError(f"{self._failed_starts} workers in a row did not start.") from error
         else:
             self._failed_starts = 0
-            self._idle.append(worker)
+            self._idle.append(starting.worker)
 
     def _take_result(self, ref: Any) -> None:
         running = self._running.pop(ref)
@@ -226,10 +250,12 @@ def rollouts(
     scenes: str | Sequence[str] | LeasePool,
     n: int,
     *,
+    ids: Iterable[int] | None = None,
     seed: int = 0,
     max_episode_steps: int = 200,
     env_options: Mapping[str, Any] = MappingProxyType({}),
     client_options: Mapping[str, Any] = MappingProxyType({}),
+    workers: WorkerPool | None = None,
     n_workers: int = 0,
     worker_options: Mapping[str, Any] = MappingProxyType({}),
     retries: int = 3,
@@ -247,13 +273,15 @@ def rollouts(
         scenes: `sim://MODEL` addresses, to be served by the workers, in blocks of `n / len(scenes)` episodes; or a
             pool of addresses to lease, one per episode.
         n: Number of episodes.
+        ids: Those of the episodes 0 to n - 1 that are to be run, such as `missing_ids` of an earlier run; all for None.
         seed: Seed of the run.
         max_episode_steps: Actions after which an episode is truncated.
-        env_options: Further options of `URLabEnv`: `observations`, `reward_fn`, `termination_fn`, `n_substeps`,
-            `reset_noise`.
+        env_options: Further options of `URLabEnv`: `task`, `randomise`, `observations`, `cameras`, `space_mode`,
+            `reward_fn`, `termination_fn`, `n_substeps`, `reset_noise`, `keyframe`.
         client_options: Further options of the workers' clients.
+        workers: Workers that stay up after the run, instead of the run's own.
         n_workers: Largest number of workers, which is also that of episodes in flight; 0 for one per processor of the
-            cluster, or per address of the pool.
+            cluster, or per address of the pool. `workers` has its own number, and its own options.
         worker_options: Options of the Ray actors, such as `num_cpus` or `resources`; one processor each by default.
         retries: Attempts of an episode after the first one.
         episode_timeout: Seconds for an attempt, after which its worker is ended.
@@ -264,21 +292,25 @@ def rollouts(
         The episodes. Iterating raises `RolloutError` when an episode failed for good.
 
     Raises:
-        ValueError: An option out of range, or a scene that is not `sim://`.
+        ValueError: An option out of range, one that belongs to `workers`, or a scene that is not `sim://`.
         URLabError: Ray is not initialised.
     """
     names = [scenes.name] if isinstance(scenes, LeasePool) else [scenes] if isinstance(scenes, str) else list(scenes)
-    pool = scenes if isinstance(scenes, LeasePool) else None
-    if not names or (pool is None and not all(name.startswith("sim://") for name in names)):
+    leases = scenes if isinstance(scenes, LeasePool) else None
+    if not names or (leases is None and not all(name.startswith("sim://") for name in names)):
         raise ValueError(f"scenes must be one or more sim:// addresses, or a LeasePool of others, not {names!r}")
     if n < 0 or seed < 0 or n_workers < 0 or retries < 0 or max_episode_steps < 1:
         raise ValueError("n, seed, n_workers and retries are 0 or more, and max_episode_steps is at least 1")
     if min(episode_timeout, start_timeout, lease_timeout) <= 0:
         raise ValueError("episode_timeout, start_timeout and lease_timeout are above 0 seconds")
-    if reserved := {"cameras", "client", "max_episode_steps", "owns_client", "space_mode"} & env_options.keys():
+    if workers is not None and (n_workers or worker_options):
+        raise ValueError("n_workers and worker_options belong to the WorkerPool, not beside workers")
+    if reserved := {"client", "max_episode_steps", "owns_client", "render_camera", "render_mode"} & env_options.keys():
         raise ValueError(f"env_options cannot have {', '.join(sorted(reserved))}")
-    if not _ray.is_initialized():
-        raise URLabError("Ray is not initialised.", hint="Call ray.init() first.")
+    chosen = list(range(n)) if ids is None else sorted(ids)
+    if len(set(chosen)) != len(chosen) or (chosen and not 0 <= chosen[0] <= chosen[-1] < n):
+        raise ValueError(f"ids must be of the episodes 0 to {n - 1}, each once")
+    pool = WorkerPool(n_workers, worker_options=worker_options) if workers is None else workers
     run = uuid.uuid4().hex
     jobs = [
         Job(
@@ -287,25 +319,20 @@ def rollouts(
             scene=names[i * len(names) // n],
             attempt=1,
             holder=f"{run}/{i}/1",
-            leases=pool,
+            leases=leases,
         )
-        for i in range(n)
+        for i in chosen
     ]
-    most = n_workers or (pool.size if pool else int(_ray.cluster_resources().get("CPU", 1)))
-    # Ray's own restarts are off: an episode whose worker died must be counted as an attempt.
-    options = {"num_cpus": 1, "scheduling_strategy": "SPREAD", **worker_options, "max_restarts": 0}
-    actor = _ray.remote(Worker).options(**options)
+    most = pool.n_workers or (leases.size if leases else int(_ray.cluster_resources().get("CPU", 1)))
+    options = {**env_options, "max_episode_steps": max_episode_steps}
     return Rollouts(
         policy,
+        Setup.of(options, client_options, lease_timeout),
         jobs,
+        workers=pool,
+        owns_workers=workers is None,
         n_workers=max(most, 1),
         retries=retries,
         episode_timeout=episode_timeout,
         start_timeout=start_timeout,
-        make_worker=partial(
-            actor.remote,
-            {**env_options, "max_episode_steps": max_episode_steps},
-            dict(client_options),
-            lease_timeout,
-        ),
     )

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from types import MappingProxyType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from urlab_client.cluster.episodes import Episode, Job, Policy, seed_of
+from urlab_client.cluster.episodes import Episode, Job, Policy, Setup, seed_of
 from urlab_client.cluster.leases import Lease
 from urlab_client.integrations.gym.env import URLabEnv
 
@@ -21,23 +21,20 @@ _ray: Any = import_module("ray")  # Any: Ray's hints leave every remote call unk
 
 
 class Worker:
-    """Runs episodes. A simulated server serves the episodes of its scene until another scene or a failure comes.
+    """Runs episodes. A simulated server serves them until another scene, other options or a failure come.
 
     The server is a child process that ends with this one, however that ends.
     """
 
-    def __init__(self, env_options: Mapping[str, Any], client_options: Mapping[str, Any], lease_timeout: float) -> None:
-        self._env_options = env_options
-        self._client_options = client_options
-        self._lease_timeout = lease_timeout
-        self._address = ""
+    def __init__(self) -> None:
+        self._made_for = ("", "")  # address and key of the setup
         self._env: URLabEnv | None = None
 
     def node_id(self) -> str:
         """Return Ray's id of this node; that it answers says that the worker is up."""
         return str(_ray.get_runtime_context().get_node_id())
 
-    def run(self, policy: Policy, job: Job) -> Episode:
+    def run(self, policy: Policy, setup: Setup, job: Job) -> Episode:
         """Run one attempt of an episode.
 
         Raises:
@@ -46,12 +43,12 @@ class Worker:
         """
         try:
             if job.leases is None:
-                return self._run(policy, job, None)
-            with job.leases.lease(job.holder, timeout=self._lease_timeout) as lease:
+                return self._run(policy, setup, job, None)
+            with job.leases.lease(job.holder, timeout=setup.lease_timeout) as lease:
                 try:
-                    env = self._environment(lease.address)
+                    env = self._environment(lease.address, setup)
                     with lease.of_server(env.client):
-                        return self._run(policy, job, lease)
+                        return self._run(policy, setup, job, lease)
                 finally:
                     self.close()  # before somebody else gets the address
         except BaseException:
@@ -64,48 +61,66 @@ class Worker:
         if env is not None:
             env.close()
 
-    def _run(self, policy: Policy, job: Job, lease: Lease | None) -> Episode:
+    def _run(self, policy: Policy, setup: Setup, job: Job, lease: Lease | None) -> Episode:
         started, clock = time.time(), time.perf_counter()
-        env = self._environment(job.scene if lease is None else lease.address)
+        address = job.scene if lease is None else lease.address
+        env = self._environment(address, setup)
         rng = np.random.default_rng([job.seed, 1])
         observation, info = env.reset(seed=job.seed)
-        setup = time.perf_counter() - clock
-        observations, actions, rewards = [np.array(observation)], list[Any](), list[float]()
+        setting_up = time.perf_counter() - clock
+        observations, actions, rewards = [observation], list[Any](), list[float]()
         terminated = truncated = False
         while not (terminated or truncated):
             if lease is not None:
                 lease.keep()
-            action = np.asarray(policy(observation, rng), dtype=np.float32)
+            action = _float32(policy(observation, rng))
             observation, reward, terminated, truncated, info = env.step(action)
-            observations.append(np.array(observation))
+            observations.append(observation)
             actions.append(action)
             rewards.append(float(reward))
         return Episode(
             id=job.id,
             seed=job.seed,
             scene=job.scene,
-            address=self._address,
+            address=address,
             attempt=job.attempt,
             node_id=self.node_id(),
             pid=os.getpid(),
-            observations=np.stack(observations),
-            actions=np.stack(actions),
+            observations=_stacked(observations),
+            actions=_stacked(actions),
             rewards=np.array(rewards),
             terminated=bool(terminated),
             truncated=bool(truncated),
+            success=info.get("success"),
             sim_time=float(info["sim_time"]),
             started=started,
-            setup=setup,
+            setup=setting_up,
             duration=time.perf_counter() - clock,
         )
 
-    def _environment(self, address: str) -> URLabEnv:
-        if self._env is not None and self._address == address:
+    def _environment(self, address: str, setup: Setup) -> URLabEnv:
+        wanted = (address, setup.key)
+        if self._env is not None and self._made_for == wanted:
             return self._env
         self.close()
-        self._env = URLabEnv.connect(address, client_options=self._client_options, **self._env_options)
-        self._address = address
+        self._env = URLabEnv.connect(address, client_options=setup.client_options, **setup.env_options)
+        self._made_for = wanted
         return self._env
+
+
+def _float32(action: Any) -> Any:
+    if isinstance(action, Mapping):
+        given = cast("Mapping[str, Any]", action)
+        return {key: _float32(value) for key, value in given.items()}
+    return np.array(action, dtype=np.float32)  # a copy: a policy may fill one array again and again
+
+
+def _stacked(rows: Sequence[Any]) -> Any:
+    """Return arrays, or dictionaries of them, with a leading axis."""
+    if isinstance(rows[0], dict):
+        first = cast("dict[str, Any]", rows[0])
+        return {key: _stacked([row[key] for row in rows]) for key in first}
+    return np.stack(rows)
 
 
 def run_episode(
@@ -138,9 +153,10 @@ def run_episode(
     Raises:
         URLabError: The server failed.
     """
-    worker = Worker({**env_options, "max_episode_steps": max_episode_steps}, client_options, lease_timeout=0.0)
+    setup = Setup.of({**env_options, "max_episode_steps": max_episode_steps}, client_options, lease_timeout=0.0)
+    worker = Worker()
     job = Job(id=episode, seed=seed_of(seed, episode), scene=scene, attempt=1, holder="", leases=None)
     try:
-        return worker.run(policy, job)
+        return worker.run(policy, setup, job)
     finally:
         worker.close()

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from urlab_client.aio.client import URLabClient
     from urlab_client.randomise.variation import Variation
 
-__all__ = ["variation_of"]
+__all__ = ["controlled_actuators", "variation_of"]
 
 
 def variation_of(
@@ -32,10 +32,20 @@ def variation_of(
     declared = declared_in(model)
     if declared is None:
         return None
+    return Variation(declared, model, controlled_actuators(client, layouts))
+
+
+def controlled_actuators(client: URLabClient, layouts: Mapping[str, ArticulationLayout]) -> frozenset[int]:
+    """Return the actuators that a controller with gains drives, by their numbers in the model.
+
+    Args:
+        client: The client, after the handshake.
+        layouts: Where the articulations are in the model, by key.
+    """
     controlled: set[int] = set()
     for key, articulation in client.articulations.items():
         controller = articulation.controller
         if controller is not None and controller.kind == ControllerKind.PD:
             actuators = layouts[key].actuators
             controlled.update(actuators[name] for name in controller.params["kp"])
-    return Variation(declared, model, frozenset(controlled))
+    return frozenset(controlled)

@@ -29,12 +29,11 @@ from mcp.types import (
     TextContent,
     TextResourceContents,
 )
+from msgspec import Struct
 
-from urlab_client.mcp.declaration import Declared, Needs, declared
+from urlab_client.mcp.declaration import Declared, Moment, Needs, declared
 from urlab_client.mcp.driving import Limits, Stopped
 from urlab_client.mcp.editing import Tools
-from urlab_client.mcp.results import Result
-from urlab_client.mcp.wording import for_agents
 from urlab_client.protocol.errors import URLabError
 from urlab_client.web.console_session import ConsoleSession
 from urlab_client.web.driving_lease import NotDriving
@@ -45,14 +44,26 @@ if TYPE_CHECKING:
 
 __all__ = ["Agent"]
 
-_MODEL, _LOG = "urlab://model", "urlab://log"
-
 _INSTRUCTIONS = """\
 Tools to look at and drive robots in a MuJoCo simulation. Call look first: it lists robots, joints, actuators, cameras,
 units and limits. Angles are in radians, lengths in metres, the z axis points up. In mode direct time passes only while
 run or move_to work; in mode live it passes by itself unless it is paused. When something does not move, call explain.
 A person may watch and take the controls at any time; then wait. One call may take {sim:g} s of simulation time and
 {wall:g} s on the wall.{missing}"""
+_RESOURCES = {
+    "urlab://model": "Robots, joints, actuators, sensors, cameras, units and limits, as they are now.",
+    "urlab://log": "Calls, errors and events, of people, too; the newest last.",
+}
+_FAILURES = (URLabError, NotDriving, Stopped, ValueError, TypeError, LookupError, OSError)
+_TOOLS = {
+    "runtime.set_paused(False)": "play with action='resume'",
+    "sim.start()": "play with action='start'",
+    "set_ctrl() or ctrl_array before step()": "set_actuators before run",
+    "step() was not called": "run was not called",
+    "waiting for step()": "waiting for run",
+    "Call reset()": "Call reset",
+}
+"""What the client's advice calls methods, and which tools do that."""
 
 
 class Agent:
@@ -65,6 +76,9 @@ class Agent:
 
     Attributes:
         server: The server of the MCP SDK, for a transport of your choice. Serve it while the console's lifespan runs.
+
+    Raises:
+        ValueError: The agent may drive, but the client is read-only.
     """
 
     def __init__(
@@ -75,20 +89,23 @@ class Agent:
         models: Mapping[str, Path] | None = None,
     ) -> None:
         session: ConsoleSession = console if isinstance(console, ConsoleSession) else console.state.console
-        self.limits = limits or Limits()
-        self._tools = Tools(session, self.limits, models or {})
+        limits = limits or Limits()
+        looks_on = session.client.config.read_only
+        if looks_on and (limits.drive or limits.edit):
+            raise ValueError("an agent drives or edits through a client that has the session, not a read-only one")
+        self._tools = Tools(session, limits, models or {})
         self._declared = declared(Tools)
-        allowed = {Needs.READ: True, Needs.DRIVE: self.limits.drive, Needs.EDIT: self.limits.edit}
-        self._offered = {name: one for name, one in self._declared.items() if allowed[one.needs]}
-        missing = [need.value for need, given in allowed.items() if not given]
+        given = {Needs.NOTHING: True, Needs.SESSION: not looks_on, Needs.DRIVE: limits.drive, Needs.EDIT: limits.edit}
+        self._offered = {name: one for name, one in self._declared.items() if given[one.needs]}
+        missing = ", ".join(need.value for need, has in given.items() if not has)
         self.server: Server[Any] = Server(
             "urlab",
             version=version("urlab-client"),
             title="URLab",
             instructions=_INSTRUCTIONS.format(
-                sim=self.limits.sim_seconds,
-                wall=self.limits.wall_seconds,
-                missing=f" Not allowed: {', '.join(missing)}." if missing else "",
+                sim=limits.sim_seconds,
+                wall=limits.wall_seconds,
+                missing=f" Not allowed: {missing}." if missing else "",
             ),
             on_list_tools=self._list_tools,
             on_call_tool=self._call_tool,
@@ -104,7 +121,7 @@ class Agent:
     async def _list_tools(
         self, context: ServerRequestContext[Any], params: PaginatedRequestParams | None
     ) -> ListToolsResult:
-        return ListToolsResult(tools=[one.described for one in self._offered.values()])
+        return ListToolsResult(tools=[one.described() for one in self._offered.values()])
 
     async def _call_tool(self, context: ServerRequestContext[Any], params: CallToolRequestParams) -> CallToolResult:
         console, viewer = self._tools.console, self._tools.driving.viewer
@@ -115,43 +132,46 @@ class Agent:
             await self._tools.connected()
             if found.takes_progress:
                 arguments["progress"] = context.session.report_progress
-            answer = _answer(await getattr(self._tools, found.name)(**arguments))
-        except (URLabError, NotDriving, Stopped, ValueError, TypeError, LookupError, OSError) as error:
-            text = for_agents(str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error))
+            answer = self._answer(await getattr(self._tools, found.name)(**arguments))
+        except _FAILURES as error:
+            text = _in_tools(str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error))
             console.note("error", viewer.name, params.name, text)
             return CallToolResult(content=[TextContent(text=text)], is_error=True)
-        if found.needs is not Needs.READ:
+        if found.needs in {Needs.DRIVE, Needs.EDIT}:
             milliseconds = 1e3 * (time.perf_counter() - began)
             console.note("call", viewer.name, params.name, json.dumps(params.arguments or {}), milliseconds)
         return answer
 
     def _tool(self, name: str) -> Declared:
-        found = self._declared.get(name)
-        if found is None:
-            raise LookupError(f"There is no tool {name!r}. There are: {', '.join(self._offered)}.")
-        if name not in self._offered:
-            raise LookupError(
-                f"{name} is not allowed here. Ask whoever started `urlab mcp` to start it with {found.needs.value}."
-            )
-        return found
+        if name in self._offered:
+            return self._offered[name]
+        if name in self._declared:
+            option = self._declared[name].needs.value
+            raise LookupError(f"{name} is not allowed here. Ask whoever started `urlab mcp` to start it with {option}.")
+        raise LookupError(f"No tool is called {name!r}. There are: {', '.join(self._offered)}.")
+
+    def _answer(self, result: Struct | tuple[Struct, bytes]) -> CallToolResult:
+        """Return a result with its structure, its text, and its picture if there is one.
+
+        Raises:
+            ValueError: A number in it is not finite.
+        """
+        shown, jpeg = result if isinstance(result, tuple) else (result, None)
+        client = self._tools.client
+        when = Moment(client.sim_time, client.step_count, str(client.step_mode))
+        structure = _short(msgspec.to_builtins(shown) | msgspec.to_builtins(when))
+        content: list[TextContent | ImageContent] = [TextContent(text=json.dumps(structure))]
+        if jpeg is not None:
+            content.append(ImageContent(data=base64.b64encode(jpeg).decode(), mime_type="image/jpeg"))
+        return CallToolResult(content=list(content), structured_content=structure)
 
     async def _list_resources(
         self, context: ServerRequestContext[Any], params: PaginatedRequestParams | None
     ) -> ListResourcesResult:
         return ListResourcesResult(
             resources=[
-                Resource(
-                    uri=_MODEL,
-                    name="model",
-                    description="Robots, joints, actuators, sensors, cameras, units and limits, as they are now.",
-                    mime_type="application/json",
-                ),
-                Resource(
-                    uri=_LOG,
-                    name="log",
-                    description="Calls, errors and events, of people, too; the newest last.",
-                    mime_type="application/json",
-                ),
+                Resource(uri=uri, name=uri.partition("//")[2], description=text, mime_type="application/json")
+                for uri, text in _RESOURCES.items()
             ]
         )
 
@@ -159,41 +179,31 @@ class Agent:
         self, context: ServerRequestContext[Any], params: ReadResourceRequestParams
     ) -> ReadResourceResult:
         uri = str(params.uri)
-        match uri:
-            case "urlab://model":
-                text = encode(self._tools.client.describe()).decode()
-            case "urlab://log":
-                text = encode(list(self._tools.console.entries)).decode()
-            case _:
-                raise MCPError(INVALID_PARAMS, f"There is no resource {uri!r}, only {_MODEL} and {_LOG}.")
-        return ReadResourceResult(contents=[TextResourceContents(uri=uri, text=text, mime_type="application/json")])
-
-
-def _answer(result: Result | tuple[Result, bytes]) -> CallToolResult:
-    """Return a result with its structure, its text, and its picture if there is one.
-
-    Raises:
-        ValueError: A number in it is not finite.
-    """
-    shown, jpeg = result if isinstance(result, tuple) else (result, None)
-    structure = _short(msgspec.to_builtins(shown))
-    text = json.dumps(structure)
-    content: list[TextContent | ImageContent] = [TextContent(text=text)]
-    if jpeg is not None:
-        content.append(ImageContent(data=base64.b64encode(jpeg).decode(), mime_type="image/jpeg"))
-    return CallToolResult(content=list(content), structured_content=structure)
+        if uri not in _RESOURCES:
+            raise MCPError(INVALID_PARAMS, f"No resource has the address {uri!r}, only {' and '.join(_RESOURCES)}.")
+        shown = self._tools.client.describe() if uri == "urlab://model" else list(self._tools.console.entries)
+        contents = TextResourceContents(uri=uri, text=encode(shown).decode(), mime_type="application/json")
+        return ReadResourceResult(contents=[contents])
 
 
 def _short(value: Any) -> Any:
-    """Return what a result is made of with six digits of each number, which is what agents need of them."""
+    """Return what a result is made of with six digits of each number, and tools where it speaks of methods."""
     match value:
         case float() if math.isfinite(value):
             return float(f"{value:.6g}")
         case float():
             raise ValueError("The simulation has diverged: some values are not finite. Call reset.")
+        case str():
+            return _in_tools(value)
         case dict():
             return {key: _short(part) for key, part in cast("dict[str, Any]", value).items()}
         case list() | tuple():
             return [_short(part) for part in cast("list[Any]", value)]
         case _:
             return value
+
+
+def _in_tools(text: str) -> str:
+    for method, named in _TOOLS.items():
+        text = text.replace(method, named)
+    return text

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import inspect
 import json
-import re
 from collections.abc import Awaitable, Callable
 from enum import Enum
-from functools import cached_property
 from typing import Any, TypeVar, get_type_hints
 
 import msgspec
 from mcp.types import Tool, ToolAnnotations
+from msgspec import Struct
 
-from urlab_client.mcp.results import Result
+from urlab_client.protocol.schemas import schemas
 
-__all__ = ["Declared", "Needs", "declared", "tool"]
+__all__ = ["Declared", "Moment", "Needs", "declared", "tool"]
 
 F = TypeVar("F", bound=Callable[..., Awaitable[Any]])
 
@@ -23,59 +22,73 @@ _MARK = "_urlab_tool"
 
 
 class Needs(Enum):
-    """What an agent must be allowed to do."""
+    """What an agent must be given: the command's option for it."""
 
-    READ = ""
+    NOTHING = ""
+    SESSION = "--take-over"
     DRIVE = "--allow-drive"
     EDIT = "--allow-edit"
+
+
+class Moment(Struct):
+    """When a result was made; every result has these fields, too.
+
+    Attributes:
+        sim_time: Simulation time, seconds.
+        step: Physics steps since the session began or the last reset.
+        mode: `direct`: time passes only while a tool lets it; `live`: time passes by itself unless paused.
+    """
+
+    sim_time: float
+    step: int
+    mode: str
 
 
 class Declared:
     """One tool.
 
+    Args:
+        method: What it does. A parameter `progress` is not the agent's to give.
+        needs: What an agent must be given.
+        hints: What hosts get to know of it.
+
     Attributes:
         name: Its name.
-        needs: What an agent must be allowed to do.
-        takes_progress: Whether the method has a parameter `progress`, which no agent gives.
+        takes_progress: Whether it reports progress.
     """
 
-    def __init__(self, method: Callable[..., Awaitable[Any]], needs: Needs, hints: dict[str, bool]) -> None:
+    def __init__(self, method: Callable[..., Awaitable[Any]], needs: Needs, hints: ToolAnnotations) -> None:
         self.name = method.__name__
         self.needs = needs
         self._method = method
         self._hints = hints
-        self.takes_progress = "progress" in inspect.signature(method).parameters
+        parameters = inspect.signature(method).parameters
+        self.takes_progress = "progress" in parameters
+        self._given = {name: one.default for name, one in parameters.items() if name not in {"self", "progress"}}
 
-    @cached_property
-    def arguments(self) -> type[msgspec.Struct]:
-        """The method's parameters as a struct."""
+    def _arguments(self) -> type[Struct]:
+        """Return the method's parameters as a struct."""
         types = get_type_hints(self._method, include_extras=True)
-        fields: list[tuple[str, Any] | tuple[str, Any, Any]] = []
-        for name, parameter in inspect.signature(self._method).parameters.items():
-            if name in {"self", "progress"}:
-                continue
-            given = parameter.default
-            fields.append((name, types[name]) if given is parameter.empty else (name, types[name], given))
+        required = inspect.Parameter.empty
+        fields = [
+            (name, types[name]) if default is required else (name, types[name], default)
+            for name, default in self._given.items()
+        ]
         return msgspec.defstruct(self.name, fields, forbid_unknown_fields=True, kw_only=True)
 
-    @cached_property
     def described(self) -> Tool:
-        """What an agent gets to know."""
+        """Return what an agent gets to know."""
         result = get_type_hints(self._method)["return"]
-        shown = result.__args__[0] if hasattr(result, "__args__") else result
-        assert issubclass(shown, Result)  # noqa: S101 - a declaration without the moment
+        output, when = _schema(result.__args__[0] if hasattr(result, "__args__") else result), _schema(Moment)
+        output["properties"] |= when["properties"]
+        output["required"] = [*output.get("required", ()), *when["required"]]
         return Tool(
             name=self.name,
             title=self.name.replace("_", " ").capitalize(),
             description=inspect.cleandoc(self._method.__doc__ or ""),
-            input_schema=_schema(self.arguments),
-            output_schema=_schema(shown),
-            annotations=ToolAnnotations(
-                read_only_hint=self.needs is Needs.READ,
-                destructive_hint=self._hints["destructive"],
-                idempotent_hint=self._hints["idempotent"],
-                open_world_hint=False,
-            ),
+            input_schema=_schema(self._arguments()),
+            output_schema=output,
+            annotations=self._hints,
         )
 
     def parse(self, given: dict[str, Any]) -> dict[str, Any]:
@@ -84,26 +97,31 @@ class Declared:
         Raises:
             ValueError: They do not fit; the text says which does not, and which there are.
         """
-        names = [field.name for field in msgspec.structs.fields(self.arguments)]
         plain = {name: _from_text(value) for name, value in given.items()}
         try:
-            made = msgspec.convert(plain, self.arguments, strict=False)
+            made = msgspec.convert(plain, self._arguments(), strict=False)
         except msgspec.ValidationError as error:
-            raise ValueError(f"{self.name}: {error}. It takes: {', '.join(names) or 'no arguments'}.") from None
-        return {name: getattr(made, name) for name in names}
+            raise ValueError(f"{self.name}: {error}. It takes: {', '.join(self._given) or 'no arguments'}.") from None
+        return {name: getattr(made, name) for name in self._given}
 
 
 def tool(needs: Needs, *, destructive: bool = False, idempotent: bool = False) -> Callable[[F], F]:
     """Declare a method as a tool.
 
     Args:
-        needs: What an agent must be allowed to do.
+        needs: What an agent must be given.
         destructive: Whether it may undo what was there.
         idempotent: Whether a second call with the same arguments changes nothing more.
     """
 
     def mark(method: F) -> F:
-        setattr(method, _MARK, Declared(method, needs, {"destructive": destructive, "idempotent": idempotent}))
+        hints = ToolAnnotations(
+            read_only_hint=needs in {Needs.NOTHING, Needs.SESSION},
+            destructive_hint=destructive,
+            idempotent_hint=idempotent,
+            open_world_hint=False,
+        )
+        setattr(method, _MARK, Declared(method, needs, hints))
         return method
 
     return mark
@@ -111,31 +129,16 @@ def tool(needs: Needs, *, destructive: bool = False, idempotent: bool = False) -
 
 def declared(owner: type) -> dict[str, Declared]:
     """Return the tools of a class by name, in their order."""
-    members = [vars(base) for base in reversed(owner.__mro__)]
-    marks = [getattr(member, _MARK, None) for scope in members for member in scope.values()]
+    members = [member for base in reversed(owner.__mro__) for member in vars(base).values()]
+    marks = [getattr(member, _MARK, None) for member in members]
     return {mark.name: mark for mark in marks if isinstance(mark, Declared)}
 
 
-def _schema(struct: type[msgspec.Struct]) -> dict[str, Any]:
+def _schema(struct: type[Struct]) -> dict[str, Any]:
     """Return a JSON schema with an object at its root, as the protocol wants it."""
-    (_,), parts = msgspec.json.schema_components([struct], ref_template="#/$defs/{name}")
-    for part in parts.values():
-        if "description" in part:
-            part["description"] = _tell_attributes(part, part["description"])
+    parts = schemas([struct], "#/$defs/{name}")
     root = parts.pop(struct.__name__)
-    for base in struct.__mro__[1:]:
-        _tell_attributes(root, base.__doc__ or "")
     return {**root, "$defs": parts} if parts else root
-
-
-def _tell_attributes(schema: dict[str, Any], doc: str) -> str:
-    """Hand what a struct's docstring says of its attributes to these, and return the rest of it."""
-    brief, _, listed = inspect.cleandoc(doc).partition("\n\nAttributes:\n")
-    for entry in re.split(r"\n(?=    \w)", f"\n{listed}")[1:]:
-        name, _, text = entry.strip().partition(": ")
-        if name in schema.get("properties", {}):
-            schema["properties"][name]["description"] = " ".join(text.split())
-    return brief
 
 
 def _from_text(value: Any) -> Any:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import hmac
 import os
 import sys
 import threading
@@ -14,12 +13,10 @@ from typing import Any, cast
 from mcp.server.stdio import stdio_server
 from mcp.server.transport_security import TransportSecuritySettings
 from starlette.applications import Starlette
-from starlette.datastructures import Headers
-from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from urlab_client.mcp.agent import Agent
-from urlab_client.web.access import Access
+from urlab_client.web.access import Access, Guarded
 
 __all__ = ["http_application", "serve_stdio"]
 
@@ -60,20 +57,19 @@ class _Lines:
             yield line
 
 
-def http_application(agent: Agent, console: ASGIApp | None, token: str, access: Access) -> Starlette:
+def http_application(agent: Agent, console: ASGIApp | None, access: Access) -> Starlette:
     """Make an application with the agent's server at `/mcp`, and the console at all other paths.
 
     Args:
         agent: The agent.
         console: The console, if it is shown. Its lifespan is the caller's.
-        token: What agents bring as `Authorization: Bearer TOKEN`. Not a key of the console, which allows more.
-        access: Under which host names agents come.
+        access: Under which host names agents come, and with which key. Not the console's, which allows more.
     """
     inner = agent.server.streamable_http_app(
         streamable_http_path=_PATH,
         transport_security=TransportSecuritySettings(enable_dns_rebinding_protection=False),  # `access` looks at that
     )
-    guarded = _Guarded(inner, token, access)
+    guarded = Guarded(inner, access, advice="Send the token that `urlab mcp` printed: `Authorization: Bearer TOKEN`.")
 
     async def dispatch(scope: Scope, receive: Receive, send: Send) -> None:
         target = guarded if console is None or scope["path"] == _PATH else console
@@ -87,24 +83,3 @@ def http_application(agent: Agent, console: ASGIApp | None, token: str, access: 
     application = Starlette(lifespan=lifespan)
     application.router.default = dispatch
     return application
-
-
-class _Guarded:
-    def __init__(self, application: ASGIApp, token: str, access: Access) -> None:
-        self._application = application
-        self._token = f"bearer {token}".encode()
-        self._access = access
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        refused = self._access.refusal(scope) if scope["type"] == "http" else (403, "bad_request", "This is HTTP only.")
-        scheme, _, value = Headers(scope=scope).get("authorization", "").partition(" ")
-        if refused is None and not hmac.compare_digest(f"{scheme.lower()} {value.strip()}".encode(), self._token):
-            refused = 401, "bad_token", "Send the token that `urlab mcp` printed: `Authorization: Bearer TOKEN`."
-        if refused is None:
-            await self._application(scope, receive, send)
-        elif scope["type"] == "websocket":
-            await receive()
-            await send({"type": "websocket.close", "code": 4403, "reason": refused[2]})
-        else:
-            status, code, text = refused
-            await JSONResponse({"error": {"code": code, "message": text}}, status)(scope, receive, send)

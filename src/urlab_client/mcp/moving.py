@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
+import msgspec
 from msgspec import Meta
 
 from urlab_client.mcp.declaration import Needs, tool
@@ -49,7 +50,7 @@ class Moving(Looking):
             return passed
 
         passed = await self.driving.drive(work, progress, limit)
-        return self.stamped(Done(done="Time passed.", passed=passed))
+        return Done(done="Time passed.", passed=passed)
 
     @tool(Needs.DRIVE, idempotent=True)
     async def move_to(
@@ -70,7 +71,7 @@ class Moving(Looking):
             lambda: found.move_to(joints, tolerance=tolerance, timeout=limit), progress, limit
         )
         reached = ", ".join(f"{name} {float(found.joints[name].position):.4g}" for name in joints)
-        return self.stamped(Done(done=f"{found.name} has settled: {reached}.", passed=passed))
+        return Done(done=f"{found.name} has settled: {reached}.", passed=passed)
 
     @tool(Needs.DRIVE, idempotent=True)
     async def set_actuators(
@@ -91,7 +92,7 @@ class Moving(Looking):
                 await self.client.step()  # hands them over
 
         await self.driving.drive(work, progress)
-        return self.stamped(Done(done=f"{found.name}: {len(set_points)} set-points are set."))
+        return Done(done=f"{found.name}: {len(set_points)} set-points are set.")
 
     @tool(Needs.DRIVE, destructive=True, idempotent=True)
     async def reset(
@@ -109,7 +110,7 @@ class Moving(Looking):
                 if not low <= position <= high:
                     raise ValueError(f"joint {joint!r} of {name!r} takes {low:g} to {high:g}, got {position:g}.")
         await self.driving.drive(lambda: self.client.reset(keyframe, per_articulation_qpos=joints), progress)
-        return self.stamped(Done(done="The simulation is at its beginning."))
+        return Done(done="The simulation is at its beginning.")
 
     @tool(Needs.DRIVE, destructive=True, idempotent=True)
     async def play(
@@ -134,7 +135,7 @@ class Moving(Looking):
                     await self.client.runtime.set_paused(action == "pause")
 
         await self.driving.drive(work, progress)
-        return self.stamped(Done(done=f"{action}: done."))
+        return Done(done=f"{action}: done.")
 
     @tool(Needs.DRIVE)
     async def record(
@@ -147,15 +148,5 @@ class Moving(Looking):
         recordings = self.console.recordings
         if action == "start":
             file = await self.driving.drive(lambda: recordings.start(cameras=cameras), progress)
-            return self.stamped(Recorded(file=file, running=True))
-        made = await recordings.stop()
-        return self.stamped(
-            Recorded(
-                file=made["name"],
-                running=False,
-                seconds=made["seconds"],
-                robots=made["robots"],
-                cameras=made["cameras"],
-                lost=made["lost"],
-            )
-        )
+            return Recorded(file, running=True)
+        return msgspec.convert(await recordings.stop(), Recorded)

@@ -1,32 +1,17 @@
-"""What the tools return. The output schemas that agents see are made of these structs."""
+"""What the tools return, where the client has no type for it. Every result also says when it was made; see `agent`."""
 
 from __future__ import annotations
 
 from msgspec import Struct
 
-from urlab_client.protocol.client_types import Finding
 from urlab_client.protocol.descriptions import Pose, SceneDescription
 from urlab_client.protocol.types import Contact
 from urlab_client.web.messages import LogEntry
 
-__all__ = ["Contacts", "Done", "Edited", "Explained", "Log", "Picture", "Recorded", "Result", "RobotState", "World"]
+__all__ = ["Contacts", "Done", "Edited", "Log", "Picture", "Recorded", "RobotState", "World"]
 
 
-class Result(Struct, kw_only=True):
-    """When the result was made.
-
-    Attributes:
-        sim_time: Simulation time, seconds.
-        step: Physics steps since the session began or the last reset.
-        mode: `direct`: time passes only while a tool lets it; `live`: time passes by itself unless paused.
-    """
-
-    sim_time: float = 0.0
-    step: int = 0
-    mode: str = ""
-
-
-class World(Result, kw_only=True):
+class World(Struct):
     """Everything there is.
 
     Attributes:
@@ -42,7 +27,7 @@ class World(Result, kw_only=True):
     driver: str | None
 
 
-class RobotState(Result, kw_only=True):
+class RobotState(Struct):
     """One robot at one moment.
 
     Attributes:
@@ -62,7 +47,7 @@ class RobotState(Result, kw_only=True):
     sensors: dict[str, list[float]]
 
 
-class Done(Result, kw_only=True):
+class Done(Struct):
     """What became of a call that changed something.
 
     Attributes:
@@ -74,23 +59,19 @@ class Done(Result, kw_only=True):
     passed: float = 0.0
 
 
-class Picture(Result, kw_only=True):
+class Picture(Struct):
     """What comes beside an image.
 
     Attributes:
         camera: `ROBOT/CAMERA`, or a camera of the scene.
         kind: `real`, `depth` (near is bright), `semantic` or `instance`.
-        width: Pixels, after making it smaller.
-        height: Pixels.
     """
 
     camera: str
     kind: str
-    width: int
-    height: int
 
 
-class Contacts(Result, kw_only=True):
+class Contacts(Struct):
     """Bodies that touch.
 
     Attributes:
@@ -102,19 +83,7 @@ class Contacts(Result, kw_only=True):
     truncated: bool
 
 
-class Explained(Result, kw_only=True):
-    """Why a robot does not move.
-
-    Attributes:
-        problems: How many findings have the verdict `problem`.
-        findings: From the connection to the set-points.
-    """
-
-    problems: int
-    findings: list[Finding]
-
-
-class Log(Result, kw_only=True):
+class Log(Struct):
     """Calls, errors and events.
 
     Attributes:
@@ -126,11 +95,11 @@ class Log(Result, kw_only=True):
     next: int
 
 
-class Recorded(Result, kw_only=True):
+class Recorded(Struct):
     """A recording. What is in it is known when it has ended.
 
     Attributes:
-        file: Name of the MCAP file in the folder for recordings.
+        name: Name of the MCAP file in the folder for recordings.
         running: Whether it goes on.
         seconds: Its length, simulation time.
         robots: Robots in it.
@@ -138,15 +107,15 @@ class Recorded(Result, kw_only=True):
         lost: States and pictures that came too fast to be written.
     """
 
-    file: str
-    running: bool
+    name: str
+    running: bool = False
     seconds: float = 0.0
     robots: list[str] = []
     cameras: list[str] = []
     lost: int = 0
 
 
-class Edited(Result, kw_only=True):
+class Edited(Struct):
     """A scene after an edit; play began anew.
 
     Attributes:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import anyio
 
 from urlab_client.mcp.driving import Driving, Limits
-from urlab_client.mcp.results import Result
 from urlab_client.protocol.errors import URLabConnectionError
 from urlab_client.web.console_session import ConsoleSession
 
@@ -15,8 +14,6 @@ if TYPE_CHECKING:
     from urlab_client.aio import URLabArticulation
 
 __all__ = ["Toolset"]
-
-R = TypeVar("R", bound=Result)
 
 _PATIENCE_S = 10.0
 
@@ -69,9 +66,3 @@ class Toolset:
         if not self.client.manager_present:
             raise LookupError("No play session runs, so there are no robots. Call play with action='start'.")
         return self.client.articulations[name]
-
-    def stamped(self, result: R) -> R:
-        """Write into a result when it was made."""
-        result.sim_time, result.step = self.client.sim_time, self.client.step_count
-        result.mode = str(self.client.step_mode)
-        return result

@@ -6,6 +6,7 @@ For the wrappers of both clients, whose maps of articulations, joints and so on 
 from __future__ import annotations
 
 import difflib
+import functools
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar, cast, overload
@@ -29,6 +30,7 @@ class UnknownName(KeyError):
         matches: The keys an ambiguous alias could mean; empty otherwise.
         known: All keys, in the map's order.
         suggestions: Keys and aliases spelled alike, best first.
+        owner: What it was looked for in, for example the key of an articulation; empty for the whole world.
     """
 
     kind: str
@@ -36,6 +38,7 @@ class UnknownName(KeyError):
     matches: tuple[str, ...]
     known: tuple[str, ...]
     suggestions: tuple[str, ...]
+    owner: str
 
     def __init__(
         self,
@@ -44,18 +47,22 @@ class UnknownName(KeyError):
         matches: tuple[str, ...],
         known: tuple[str, ...],
         suggestions: tuple[str, ...],
+        *,
+        owner: str = "",
     ) -> None:
         self.kind = kind
         self.name = name
         self.matches = matches
         self.known = known
         self.suggestions = suggestions
+        self.owner = owner
         super().__init__(self._message())
 
     def _message(self) -> str:
         if self.matches:
-            return f"{self.kind} {self.name!r} is ambiguous: it could mean {_listed(self.matches, 'or')}."
-        text = f"no {self.kind} {self.name!r}."
+            what = f"{self.kind} {self.name!r}{f' of {self.owner}' if self.owner else ''}"
+            return f"{what} is ambiguous: it could mean {_listed(self.matches, 'or')}."
+        text = f"{f'{self.owner} has ' if self.owner else ''}no {self.kind} {self.name!r}."
         if self.suggestions:
             text += f" Did you mean {_listed(self.suggestions, 'or')}?"
         return f"{text} Known: {_listed(self.known, 'and')}." if self.known else f"{text} There are none."
@@ -64,7 +71,8 @@ class UnknownName(KeyError):
         return str(self.args[0])  # a plain KeyError puts it in quotes
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.kind, self.name, self.matches, self.known, self.suggestions)
+        kind = functools.partial(type(self), owner=self.owner)
+        return kind, (self.kind, self.name, self.matches, self.known, self.suggestions)
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
@@ -91,6 +99,7 @@ class NameMap(dict[str, T]):
         items: The entries by exact key.
         aliases: Per alias the keys it stands for, for example a MJCF model name and its instances.
         kind: What the entries are, for messages.
+        owner: What has them, for messages; empty for the whole world.
 
     Raises:
         ValueError: If an alias stands for a key that is not there.
@@ -98,15 +107,19 @@ class NameMap(dict[str, T]):
 
     kind: str
     """What the entries are."""
+    owner: str
+    """What has them; empty for the whole world."""
 
     def __init__(
         self,
         items: Mapping[str, T] | Iterable[tuple[str, T]] = (),
         aliases: Mapping[str, Sequence[str]] | None = None,
         kind: str = "entry",
+        owner: str = "",
     ) -> None:
         super().__init__(items)
         self.kind = kind
+        self.owner = owner
         self._aliases: dict[str, tuple[str, ...]] = {}
         for alias, keys in (aliases or {}).items():
             for key in keys:
@@ -155,10 +168,10 @@ class NameMap(dict[str, T]):
         matches = self._aliases.get(cast("str", name), ())
         unique = [alias for alias, keys in self._aliases.items() if len(keys) == 1]
         suggestions = difflib.get_close_matches(name, [*known, *unique]) if isinstance(name, str) else []
-        return UnknownName(self.kind, name, matches, known, tuple(suggestions))
+        return UnknownName(self.kind, name, matches, known, tuple(suggestions), owner=self.owner)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return NameMap, (dict(self), self._aliases, self.kind)
+        return NameMap, (dict(self), self._aliases, self.kind, self.owner)
 
     def _ipython_key_completions_(self) -> list[str]:
         """Return what completes `map["` in IPython and Jupyter: keys, then the aliases that mean one of them."""

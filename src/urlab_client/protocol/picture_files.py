@@ -15,7 +15,7 @@ from urlab_client.protocol.pixels import Pixels
 if TYPE_CHECKING:
     from PIL import Image
 
-__all__ = ["JPEG_QUALITY", "jpeg", "png"]
+__all__ = ["JPEG_QUALITY", "jpeg", "pillow_image", "png"]
 
 JPEG_QUALITY: Final = 85
 """Default quality of a JPEG, of 100."""
@@ -37,29 +37,56 @@ def png(pixels: Pixels, mode: CameraMode | str) -> bytes:
         MissingExtra: Pillow is not installed.
     """
     if mode != CameraMode.DEPTH:
-        return _encoded(_image(_rgb(pixels, mode)), "PNG")
+        return _encoded(pillow_image(pixels, mode), "PNG")
     with np.errstate(invalid="ignore"):
         depth = np.rint(np.asarray(pixels, np.float64) * _MILLIMETRES)
         within = (depth >= 0) & (depth < _DEEPEST)
     return _encoded(_image(np.where(within, depth, 0).astype(np.uint16)), "PNG")
 
 
-def jpeg(pixels: Pixels, mode: CameraMode | str, quality: int = JPEG_QUALITY) -> bytes:
+def jpeg(pixels: Pixels, mode: CameraMode | str, quality: int = JPEG_QUALITY, *, max_size: int | None = None) -> bytes:
     """Return a picture as JPEG, to be looked at: colours, or depth as grey, near is bright.
 
     Args:
         pixels: As in `CameraSample`.
         mode: What they mean.
         quality: 1 to 100.
+        max_size: Pixels that the longer side may have; None leaves the picture as large as it is.
 
     Raises:
         MissingExtra: Pillow is not installed.
-        ValueError: There is no such quality.
+        ValueError: There is no such quality or size.
     """
     if not 1 <= quality <= 100:
         raise ValueError(f"the quality of a JPEG is 1 to 100, got {quality}")
-    shown = _grey(pixels) if mode == CameraMode.DEPTH else _rgb(pixels, mode)
-    return _encoded(_image(shown), "JPEG", quality=quality)
+    if max_size is not None and max_size < 1:
+        raise ValueError(f"max_size is at least 1 pixel, got {max_size}")
+    image = _image(_grey(pixels)) if mode == CameraMode.DEPTH else pillow_image(pixels, mode)
+    if max_size is not None:
+        image.thumbnail((max_size, max_size))
+    return _encoded(image, "JPEG", quality=quality)
+
+
+def pillow_image(pixels: Pixels, mode: CameraMode | str, *, alpha: bool = False) -> Image.Image:
+    """Return a picture of colours or of a segmentation as Pillow's, RGB or RGBA.
+
+    Pillow picks the channels as it takes the picture over, at a tenth of what NumPy takes to rearrange them.
+
+    Args:
+        pixels: As in `CameraSample`.
+        mode: What they mean.
+        alpha: Whether to keep that channel.
+
+    Raises:
+        MissingExtra: Pillow is not installed.
+    """
+    need("PIL", extra="pillow")
+    from PIL import Image  # noqa: PLC0415
+
+    height, width = pixels.shape[:2]
+    channels = "RGB" if mode == CameraMode.REAL else "BGR"
+    kind, raw = ("RGBA", f"{channels}A") if alpha else ("RGB", f"{channels}X")
+    return Image.frombytes(kind, (width, height), np.ascontiguousarray(pixels).data, "raw", raw)
 
 
 def _image(array: NDArray[Any]) -> Image.Image:
@@ -73,10 +100,6 @@ def _encoded(image: Image.Image, kind: str, **options: Any) -> bytes:
     buffer = io.BytesIO()
     image.save(buffer, kind, **options)
     return buffer.getvalue()
-
-
-def _rgb(pixels: Pixels, mode: CameraMode | str) -> NDArray[Any]:
-    return np.ascontiguousarray(pixels[..., :3] if mode == CameraMode.REAL else pixels[..., 2::-1])
 
 
 def _grey(depth: Pixels) -> NDArray[np.uint8]:

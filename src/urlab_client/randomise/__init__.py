@@ -4,6 +4,14 @@ A `Randomisation` says what varies from episode to episode and by how much; the 
 numbers, which are the same wherever it runs.
 """
 
-from urlab_client.randomise.declaration import CameraLatency, Delay, Noise, Push, Randomisation, Vary
+from urlab_client.randomise.declaration import (
+    CameraLatency,
+    Delay,
+    Noise,
+    Push,
+    Randomisation,
+    UnsupportedRandomisation,
+    Vary,
+)
 
-__all__ = ["CameraLatency", "Delay", "Noise", "Push", "Randomisation", "Vary"]
+__all__ = ["CameraLatency", "Delay", "Noise", "Push", "Randomisation", "UnsupportedRandomisation", "Vary"]

@@ -11,6 +11,8 @@ from typing import Any, Final, Literal, Self, get_args
 import msgspec
 from msgspec import Struct
 
+from urlab_client.protocol.errors import URLabError
+
 __all__ = [
     "MODEL_TEXT",
     "MODEST",
@@ -23,6 +25,7 @@ __all__ = [
     "Quantity",
     "Randomisation",
     "Range",
+    "UnsupportedRandomisation",
     "Vary",
     "Vector",
     "steps_range",
@@ -84,6 +87,30 @@ def _check_range(what: str, given: Range) -> None:
         math.isfinite(a) and math.isfinite(b) and a <= b for a, b in zip(lows, highs, strict=True)
     ):
         raise ValueError(f"{what} takes a lowest and a highest value, not {list(given)}")
+
+
+class UnsupportedRandomisation(URLabError):
+    """A server cannot vary what a `Randomisation` declares: its protocol has no op for it.
+
+    Attributes:
+        quantities: What it cannot vary, as `Vary.what`.
+        address: The server.
+    """
+
+    def __init__(self, quantities: tuple[str, ...], address: str) -> None:
+        self.quantities = quantities
+        self.address = address
+        super().__init__(
+            f"The server at {address} does not vary its scene, and no op of its protocol changes "
+            f"{', '.join(quantities)} during play.",
+            hint=(
+                "Over the wire, gravity, position, base_position, base_yaw, and kp and kv of PD controllers can vary. "
+                "For the rest, use a sim:// address, or start the server with `urlab serve --randomise FILE`."
+            ),
+        )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.quantities, self.address)
 
 
 class _Declared(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):

@@ -29,18 +29,20 @@ def populate(world: EditorWorld, models: Sequence[str]) -> None:
     """Open the level among `models`, place the others, and see to a manager."""
     for level in filter(is_level, models):
         world.levels.load_file(Path(level))
+    names = [row.name for row in world.list_actors()]
     edge: float | None = None
-    for row in world.list_actors():
-        edge = _beyond(world, row.name, edge)
     sources: dict[str, str] = {}
     for model in models:
-        if not is_level(model):
-            edge = _place(world, model, sources, edge)
+        if is_level(model):
+            continue
+        for name in names:  # not before something follows: finding where a model ends may take compiling it
+            edge = _beyond(world, name, edge)
+        names = [_place(world, model, sources, edge)]
     world.ensure_manager()
 
 
-def _place(world: EditorWorld, model: str, sources: dict[str, str], edge: float | None) -> float | None:
-    """Import a model and place it beyond `edge`, the largest y in use; return the new one.
+def _place(world: EditorWorld, model: str, sources: dict[str, str], edge: float | None) -> str:
+    """Import a model and place it beyond `edge`, the largest y in use, if there is any; return the actor's name.
 
     `sources` holds the files imported so far by blueprint.
     """
@@ -54,10 +56,11 @@ def _place(world: EditorWorld, model: str, sources: dict[str, str], edge: float 
     if other != path:
         raise ModelError(f"{model} and {other} would both become blueprint '{blueprint.stem}': rename one of the files")
     actor = world.spawn_actor(blueprint.class_path, _free_id(world, Path(path).stem)).actor
-    bounds = world.get_actor_bounds(actor.name, components_only=True)
-    if bounds.extents != (0.0, 0.0, 0.0) and edge is not None:
-        world.set_actor_transform(actor.name, location=(0.0, edge + GAP_M - bounds.min[1], 0.0))
-    return _beyond(world, actor.name, edge)
+    if edge is not None:
+        bounds = world.get_actor_bounds(actor.name, components_only=True)
+        if bounds.extents != (0.0, 0.0, 0.0):
+            world.set_actor_transform(actor.name, location=(0.0, edge + GAP_M - bounds.min[1], 0.0))
+    return actor.name
 
 
 def _free_id(world: EditorWorld, stem: str) -> str:

@@ -32,6 +32,8 @@ _HEADERS = {
 _PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
 <title>URLab console</title><body><h1>{title}</h1><p>{text}</p></body></html>"""
 
+_ADVICE = "Open the link that `urlab console` printed; it is good for one browser."
+
 _Refusal: TypeAlias = tuple[int, str, str]
 
 
@@ -45,14 +47,15 @@ class Access:
         hosts: Host names under which the application is reached, in lower case. Others are refused, so that a page
             elsewhere cannot reach it under a name of its own (DNS rebinding).
         tokens: Whether a key is needed. False is for applications that let in only whom they know anyway.
+        keys: Keys that are good without a token.
     """
 
-    def __init__(self, *, hosts: Collection[str] = LOOPBACK, tokens: bool = True) -> None:
+    def __init__(self, *, hosts: Collection[str] = LOOPBACK, tokens: bool = True, keys: Collection[str] = ()) -> None:
         self.hosts: frozenset[str] = frozenset(hosts)
         self.tokens = tokens
         self.cookie: str = f"urlab_{secrets.token_hex(4)}"  # cookies of a host go to all its ports
         self._tokens: set[str] = set()
-        self._keys: set[str] = set()
+        self._keys: set[str] = set(keys)
 
     def invite(self) -> str:
         """Return a new token, good for one use."""
@@ -100,11 +103,13 @@ class Guarded:
     Args:
         app: The application.
         access: What a request must bring.
+        advice: What those are told who bring no key.
     """
 
-    def __init__(self, app: ASGIApp, access: Access) -> None:
+    def __init__(self, app: ASGIApp, access: Access, *, advice: str = _ADVICE) -> None:
         self._app = app
         self._access = access
+        self._advice = advice
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request, or let the application do so."""
@@ -120,7 +125,7 @@ class Guarded:
             key = self._access.key_of(Headers(scope=scope))
             scope["urlab_key"] = key
             if key is None and not _is_entrance(scope):
-                refused = 401, "no_key", "Open the link that `urlab console` printed; it is good for one browser."
+                refused = 401, "no_key", self._advice
         if refused is None:
             await self._app(scope, receive, _with_headers(send))
         elif scope["type"] == "websocket":

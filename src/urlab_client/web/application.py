@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import anyio
+import anyio.to_thread
 import msgspec
 from msgspec import Struct
 from starlette.applications import Starlette
@@ -33,7 +34,7 @@ from urlab_client.web.access import Access, Guarded
 from urlab_client.web.console_session import Audience, ConsoleSession
 from urlab_client.web.driving_lease import DrivingLease, NotDriving, Viewer
 from urlab_client.web.handling_routes import HandlingRoutes
-from urlab_client.web.messages import Ack, Ctrl, FromViewer, Log, Name, Ping, Pong, Refused, You
+from urlab_client.web.messages import Ack, Ctrl, FromViewer, Hand, Log, Name, Ping, Pong, Refused, You
 from urlab_client.web.metrics import showing
 from urlab_client.web.model_upload import ModelRoutes
 from urlab_client.web.ops import encode, openapi, parse, served
@@ -59,6 +60,7 @@ def app(
     client: URLabClient,
     *,
     access: Access | None = None,
+    handshake: Callable[[], bytes] | None = None,
     lease_seconds: float = 20.0,
     metrics: CollectorRegistry | None = None,
     recordings: str | os.PathLike[str] = "recordings",
@@ -71,23 +73,28 @@ def app(
         client: An async client of the loop that serves. The application reads set-points and state from it as any
             other part of a program may.
         access: Who may come in; default: whoever brings a token of `site.state.access.invite()`, on this machine.
+        handshake: For a client with `read_only=True`: returns what `handshake()` of the client that drives returns,
+            as `Path("…").read_bytes` does. Called in a thread, again whenever play has begun anew.
         lease_seconds: How long a viewer keeps the controls without using them.
         metrics: What `/metrics` shows to Prometheus, behind the same access; None leaves the path out. The client's
             requests are in it if the client was made with `observe=PrometheusObserver(metrics)`.
         recordings: Folder of the recordings that viewers make, download and replay; made with the first one.
+
+    Raises:
+        ValueError: The client is read-only, and there is no `handshake`, or the other way round.
     """
+    if client.config.read_only != (handshake is not None):
+        raise ValueError("app: a client with read_only=True takes `handshake`, and no other does")
     access = access or Access()
-    site = _Site(ConsoleSession(client, DrivingLease(lease_seconds), Path(recordings)), access)
+    session = ConsoleSession(client, DrivingLease(lease_seconds), Path(recordings), handshake)
+    site = _Site(session, access, metrics)
 
     @contextlib.asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncGenerator[None]:
         async with site.console.open():
             yield
 
-    routes = site.routes()
-    if metrics is not None:
-        routes.append(Route("/metrics", showing(metrics)))
-    application = Starlette(routes=routes, middleware=[Middleware(Guarded, access=access)], lifespan=lifespan)
+    application = Starlette(routes=site.routes(), middleware=[Middleware(Guarded, access=access)], lifespan=lifespan)
     application.state.access = access
     application.state.console = site.console
     return application
@@ -118,9 +125,10 @@ class _LoginRequest(Struct):
 
 
 class _Site:
-    def __init__(self, console: ConsoleSession, access: Access) -> None:
+    def __init__(self, console: ConsoleSession, access: Access, metrics: CollectorRegistry | None) -> None:
         self.console = console
         self._access = access
+        self._metrics = metrics
         self._viewers: dict[str, Viewer] = {}
         self._reading = ReadingRoutes(console, self._viewer)
         self._recordings = RecordingRoutes(console, self._viewer)
@@ -134,6 +142,7 @@ class _Site:
         return [
             route("/", self._page),
             route("/api/openapi.json", self._openapi),
+            route("/api/handshake", self._handshake),
             route("/api/world", self._world),
             route("/api/status", self._status),
             route("/api/state", self._state),
@@ -158,6 +167,7 @@ class _Site:
             WebSocketRoute("/api/live", self._live),
             WebSocketRoute("/api/cameras/{path:path}/live", self._pictures),
             Mount("/static", StaticFiles(directory=_STATIC)),
+            *([] if self._metrics is None else [Route("/metrics", showing(self._metrics))]),
             *self._studio_routes(),
         ]
 
@@ -182,7 +192,11 @@ class _Site:
         return FileResponse(_STATIC / "index.html")
 
     async def _openapi(self, request: Request) -> Response:
-        return _json(openapi(request.scope.get("root_path", "")))
+        return _json(openapi(request.scope.get("root_path", ""), metrics=self._metrics is not None))
+
+    async def _handshake(self, request: Request) -> Response:
+        shared = await anyio.to_thread.run_sync(self.console.client.handshake)
+        return Response(shared, media_type="application/octet-stream")
 
     async def _world(self, request: Request) -> Response:
         return _json(encode(self.console.world))
@@ -201,7 +215,7 @@ class _Site:
     async def _op(self, request: Request) -> Response:
         op = served(request.path_params["op"])
         if op is None:
-            return _error(404, "unknown_op", f"There is no op {request.path_params['op']!r} here.", "See openapi.json.")
+            return _error(404, "unknown_op", f"No op is called {request.path_params['op']!r}.", "See openapi.json.")
         body = await _body(request)
         return _json(encode(await self.console.controls.do(self._viewer(request), parse(op, body))))
 
@@ -303,8 +317,8 @@ class _Site:
                     case Name(name=name):
                         one.viewer.name = " ".join(name.split())[:24] or one.viewer.name
                         self.console.tell()
-                    case Ctrl(values=values):
-                        self.console.controls.set_points(one.viewer, values)
+                    case Ctrl() | Hand():
+                        self.console.drive(one.viewer, message)
             except (NotDriving, ValueError, KeyError, RecursionError, msgspec.MsgspecError) as error:
                 await socket.send_text(encode(Refused(_explain(error)[1])).decode())
 

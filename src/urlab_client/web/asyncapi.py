@@ -6,9 +6,9 @@ from functools import lru_cache
 from importlib.metadata import version
 from typing import Any
 
-import msgspec
 from msgspec import Struct
 
+from urlab_client.protocol.schemas import prose, schemas
 from urlab_client.web.messages import (
     Ack,
     Ctrl,
@@ -46,9 +46,6 @@ def asyncapi(host: str, root: str, protocol: str) -> bytes:
         root: The path under which it is mounted, or a proxy shows it.
         protocol: `ws` or `wss`.
     """
-    _, schemas = msgspec.json.schema_components(
-        [*_TOLD, *_SAID, PictureHead], ref_template="#/components/schemas/{name}"
-    )
     messages = {_tag(kind): _message(kind) for kind in (*_TOLD, *_SAID)} | {"picture": _PICTURE}
     live, pictures = [*map(_tag, _TOLD), *map(_tag, _SAID)], ["picture", _tag(Ack)]
     return encode(
@@ -75,7 +72,7 @@ def asyncapi(host: str, root: str, protocol: str) -> bytes:
             },
             "components": {
                 "messages": messages,
-                "schemas": schemas,
+                "schemas": schemas([*_TOLD, *_SAID, PictureHead], "#/components/schemas/{name}"),
                 "securitySchemes": {"key": {"type": "http", "scheme": "bearer"}},
             },
         }
@@ -89,7 +86,7 @@ def _tag(kind: type[Struct]) -> str:
 def _message(kind: type[Struct]) -> dict[str, Any]:
     return {
         "title": _tag(kind),
-        "summary": " ".join((kind.__doc__ or "").split()),
+        "summary": " ".join(prose(kind).split()),
         "contentType": "application/json",
         "payload": {"$ref": f"#/components/schemas/{kind.__name__}"},
     }

@@ -10,11 +10,12 @@ import contextlib
 import logging
 import time
 from collections import deque
-from collections.abc import AsyncGenerator, Generator, Mapping
+from collections.abc import AsyncGenerator, Callable, Generator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import anyio
+import anyio.to_thread
 import numpy as np
 from msgspec import structs
 
@@ -35,8 +36,9 @@ from urlab_client.protocol.messages.streams import (
 from urlab_client.web.controls import Controls
 from urlab_client.web.description import WorldDescription, describe
 from urlab_client.web.driving_lease import DrivingLease, Viewer
+from urlab_client.web.hand_driving import HandDriving
 from urlab_client.web.handling import Handling
-from urlab_client.web.messages import ArticulationSample, EntitySample, Link, LogEntry, State, Status, World
+from urlab_client.web.messages import ArticulationSample, Ctrl, EntitySample, Hand, Link, LogEntry, State, Status, World
 from urlab_client.web.mujoco_viewer import MujocoViewer
 from urlab_client.web.ops import encode
 from urlab_client.web.pictures import Feed
@@ -79,9 +81,16 @@ class ConsoleSession:
         client: The client; the console opens its session and keeps it.
         lease: The controls.
         recordings: Folder for recordings.
+        handshake: Returns what a read-only client discovers with; None for one that opens the session.
     """
 
-    def __init__(self, client: URLabClient, lease: DrivingLease, recordings: Path) -> None:
+    def __init__(
+        self,
+        client: URLabClient,
+        lease: DrivingLease,
+        recordings: Path,
+        handshake: Callable[[], bytes] | None = None,
+    ) -> None:
         self.client = client
         self.lease = lease
         self.link: Link = Link("connecting", since=time.time())
@@ -94,10 +103,13 @@ class ConsoleSession:
         self.snapshot: StateSnapshot | None = None
         self.mujoco_viewer: MujocoViewer = MujocoViewer(client)
         self.controls: Controls = Controls(self)
+        self.hands: HandDriving = HandDriving(self)
         self.recordings: Recordings = Recordings(client, recordings)
         self.replay: Replay = Replay(self)
         self.handling: Handling = Handling(self)
         self.controls.before_step = self.handling.apply
+        self._handshake = handshake
+        self._adopted = b""
         self._bells: set[asyncio.Event] = set()
         self._n = 0
         self._want: str | None = "discover"
@@ -116,7 +128,12 @@ class ConsoleSession:
         """Keep the session and receive state while the body runs."""
         async with anyio.create_task_group() as tasks:
             controls = self.controls
-            jobs = (controls.send_set_points, controls.keep_stepping, self.replay.keep_playing)
+            jobs = (
+                controls.send_set_points,
+                controls.keep_stepping,
+                self.hands.keep_driving,
+                self.replay.keep_playing,
+            )
             for job in (self._keep, self._receive, self._pulse, *jobs):
                 tasks.start_soon(job)
             try:
@@ -156,10 +173,10 @@ class ConsoleSession:
                 try:
                     await self.client.resync(timeout=_CONNECT_S)
                 except URLabError:
-                    await self.client.discover()
+                    await self._discover()
             else:
-                await self.client.discover()
-        except (URLabError, OSError) as error:
+                await self._discover()
+        except (URLabError, OSError, ValueError) as error:
             self._want = "discover" if want == "discover" else "resync"
             if self.link.reason != str(error):
                 self._set_link("lost" if self._ready.is_set() else "connecting", str(error))
@@ -168,6 +185,15 @@ class ConsoleSession:
         self._set_link("connected")
         self._ready.set()
         self._begin_anew()
+
+    async def _discover(self) -> None:
+        if self._handshake is None:
+            await self.client.discover()
+            return
+        given = await anyio.to_thread.run_sync(self._handshake)
+        if given != self._adopted:
+            await self.client.discover(handshake=given)
+            self._adopted = given
 
     def _take(self, event: ClientEvent) -> None:
         """Act on what happened to the connection."""
@@ -196,6 +222,19 @@ class ConsoleSession:
                 self._begin_anew()
             case _:
                 pass
+
+    def drive(self, viewer: Viewer, order: Ctrl | Hand) -> None:
+        """Do what a viewer's message orders.
+
+        Raises:
+            NotDriving: Somebody else has the controls.
+            KeyError: A name is unknown; nothing was set.
+            ValueError: It cannot be done; nothing was set.
+        """
+        if isinstance(order, Hand):
+            self.hands.command(viewer, order)
+        else:
+            self.controls.set_points(viewer, order.values)
 
     def take_back(self) -> None:
         """Open a session again, after another program took the server over."""
@@ -229,7 +268,10 @@ class ConsoleSession:
                     while True:
                         snapshot = await states.receive(timeout=None)
                         self._note_time(snapshot.time)
-                        if not self.replay.open:
+                        if self._handshake is not None and not self.client.matches(snapshot):
+                            self.take_back()  # play began anew, and the driver has said so, or will
+                            await anyio.sleep(_RETRY_S)
+                        elif not self.replay.open:
                             self._publish(snapshot, {key: self._targets(key) for key in snapshot.per_articulation})
                         # By the clock and not by when it woke up, else each late awakening makes the rate lower.
                         due = max(due + _PERIOD_S, time.monotonic() - _PERIOD_S)

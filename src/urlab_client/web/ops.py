@@ -28,6 +28,7 @@ from urlab_client.protocol.messages.runtime import (
 from urlab_client.protocol.messages.session import Forward, Hello, Reset
 from urlab_client.protocol.messages.sim import BeginPie, BeginPieOk, StopPie, StopPieOk
 from urlab_client.protocol.registry import OPS
+from urlab_client.protocol.schemas import schemas
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabClient, URLabController
@@ -118,18 +119,17 @@ def _controller(client: URLabClient, key: str) -> URLabController | None:
 
 
 @lru_cache(maxsize=8)
-def openapi(root: str = "") -> bytes:
+def openapi(root: str = "", *, metrics: bool = False) -> bytes:
     """Return the OpenAPI 3.1 document of the whole HTTP API.
 
     Args:
         root: The path under which the application is mounted, or a proxy shows it.
+        metrics: Whether it serves `/metrics`.
     """
     ops = [op for op in OPS.values() if op.request not in _UNSERVED]
     replies = [_STARTED if op.reply is BeginPieOk else op.reply for op in ops]
     structs = [*(op.request for op in ops), *replies]
-    _, components = msgspec.json.schema_components(
-        structs, schema_hook=_array_schema, ref_template="#/components/schemas/{name}"
-    )
+    components = schemas(structs, "#/components/schemas/{name}")
     for op in ops:
         properties = components[op.request.__name__]["properties"]
         for name in ("op", "session_id"):
@@ -149,7 +149,11 @@ def openapi(root: str = "") -> bytes:
             },
             "servers": [{"url": root or "/"}],
             "security": security,
-            "paths": {**_PATHS, **{f"/api/ops/{op.name}": {"post": _operation(op)} for op in ops}},
+            "paths": {
+                **_PATHS,
+                **(_METRICS if metrics else {}),
+                **{f"/api/ops/{op.name}": {"post": _operation(op)} for op in ops},
+            },
         }
     )
 
@@ -174,10 +178,6 @@ def _ref(name: str) -> dict[str, str]:
 
 def _answer(schema: str, text: str) -> dict[str, Any]:
     return {"description": text, "content": {"application/json": {"schema": _ref(schema)}}}
-
-
-def _array_schema(kind: type) -> dict[str, Any]:
-    return {"type": "array", "items": {"type": "number"}}  # arrays are the one type that msgspec does not know
 
 
 _ERROR = {
@@ -209,9 +209,22 @@ def _path(method: str, name: str, summary: str, **more: Any) -> dict[str, Any]:
     }
 
 
+_METRICS: dict[str, Any] = {
+    "/metrics": _path(
+        "get",
+        "metrics",
+        "What this program measures of the client's requests, in Prometheus' text format.",
+        responses={
+            "200": {"description": "Success.", "content": {"text/plain": {"schema": {"type": "string"}}}},
+            "default": _answer("Error", "What went wrong."),
+        },
+    )
+}
+
 _PATHS: dict[str, Any] = {
     "/api/world": _path("get", "world", "Articulations, joints with ranges, actuators, sensors, cameras."),
     "/api/status": _path("get", "status", "Connection, play, modes, who drives."),
+    "/api/handshake": _path("get", "handshake", "What a client with `read_only=True` passes to `discover()`: bytes."),
     "/api/state": _path("get", "state", "The newest state."),
     "/api/log": _path("get", "log", "The latest calls, errors and events."),
     "/api/events": _path(
@@ -229,6 +242,9 @@ _PATHS: dict[str, Any] = {
         **_path("post", "record", "Record into an MCAP file: `{cameras: bool}`. Needs the controls."),
         **_path("delete", "stop_recording", "End the recording, and describe it. Needs the controls."),
     },
+    "/api/recording/outcome": _path(
+        "post", "mark_episode", "Note `{outcome}` of the episode: success, failure, discarded. Needs the controls."
+    ),
     "/api/recordings": _path("get", "recordings", "The recordings, the newest first."),
     "/api/recordings/{name}": {
         **_path("get", "download", "A recording, `?as=csv`, `npz` or `mp4&camera=…`; `?as=about` describes it."),

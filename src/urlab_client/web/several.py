@@ -18,15 +18,18 @@ from starlette.routing import Mount, Route
 
 from urlab_client.web.access import Access, Guarded
 from urlab_client.web.application import app, entrance
+from urlab_client.web.metrics import showing
 from urlab_client.web.ops import encode
 
 if TYPE_CHECKING:
+    from prometheus_client import CollectorRegistry
+
     from urlab_client.aio import URLabClient
 
 __all__ = ["apps"]
 
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
-_TAKEN = frozenset({"api"})
+_TAKEN = frozenset({"api", "metrics"})
 _PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
 <title>URLab consoles</title><body><h1>Servers</h1><ul>{items}</ul></body></html>"""
 
@@ -36,6 +39,7 @@ def apps(
     *,
     access: Access | None = None,
     lease_seconds: float = 20.0,
+    metrics: CollectorRegistry | None = None,
     recordings: str | os.PathLike[str] = "recordings",
 ) -> Starlette:
     """Make one application of the consoles of several servers.
@@ -49,6 +53,7 @@ def apps(
             `_` and `-`.
         access: Who may come in; default: whoever brings a token of `site.state.access.invite()`, on this machine.
         lease_seconds: How long a viewer keeps the controls of a server without using them.
+        metrics: What `/metrics` shows to Prometheus, behind the same access; None leaves the path out.
         recordings: Folder of the recordings, with a folder in it for each server.
 
     Raises:
@@ -56,7 +61,9 @@ def apps(
     """
     for name in clients:
         if not _NAME.fullmatch(name) or name in _TAKEN:
-            raise ValueError(f"{name!r} cannot be the name of a server: use letters, digits, _ and -, but not 'api'")
+            raise ValueError(
+                f"{name!r} cannot be the name of a server: use letters, digits, _ and -, but not 'api' or 'metrics'"
+            )
     if not clients:
         raise ValueError("apps takes one client or more")
     door = access or Access()
@@ -98,6 +105,7 @@ def apps(
             Route("/", page),
             Route("/api/servers", listed),
             Route("/api/session", entrance(door), methods=["POST"]),
+            *([] if metrics is None else [Route("/metrics", showing(metrics))]),
         ],
         middleware=[Middleware(Guarded, access=door)],
     )

@@ -180,6 +180,11 @@ class LatestPicture(MessageHandler):
             self._message = None
             self._pixels, self._sim_time, self._frame_id = pixels, sim_time, frame_id
 
+    @property
+    def came(self) -> bool:
+        """Whether there has been one."""
+        return self._pixels is not None or self._message is not None
+
     def frame_id(self) -> int | None:
         """Return which snapshot of the state the newest picture shows, as far as it says so. From any thread."""
         self.newest()

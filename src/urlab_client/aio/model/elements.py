@@ -399,7 +399,7 @@ def _named(info: ArticulationInfo, kind: str, items: Sequence[H], original: Mapp
     for live, authored in original.items():
         if live in by_name:
             aliases.setdefault(authored, []).append(live)
-    return NameMap(by_name, aliases, kind=f"{kind} of {info.prefix}")
+    return NameMap(by_name, aliases, kind=kind, owner=info.prefix)
 
 
 def _joints(record: MirroredArticulation, model: mujoco.MjModel | None) -> list[Joint]:

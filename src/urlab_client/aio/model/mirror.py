@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from urlab_client._mujoco import without_newer_attributes
+from urlab_client._mujoco import forget_last_document, without_newer_attributes
 from urlab_client.aio.model.numbers import first_not_finite
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.errors import ProtocolError, URLabVersionMismatch
@@ -118,7 +118,9 @@ def _compiled(xml: str, assets: Mapping[str, bytes], *, trusted: bool) -> mujoco
     import mujoco  # noqa: PLC0415
 
     if trusted:
-        return mujoco.MjModel.from_xml_string(xml, dict(assets))
+        model = mujoco.MjModel.from_xml_string(xml, dict(assets))
+        forget_last_document()
+        return model
     from urlab_client.aio.model.compilation import compile_confined  # noqa: PLC0415 - it is run as a program, too
 
     try:

@@ -14,11 +14,11 @@ from typing import Final
 
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.deadline import DEFAULT, Timeout
-from urlab_client.aio.live.camera_source import FIRST_PICTURE_S, CameraSource, HasCamera
+from urlab_client.aio.live.camera_source import CameraSource, HasCamera
 from urlab_client.aio.session import Turn
 from urlab_client.aio.state.sim_state import SimState
-from urlab_client.aio.state.step_mode import stopped_live
-from urlab_client.aio.streams import Stream
+from urlab_client.aio.state.step_mode import learn_mode, stopped_live
+from urlab_client.aio.state.step_pictures import first_picture_s
 from urlab_client.aio.transport.subscriber import MessageHandler
 from urlab_client.protocol.codec import op_of
 from urlab_client.protocol.enums import StepMode
@@ -32,6 +32,7 @@ from urlab_client.protocol.errors import (
 )
 from urlab_client.protocol.layouts import BytesLike
 from urlab_client.protocol.messages.session import Meta, Step
+from urlab_client.protocol.messages.sim import PieStatus
 from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
 from urlab_client.protocol.pixels import decode_camera, picture_stamp
 
@@ -39,16 +40,14 @@ __all__ = ["Capturing"]
 
 _RENDER_S: Final = 2.0
 _AGAIN_S: Final = 0.05
-_PROOF_S: Final = 1.0
+_MOVES_S: Final = 0.25
+"""In which time passes in live mode unless it is paused, at 5 % of real time, too."""
 
 _HINT = (
     "Is the camera switched on in the editor, and can the server draw? Without OpenGL it sends no pictures; its log "
     "says what it found."
 )
-_ASSUMED = (
-    "Which step mode the server is in is not known, and outside live mode it publishes no pictures: call "
-    "client.runtime.set_mode() first."
-)
+_ASSUMED = "Which step mode the server is in is not known, and outside live mode it may publish no pictures."
 
 
 class Capturing:
@@ -80,16 +79,18 @@ class Capturing:
                 raise NoActiveManager("no_active_manager", "no play session runs. Nothing was sent.", op="capture")
             views = self._views(cameras)
             taking = _Taking(state, turn, views, self._deadline(views, timeout))
-            if state.mode is StepMode.LIVE or state.mode_assumed:
-                await taking.in_live_mode(certain=await self._is_live(turn))
-            else:
-                try:
+            try:
+                if state.mode_assumed and not state.session.read_only:
+                    await self._learn_mode(turn)
+                if state.mode is StepMode.LIVE or state.mode_assumed:
+                    await taking.in_live_mode(certain=not state.mode_assumed)
+                else:
                     async with stopped_live(state, turn):
                         await taking.in_live_mode(certain=True)
-                except ModeLocked as locked:
-                    locked.hint = "Pictures come with steps here: client.step(include_cameras=…)."
-                    raise
-                taking.note_time(state.sim_time)
+                    taking.note_time(state.sim_time)
+            except ModeLocked as locked:
+                locked.hint = "Pictures come with steps here: client.step(include_cameras=…)."
+                raise
         return taking.delivered()
 
     def _views(self, cameras: Sequence[HasCamera]) -> list[URLabCameraView]:
@@ -106,27 +107,21 @@ class Capturing:
         seconds = self._default_timeout if timeout is DEFAULT else timeout
         if seconds is None:
             return None
-        if timeout is DEFAULT and any(view.latest_frame is None for view in views):
-            seconds = max(seconds, FIRST_PICTURE_S)
+        if timeout is DEFAULT:
+            seconds = max(seconds, first_picture_s(views))
         return asyncio.get_running_loop().time() + seconds
 
-    async def _is_live(self, turn: Turn) -> bool:
-        """Return whether the server is in live mode for certain: else a request for pictures might be a step."""
+    async def _learn_mode(self, turn: Turn) -> None:
+        """Find out which mode the server is in: outside live mode a request for pictures might be a step."""
         state = self._state
-        if state.session.read_only:
-            return False
-        if not state.mode_assumed:
-            return True
-        if state.session.features.publishes_steps:
-            return False  # its snapshots come in every mode
-        snapshots = Stream(state.publishers.state(), policy=StreamPolicy.LATEST)
-        try:
-            async with snapshots:
-                await turn.aside(snapshots.receive(timeout=_PROOF_S))
-        except URLabTimeoutError:
-            return False
-        state.mode = StepMode.LIVE
-        return True
+        before = (await turn.call(PieStatus())).sim_time
+        if before is None:
+            return
+        await turn.aside(asyncio.sleep(_MOVES_S))
+        if (await turn.call(PieStatus())).sim_time != before:
+            state.mode = StepMode.LIVE  # nobody else has the session, so it runs by itself
+        else:
+            await learn_mode(state, turn)
 
 
 class _Taking:
@@ -185,7 +180,8 @@ class _Taking:
         while True:
             request = Step(include_cameras=dict.fromkeys(missing, "sync"), render="sync")
             request.camera_timeout_ms = 1000.0 * _RENDER_S
-            reply = await turn.call(request, takes=(op_of(Step).timeout or 0.0) + _RENDER_S)
+            seconds = _RENDER_S + first_picture_s(missing.values())
+            reply = await turn.call(request, takes=(op_of(Step).timeout or 0.0) + seconds)
             for name, frame in (reply.cameras or {}).items():
                 if name in missing and (frame.frame_id or 0) >= (reply.frame_id or 0):
                     view = missing.pop(name)

@@ -15,7 +15,7 @@ from urlab_client.protocol.enums import LATER_MODE_NAMES, StepMode, known
 from urlab_client.protocol.errors import BadMode, ModeLocked
 from urlab_client.protocol.messages.runtime import SetMode, SetModeOk, SetPaused
 
-__all__ = ["ask_mode", "promote", "settle_mode", "stopped_live"]
+__all__ = ["ask_mode", "learn_mode", "promote", "settle_mode", "stopped_live"]
 
 
 log: logging.Logger = logging.getLogger("urlab_client.client")
@@ -104,6 +104,31 @@ async def stopped_live(state: SimState, turn: Turn) -> AsyncGenerator[None]:
             await _request(turn, mode)
             await turn.call(SetPaused(paused=_rests(state)))
         state.pending.mode, state.pending.paused = None, False
+
+
+async def learn_mode(state: SimState, turn: Turn) -> None:
+    """Find out in which step mode time stands still, which only a change of mode tells: to live mode, paused, and back.
+
+    The client's state takes it over; a mode without a name here stays an assumption.
+
+    Raises:
+        ModeLocked: The project pins another mode than live.
+    """
+    with anyio.CancelScope(shield=True):  # its requests have deadlines
+        await turn.call(SetPaused(paused=True))  # before: entering live mode does not pause
+        previous: StepMode | str = StepMode.LIVE
+        try:
+            previous = known(StepMode, (await _request(turn, StepMode.LIVE)).previous_mode)
+        except ModeLocked as locked:
+            if locked.pinned is not StepMode.LIVE:
+                await turn.call(SetPaused(paused=False))
+                raise
+        if previous is not StepMode.LIVE:
+            await _request(turn, previous)
+        if isinstance(previous, StepMode):
+            state.mode = previous
+        if state.mode is not StepMode.LIVE:
+            await turn.call(SetPaused(paused=_rests(state)))
 
 
 async def _still_puppet(turn: Turn, previous: StepMode, current: StepMode) -> None:

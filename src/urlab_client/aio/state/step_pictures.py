@@ -11,19 +11,26 @@ import logging
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Final
 
+from urlab_client.aio.live.camera_source import FIRST_PICTURE_S
 from urlab_client.protocol.enums import CameraTiming
 from urlab_client.protocol.messages.session import CameraFrame, Step, StepOk
 
 if TYPE_CHECKING:
+    from urlab_client.aio.cameras import URLabCameraView
     from urlab_client.aio.state.sim_state import SimState
     from urlab_client.aio.turn import Turn
 
-__all__ = ["StepPictures"]
+__all__ = ["StepPictures", "first_picture_s"]
 
 log: logging.Logger = logging.getLogger("urlab_client.client")
 
 _BLOCKING_S: Final = 3.0  # an alpha waits up to 2 s + 1 s for each picture
 _RENDER_S: Final = 5.0
+
+
+def first_picture_s(views: Iterable[URLabCameraView]) -> float:
+    """Return how long a server may look for OpenGL before it draws: 0 where each camera has shown something."""
+    return 0.0 if all(view.pictures.came for view in views) else FIRST_PICTURE_S
 
 
 class StepPictures:
@@ -70,6 +77,11 @@ class StepPictures:
     @property
     def seconds(self) -> float:
         """How long the server may take for them, besides the step itself."""
+        views = [view for name in self._wanted if (view := self._state.objects.camera(name)) is not None]
+        return self._drawing_s + first_picture_s(views)
+
+    @property
+    def _drawing_s(self) -> float:
         if not self._sync:
             return 0.0
         return _RENDER_S if self._features.renders_sync else _BLOCKING_S * len(self._sync)
@@ -137,7 +149,7 @@ class StepPictures:
         streams.needed = True
         if not self._listening:
             self._listen(late)
-        found = await streams.pictures(late, reply.frame_id, turn.deadline(self.seconds))
+        found = await streams.pictures(late, reply.frame_id, turn.deadline(self._drawing_s))
         if found:
             reply.cameras = {**frames, **found}
 

@@ -20,8 +20,9 @@ from urlab_client.aio.transport.mapped_region import RegionInUse
 from urlab_client.aio.transport.poller import ReplyPoll
 from urlab_client.aio.transport.region_channel import SYNC_PREFIX, RegionChannel, envelope_of, opening_of
 from urlab_client.aio.transport.server_regions import SharedMemoryRegions
+from urlab_client.aio.transport.shm_way import way_of
 from urlab_client.protocol import doorbell
-from urlab_client.protocol.base import Effect, Needs, Op
+from urlab_client.protocol.base import Effect, Op
 from urlab_client.protocol.errors import (
     ClientClosed,
     ConnectionLost,
@@ -31,7 +32,7 @@ from urlab_client.protocol.errors import (
     URLabError,
     URLabTimeoutError,
 )
-from urlab_client.protocol.messages.session import HelloOk, StateReply
+from urlab_client.protocol.messages.session import HelloOk
 from urlab_client.protocol.messages.streams import ClientEvent, ServerLost
 from urlab_client.protocol.shm import REPLY_FILE, REQUEST_FILE, RegionNotReady
 
@@ -39,10 +40,6 @@ __all__ = ["ShmTransport"]
 
 log: logging.Logger = logging.getLogger("urlab_client.transport")
 
-# Replies that grow with what happens in the scene, whatever size they had before.
-_UNBOUNDED = frozenset({"hello", "meta", "get_contacts", "list_keyframes", "replay_list_sessions"})
-# Pieces are larger than slots, and one that was executed without an answer may not be sent again.
-_UPLOADS = frozenset({"upload_model_manifest", "upload_model_chunk", "upload_model_commit"})
 # A reply may be so many times larger than the largest one of its kind seen before.
 _GROWTH = 8
 
@@ -161,25 +158,32 @@ class ShmTransport:
         self, frame: bytes, op: Op, *, deadline: float | None, connect_by: float | None, late: LateReply | None = None
     ) -> bytes:
         """See `RequestTransport.request`. Where late replies come is told of what goes over ZMQ, as handshakes do."""
-        detour = self._detour(frame, op)
+        way = way_of(op)
+        pictures = way.pictures and b"include_cameras" in frame
+        detour = way.detour or ("pictures" if pictures else self._refused.get(op.name, ""))
         channel = None
         if not detour:
-            channel = self._usable_channel()
+            loop = asyncio.get_running_loop()
+            now = loop.time()
+            channel = self._usable_channel(now)
             if channel is None:
                 detour = self._obstacle
             elif len(frame) > channel.limit:
                 detour = "request too large"
-            elif issubclass(op.reply, StateReply) and not 0 < self._largest_state * _GROWTH <= channel.limit:
+            elif way.state and not 0 < self._largest_state * _GROWTH <= channel.limit:
                 detour = "reply may be too large" if self._largest_state else "size of the reply not known yet"
-        if channel is not None and not detour:
-            answer = await self._over_shm(channel, frame, op, deadline)
-            detour = self._refusal(answer, op)
-            if not detour:
-                self._learn(frame, op, answer)
-                return answer
+            else:
+                pending = _Pending(op, loop.create_future(), now, deadline)
+                answer = await self._over_shm(channel, frame, pending, loop)
+                detour = self._refusal(answer, op)
+                if not detour:
+                    if way.state and len(answer) > self._largest_state:
+                        self._largest_state = len(answer)
+                    return answer
         self.stats.over_zmq[detour] = self.stats.over_zmq.get(detour, 0) + 1
         answer = await self._inner.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
-        self._learn(frame, op, answer)
+        if way.state and not pictures:
+            self._largest_state = max(self._largest_state, len(answer))
         return answer
 
     async def aclose(self) -> None:
@@ -196,24 +200,8 @@ class ShmTransport:
 
     # Which way
 
-    def _detour(self, frame: bytes, op: Op) -> str:
-        """Return why a request cannot go over shared memory, whatever its state; empty if it can."""
-        if op.needs is Needs.EDITOR:
-            return "editor op"
-        if op.ns == "scene":
-            return "upload"  # its chunks and its reply outgrow a slot
-        if op.name in _UNBOUNDED:
-            return "handshake" if op.needs is Needs.NOTHING else "reply may be too large"
-        if op.name in _UPLOADS:
-            return "upload"
-        if op.name == "step" and b"include_cameras" in frame:
-            return "pictures"
-        return self._refused.get(op.name, "")
-
-    def _usable_channel(self) -> RegionChannel | None:
+    def _usable_channel(self, now: float) -> RegionChannel | None:
         """Return the channel if it may be used right now."""
-        loop = asyncio.get_running_loop()
-        now = loop.time()
         if self._closed or self._pending is not None:
             self._obstacle = "busy"
             return None
@@ -231,7 +219,7 @@ class ShmTransport:
                 self._put_off(error)
                 return None
         self._used_at = now
-        if not self._is_clean(channel):
+        if channel.dirty and not self._is_clean(channel):
             if self._channel is not None:
                 self._obstacle = "waiting for an old reply"
             return None
@@ -286,15 +274,13 @@ class ShmTransport:
                 return ""
         return self._refused.get(op.name, "")
 
-    def _learn(self, frame: bytes, op: Op, answer: bytes) -> None:
-        if issubclass(op.reply, StateReply) and b"include_cameras" not in frame:
-            self._largest_state = max(self._largest_state, len(answer))
-
     # Over shared memory
 
-    async def _over_shm(self, channel: RegionChannel, frame: bytes, op: Op, deadline: float | None) -> bytes:
-        loop = asyncio.get_running_loop()
-        pending = self._pending = _Pending(op, loop.create_future(), loop.time(), deadline)
+    async def _over_shm(
+        self, channel: RegionChannel, frame: bytes, pending: _Pending, loop: asyncio.AbstractEventLoop
+    ) -> bytes:
+        op, deadline = pending.op, pending.deadline
+        self._pending = pending
         # Until the reply is here, whatever ends the wait leaves one that is still to come.
         channel.dirty = True
         try:
@@ -315,7 +301,8 @@ class ShmTransport:
                     self._glances = loop.call_later(_GLANCE_S, self._glance, loop)
             answer = await pending.future
         finally:
-            self._unwatch()
+            if pending.watch is not None:
+                self._unwatch()
             self._pending = None
             self._used_at = loop.time()
         channel.dirty = False

@@ -35,6 +35,11 @@ class BlockingTwin(Generic[F]):
         self._aio = aio
         self._portal = portal
 
+    @property
+    def aio(self) -> F:
+        """The async twin."""
+        return self._aio
+
     def __enter__(self) -> Self:
         self._portal.call(self._aio.__aenter__)
         return self

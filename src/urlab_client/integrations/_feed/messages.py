@@ -6,7 +6,7 @@ named `urlab.*` are this project's and can be plotted there.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 from msgspec import Struct
@@ -20,11 +20,13 @@ __all__ = [
     "ContactMessage",
     "ContactsMessage",
     "EntityMessage",
+    "EpisodeOutcome",
     "FrameTransform",
     "FrameTransforms",
     "GapMessage",
     "JointState",
     "JointStates",
+    "OutcomeMessage",
     "Quaternion",
     "RawImage",
     "Time",
@@ -70,6 +72,10 @@ class Quaternion(Struct, frozen=True):
     y: float
     z: float
     w: float
+
+
+EpisodeOutcome = Literal["success", "failure", "discarded"]
+"""What became of an episode."""
 
 
 class ArticulationMessage(Struct, kw_only=True, omit_defaults=True):
@@ -220,6 +226,22 @@ class EpisodeMessage(Struct, frozen=True):
     varied: list[VariedQuantity]
 
 
+class OutcomeMessage(Struct, frozen=True):
+    """What became of an episode, as whoever drove it judged; the last message of an episode counts.
+
+    Attributes:
+        timestamp: Time of the recording's clock.
+        episode: Number of resets before.
+        outcome: `success`, `failure` or `discarded`.
+        goal: What the episode was about, by name.
+    """
+
+    timestamp: Time
+    episode: int
+    outcome: EpisodeOutcome
+    goal: dict[str, list[float]]
+
+
 class GapMessage(Struct, frozen=True):
     """What was dropped since the previous message of this kind, because the file could not be written fast enough."""
 
@@ -235,6 +257,7 @@ _URLAB: dict[type[Struct], str] = {
     ContactsMessage: "urlab.Contacts",
     EpisodeMessage: "urlab.Episode",
     GapMessage: "urlab.Gap",
+    OutcomeMessage: "urlab.EpisodeOutcome",
 }
 
 

@@ -7,14 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from urlab_client.integrations._feed.messages import CompressedImage, RawImage, Time
+from urlab_client.integrations._feed.messages import CompressedImage, EpisodeOutcome, RawImage, Time
 from urlab_client.integrations._feed.scene_messages import CameraLayout, SceneMessages
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraFrame, StateReply
 from urlab_client.protocol.messages.streams import StateSnapshot
+from urlab_client.protocol.picture_files import pillow_image
 from urlab_client.protocol.pixels import Pixels, decode_camera
 
-__all__ = ["CameraPicture", "SampleClock", "Schedule", "State", "compressed", "picture_message"]
+__all__ = ["CameraPicture", "EpisodeMark", "SampleClock", "Schedule", "State", "compressed", "picture_message"]
 
 _FALLBACK_NS = 1_000_000
 
@@ -53,6 +54,15 @@ class CameraPicture:
         if isinstance(frame, CameraFrame):
             return decode_camera(frame.data, self.camera.view.mode, frame.width, frame.height).pixels
         return frame
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeMark:
+    """What became of the episode that the last state before it belongs to."""
+
+    outcome: EpisodeOutcome
+    goal: dict[str, list[float]]
+    wall_ns: int
 
 
 class Schedule:
@@ -111,13 +121,8 @@ class SampleClock:
 
 def compressed(pixels: Pixels, mode: str, jpeg_quality: int | None) -> bytes:
     """Return a picture of bytes as JPEG, or as PNG without a quality."""
-    from PIL import Image  # noqa: PLC0415  # whoever shows poses alone does without
-
     target = io.BytesIO()
-    if mode == CameraMode.REAL:
-        image = Image.fromarray(np.ascontiguousarray(pixels[..., :3]))
-    else:
-        image = Image.fromarray(np.ascontiguousarray(pixels[..., [2, 1, 0, 3]]))
+    image = pillow_image(pixels, mode, alpha=mode != CameraMode.REAL)
     if jpeg_quality is not None:
         image.save(target, "JPEG", quality=jpeg_quality)
     else:

@@ -35,6 +35,7 @@ from urlab_client.integrations.gym.task import (
 )
 from urlab_client.integrations.gym.threaded_batch import ThreadedBatch
 from urlab_client.integrations.gym.vectorized import Floats, Found, Indices, Vectorized, check_render_mode
+from urlab_client.integrations.gym.warp_batch import WarpBatch
 from urlab_client.protocol.enums import ControllerKind
 from urlab_client.protocol.errors import UnknownKeyframe, URLabError
 from urlab_client.protocol.names import compiled_names
@@ -78,6 +79,8 @@ class URLabBatchEnv(Vectorized):
         randomise: Randomisation | str | os.PathLike[str] | None = None,
         autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
         n_threads: int = 0,
+        engine: Literal["mujoco", "warp"] = "mujoco",
+        engine_options: Mapping[str, int] = MappingProxyType({}),
         client_options: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
         """Fetch the scene and make the batch.
@@ -98,15 +101,24 @@ class URLabBatchEnv(Vectorized):
             task: See `URLabEnv`. One object serves all environments.
             randomise: See `URLabEnv`. Latency of cameras is without effect: a batch observes none.
             autoreset_mode: `NEXT_STEP`, `SAME_STEP` or `DISABLED`.
-            n_threads: Threads that step, the caller's included; 0 for one per processor.
+            n_threads: Threads that step, the caller's included; 0 for one per processor. Of no effect with `warp`.
+            engine: What steps: `mujoco`, on processors, in float64, bit for bit as servers do; `warp`, MuJoCo Warp, in
+                float32, on an NVIDIA GPU where there is one. Resets are MuJoCo's own with both.
+            engine_options: For `warp`: `contacts` and `constraints`, the most of one copy at one time, for which its
+                arrays have room.
             client_options: Further options of the client that fetches the scene.
 
         Raises:
-            URLabError: The scene cannot be fetched.
-            ValueError: An option out of range.
+            URLabError: The scene cannot be fetched, or MuJoCo Warp has not what it uses.
+            MissingExtra: `engine` needs an extra that is not installed.
+            ValueError: An option out of range, or a model that varies, with `warp`.
         """
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, not {num_envs}")
+        if engine not in ("mujoco", "warp"):
+            raise ValueError(f"engine is 'mujoco' or 'warp', not {engine!r}")
+        if unknown := engine_options.keys() - ({"contacts", "constraints"} if engine == "warp" else set[str]()):
+            raise ValueError(f"engine_options of {engine} cannot have {', '.join(sorted(unknown))}")
         check_render_mode(render_mode)
         check_alone(task, reward_fn=reward_fn, termination_fn=termination_fn)
         settings = EpisodeSettings.of(
@@ -147,7 +159,11 @@ class URLabBatchEnv(Vectorized):
         self.render_mode = render_mode
         self._render_camera = render_camera
         self._pictures: BatchPictures | None = None
-        self._batch = (batch_class() or ThreadedBatch)(model, num_envs, n_threads)
+        self._batch: Any = (
+            WarpBatch(model, num_envs, **engine_options)
+            if engine == "warp"
+            else (batch_class() or ThreadedBatch)(model, num_envs, n_threads)
+        )
         # Bound before the first call: a derived field is computed only where somebody looks at it.
         self._arrays = {name: self._batch.bind(name) for name in _BOUND}
         self._prefixes = prefixes
@@ -198,11 +214,11 @@ class URLabBatchEnv(Vectorized):
         if pictures is not None:
             pictures.close()
 
-    def _reset_and_step(self, fresh: Indices, acting: Indices, actions: Any) -> tuple[Found, Found]:
+    def _reset_and_step(self, fresh: Indices, acting: Indices, set_points: Mapping[str, Floats]) -> tuple[Found, Found]:
         nothing: Found = (None, {})
         return (
             self._reset_some(fresh, self._keyframe) if len(fresh) else nothing,
-            self._step_some(acting, actions) if len(acting) else nothing,
+            self._step_some(acting, set_points) if len(acting) else nothing,
         )
 
     def _reset_some(self, indices: Indices, keyframe: str | None) -> Found:
@@ -233,10 +249,10 @@ class URLabBatchEnv(Vectorized):
         self._step_count[indices] = 0
         return self._observe(indices), {}
 
-    def _step_some(self, indices: Indices, actions: Any) -> Found:
+    def _step_some(self, indices: Indices, set_points: Mapping[str, Floats]) -> Found:
         ctrl = self._arrays["ctrl"]
         targets: dict[str, NDArray[Any]] = {}
-        for key, values in self.mapping.set_points(actions).items():
+        for key, values in set_points.items():
             controller = self._controllers.get(key)
             if controller is None or not controller.active:
                 ctrl[np.ix_(indices, self.mapping.layout(key).ctrl_adr)] = values[indices]

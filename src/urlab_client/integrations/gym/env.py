@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
@@ -18,7 +19,9 @@ from urlab_client.integrations.gym.spaces import Observation, SpaceMapping, Spac
 from urlab_client.integrations.gym.starts import ResetNoise
 from urlab_client.integrations.gym.task import EpisodeSettings, Task, check_alone
 from urlab_client.protocol.base import Floats
+from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.names import NameMap
+from urlab_client.protocol.pixels import without_alpha
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.articulation import URLabArticulation, URLabEntity
@@ -100,13 +103,15 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
             keyframe: Where episodes start, unless `reset` names another one; the initial state by default.
             task: What the robot is to do: where episodes start, after `keyframe` and `reset_noise`, rewards and ends.
             randomise: What varies from episode to episode, and what disturbs sensors and actuators: a
-                `Randomisation`, or its TOML file. Quantities of the model need a server that varies them; see
-                `connect`. What the server says that it varies, for None.
+                `Randomisation`, or its TOML file. Most quantities of the model need a server that varies them; see
+                `connect`. On another one gravity, the start, and gains of PD controllers vary by ops, until `close()`.
+                What the server says that it varies, for None.
             owns_client: Close the client with the environment.
 
         Raises:
-            URLabError: The client has no model, no articulation, or is in live mode, or the server does not vary
-                what `randomise` does.
+            URLabError: The client has no model, no articulation, or is in live mode, or the server varies something
+                else than `randomise` does.
+            UnsupportedRandomisation: The server varies nothing by itself, and has no op for what `randomise` varies.
             KeyError: An unknown camera, or body to push.
             ValueError: An option out of range, or rendering of a scene without a camera.
         """
@@ -255,10 +260,12 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         frame = self._episode.frames.get(self._rendered[0])
         if frame is None:
             raise gymnasium.error.ResetNeeded("call reset() before render()")
-        return np.array(frame[..., :3], dtype=np.uint8)
+        return without_alpha(frame)
 
     def close(self) -> None:
-        """Close the client, if it was made for this environment."""
+        """Close the client, if it was made for this environment; put back what this one varied on its server."""
+        with contextlib.suppress(URLabError):  # the client may be closed already
+            portal_of(self.client).call(self._episode.close)
         if self._owns_client:
             self.client.close()
         super().close()

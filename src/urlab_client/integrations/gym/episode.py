@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fnmatch
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
@@ -17,12 +18,13 @@ from urlab_client.aio.client import URLabClient
 from urlab_client.integrations._varied import variation_of
 from urlab_client.integrations.gym.spaces import LEVELS, Field, Observation, Space, SpaceMapping, dict_space
 from urlab_client.integrations.gym.task import EpisodeSettings, Start, States, Task, TaskScene, add_observed, with_task
+from urlab_client.integrations.gym.wire_variation import WireVariation
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.enums import CameraMode, ObservationLevel, StepMode
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.cameras import CameraDelay
 from urlab_client.protocol.messages.session import StepOk
-from urlab_client.protocol.pixels import Pixels
+from urlab_client.protocol.pixels import Pixels, without_alpha
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.randomise.variation import EpisodeDraws, declared_in
 from urlab_client.sync.client import URLabClient as BlockingClient
@@ -62,6 +64,7 @@ class EnvEpisode:
         observation_space: That of the mapping, with `cameras` added where there are any.
         frames: The last frames by camera, as they were asked for.
         randomise: What varies from episode to episode, or None.
+        over_wire: How that varies on a server that varies nothing by itself, or None.
     """
 
     def __init__(
@@ -72,6 +75,7 @@ class EnvEpisode:
         rendered: Sequence[str],
         task: Task | None = None,
         randomise: Randomisation | None = None,
+        earlier: EnvEpisode | None = None,
     ) -> None:
         """Describe the episodes of a client.
 
@@ -81,9 +85,11 @@ class EnvEpisode:
             rendered: Further cameras whose frames are to be in `frames`.
             task: What chooses the start, and adds to observations; set up here if it is not yet.
             randomise: What varies from episode to episode; what the server says that it varies, for None.
+            earlier: That of an earlier client of the server, in whose place this one is.
 
         Raises:
-            URLabError: The client has no model, no articulation, or is in live mode, or the server cannot vary that.
+            URLabError: The client has no model, no articulation, or is in live mode, or the server varies otherwise.
+            UnsupportedRandomisation: The server varies nothing by itself, and no op does that.
             KeyError: An unknown camera.
             ValueError: An option out of range.
         """
@@ -120,6 +126,11 @@ class EnvEpisode:
         self.randomise: Randomisation | None = _in_force(client, model, randomise)
         layouts = {key: self.mapping.layout(key) for key in self.mapping.keys}
         self._variation = variation_of(client, model, layouts)
+        self.over_wire: WireVariation | None = None
+        if self._variation is None and self.randomise is not None and self.randomise.vary:
+            before = None if earlier is None else earlier.over_wire
+            self.over_wire = WireVariation(client, model, layouts, self.randomise, before)
+            self._variation = self.over_wire.variation
         latencies = () if self.randomise is None else self.randomise.camera
         self._latencies = {
             name: late for late in latencies for name in self._cameras if fnmatch.fnmatchcase(name, late.camera)
@@ -164,15 +175,27 @@ class EnvEpisode:
             articulation.ctrl_array[:] = 0.0
         if self._variation is not None and seed is not None:
             self._draws = self._variation.draw(seed)
+            if self.over_wire is not None:
+                await self.over_wire.apply(self._draws)
         await client.reset(keyframe, seed)
+        placed = await self._start_over_wire()
         overrides = self._noisy_positions(rng) if self._noise else None
-        if overrides:
+        if overrides and self.over_wire is None:
             await client.reset(keyframe, seed, overrides)
-        placed = await self._start_task(rng)
+        elif overrides:  # another reset would undo the start
+            placed |= await self._place_joints(overrides)
+            overrides = None
+        placed |= await self._start_task(rng)
         if self._cameras:
             await self._delay_cameras(seed)
             await self._look(keyframe, seed, overrides, placed)
         return self._observe()
+
+    async def close(self) -> None:
+        """Leave a server that does not vary by itself as it was; nothing where it is gone."""
+        if self.over_wire is not None and self._draws is not None:
+            with contextlib.suppress(URLabError):
+                await self.over_wire.undo()
 
     async def step(self, action: Any, forces: Mapping[str, Floats] = MappingProxyType({})) -> Observation:
         """Apply an action for `n_substeps` and return the observation after it.
@@ -184,7 +207,11 @@ class EnvEpisode:
         Raises:
             ValueError: The action does not fit; nothing was sent.
         """
-        for key, values in self.mapping.set_points(action).items():
+        return await self.act(self.mapping.set_points(action), forces)
+
+    async def act(self, set_points: Mapping[str, Floats], forces: Mapping[str, Floats]) -> Observation:
+        """Do what `step` does, given the set-points of each articulation, shape (n_ctrl,)."""
+        for key, values in set_points.items():
             self.client.articulations[key].ctrl_array[:] = values
         for body, force in forces.items():
             articulation, name = self._pushed(body)
@@ -215,11 +242,37 @@ class EnvEpisode:
         start = Start(task.scene, np.array(data.qpos))
         task.reset(rng, start)
         self._goal = start.goal
+        return await self._place_changed(start.qpos)
+
+    async def _start_over_wire(self) -> dict[str, Floats]:
+        """Vary the start where the server does not; return the positions of each articulation that moved."""
+        data = self.client.data
+        if self.over_wire is None or self._draws is None or data is None:
+            return {}
+        qpos = np.array(data.qpos)
+        self.over_wire.start(self._draws, qpos)
+        return await self._place_changed(qpos)
+
+    async def _place_joints(self, positions: Mapping[str, Mapping[str, float]]) -> dict[str, Floats]:
+        """Put hinge and slide joints somewhere; return the positions of each articulation that moved."""
+        data = self.client.data
+        if data is None:
+            return {}
+        qpos = np.array(data.qpos)
+        for key, by_name in positions.items():
+            joints = self.mapping.layout(key).joints
+            for name, position in by_name.items():
+                qpos[self._model.jnt_qposadr[joints[name]]] = position
+        return await self._place_changed(qpos)
+
+    async def _place_changed(self, qpos: Floats) -> dict[str, Floats]:
+        """Place the articulations whose part of the positions of the scene differs; return their positions."""
+        data = self.client.data
         placed: dict[str, Floats] = {}
         for key in self.mapping.keys:
             address = self.mapping.layout(key).qpos_adr
-            if not np.array_equal(start.qpos[address], data.qpos[address]):
-                placed[key] = start.qpos[address]
+            if data is not None and not np.array_equal(qpos[address], data.qpos[address]):
+                placed[key] = qpos[address]
         await self._place(placed)
         return placed
 
@@ -305,7 +358,7 @@ class EnvEpisode:
         frame = self.frames[name]
         if self._cameras[name].mode != CameraMode.REAL:
             return frame
-        return np.ascontiguousarray(frame[..., :3], dtype=np.uint8)
+        return without_alpha(frame)
 
     def _with_cameras(self, cameras: Sequence[str]) -> Space:
         mapping = self.mapping
@@ -340,16 +393,15 @@ def _in_force(client: URLabClient, model: mujoco.MjModel, randomise: Randomisati
     """Return what varies: as asked for, or as the server says.
 
     Raises:
-        URLabError: The server does not vary what is asked for.
+        URLabError: The server varies something else by itself.
     """
     declared = declared_in(model)
     if randomise is None:
         return declared
-    if declared != randomise and (declared is not None or randomise.vary):
-        does = "does not vary its scene" if declared is None else "varies its scene in another way"
+    if declared is not None and declared != randomise:
         raise URLabError(
-            f"The server at {client.address} {does}.",
-            hint="Use a sim:// address, or start it with `urlab serve --randomise FILE`.",
+            f"The server at {client.address} varies its scene in another way.",
+            hint="Leave `randomise` out, or start the server with `urlab serve --randomise FILE`.",
         )
     return randomise
 

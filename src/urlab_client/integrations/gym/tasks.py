@@ -13,7 +13,7 @@ from urlab_client.integrations.gym.shipped_tasks import FixedReach, Push, PushPi
 from urlab_client.integrations.gym.task import Task
 from urlab_client.integrations.gym.vector import URLabVectorEnv
 
-__all__ = ["TASKS", "make", "make_vec", "register"]
+__all__ = ["TASKS", "make", "make_endless", "make_vec", "register"]
 
 TASKS: Final[dict[str, type[Task]]] = {
     "urlab/Arm-v0": FixedReach,
@@ -41,7 +41,7 @@ def make(task_id: str, address: str | None = None, **options: Any) -> URLabEnv:
     return URLabEnv.connect(address or task.scene_address, task=task, **options)
 
 
-def _make_endless(task_id: str, **options: Any) -> URLabEnv:
+def make_endless(task_id: str, **options: Any) -> URLabEnv:
     """Make an environment that leaves it to Gymnasium to end episodes: `gymnasium.make(…, max_episode_steps=…)`."""
     return make(task_id, max_episode_steps=sys.maxsize, **options)
 
@@ -74,8 +74,9 @@ def register() -> None:
         if task_id not in gymnasium.registry:
             gymnasium.register(  # pyright: ignore[reportUnknownMemberType]  # its kwargs are a bare dict
                 task_id,
-                entry_point=_make_endless,
-                vector_entry_point=make_vec,
+                # As text, so that a specification can be stored: Minari keeps it with what it collects.
+                entry_point=f"{__name__}:{make_endless.__name__}",
+                vector_entry_point=f"{__name__}:{make_vec.__name__}",
                 max_episode_steps=task.max_episode_steps,
                 kwargs={"task_id": task_id},
             )

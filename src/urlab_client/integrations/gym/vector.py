@@ -26,6 +26,7 @@ from urlab_client.integrations.gym.task import EpisodeSettings, States, Task, ch
 from urlab_client.integrations.gym.vectorized import Found, Indices, Vectorized, check_render_mode
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.errors import URLabError
+from urlab_client.protocol.pixels import without_alpha
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.sync._portal import Portal
 
@@ -66,6 +67,7 @@ class _Session:
         self._episode_options = episode_options
         self._rendered = rendered
         self._opening: asyncio.Task[None] | None = None
+        self._earlier: EnvEpisode | None = None
 
     async def reset(
         self, rng: np.random.Generator, keyframe: str | None, seed: int | None, timeout: float
@@ -79,12 +81,12 @@ class _Session:
                 raise URLabError("The environment was closed.")
             return await self.episode.reset(rng, keyframe, seed)
 
-    async def step(self, action: Any, forces: Mapping[str, Floats], timeout: float) -> Observation:
+    async def step(self, set_points: Mapping[str, Floats], forces: Mapping[str, Floats], timeout: float) -> Observation:
         """Act."""
         if self.episode is None:
             raise URLabError("The environment failed before.", hint="Reset it, which starts it afresh.")
         async with asyncio.timeout(timeout):
-            return await self.episode.step(action, forces)
+            return await self.episode.act(set_points, forces)
 
     def reopen(self) -> asyncio.Task[None]:
         """Give up what there is, and begin to start a session in its place; whoever resets waits for that."""
@@ -98,6 +100,8 @@ class _Session:
         if self._opening is not None:
             self._opening.cancel()
             await asyncio.wait((self._opening,))
+        if self.episode is not None:
+            await self.episode.close()
         await self._close_client()
 
     async def open(self) -> None:
@@ -108,7 +112,8 @@ class _Session:
                 await client.discover()
                 wanted = self._rendered
                 shown = () if wanted is None else (wanted.camera or first_camera(client),)
-                self.episode = EnvEpisode(client, rendered=shown, **self._episode_options)
+                options = self._episode_options
+                self.episode = self._earlier = EnvEpisode(client, rendered=shown, earlier=self._earlier, **options)
                 self.shown = shown
             except BaseException:
                 await client.close()
@@ -270,7 +275,7 @@ class URLabVectorEnv(Vectorized):
         for i, session in enumerate(self._sessions):
             episode = session.episode
             if episode is not None and session.shown and session.shown[0] in episode.frames:
-                self._pictures[i] = np.array(episode.frames[session.shown[0]][..., :3], dtype=np.uint8)
+                self._pictures[i] = without_alpha(episode.frames[session.shown[0]])
         if not self._pictures:
             raise gymnasium.error.ResetNeeded("call reset() before render()")
         black = np.zeros_like(next(iter(self._pictures.values())))
@@ -303,15 +308,17 @@ class URLabVectorEnv(Vectorized):
         }
         return self._found(self._portal.call(self._all, calls))
 
-    def _reset_and_step(self, fresh: Indices, acting: Indices, actions: Any) -> tuple[Found, Found]:
-        each = list(iterate(self.action_space, actions))
+    def _reset_and_step(self, fresh: Indices, acting: Indices, set_points: Mapping[str, Floats]) -> tuple[Found, Found]:
         timeout, sessions = self._step_timeout, self._sessions
         resets = {
             i: partial(sessions[i].reset, self._rngs[i], self._keyframe, self._episode_seed(i), timeout)
             for i in map(int, fresh)
         }
         forces = self._forces(acting)
-        steps = {i: partial(sessions[i].step, each[i], forces.get(i, {}), timeout) for i in map(int, acting)}
+        steps = {
+            i: partial(sessions[i].step, {key: of[i] for key, of in set_points.items()}, forces.get(i, {}), timeout)
+            for i in map(int, acting)
+        }
         results = self._portal.call(self._all, {**resets, **steps})
         return self._found({i: results[i] for i in resets}), self._found({i: results[i] for i in steps})
 

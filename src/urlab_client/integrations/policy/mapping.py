@@ -19,6 +19,7 @@ from urlab_client.integrations.policy.spec import (
     AngularVelocity,
     BaseHeight,
     CommandTerm,
+    GoalTerm,
     Gravity,
     JointPosition,
     JointVelocity,
@@ -154,6 +155,7 @@ class _Moment(NamedTuple):
     command: Floats
     last_action: Floats
     time: float
+    goal: Floats
 
 
 _Read = Callable[[_Moment], Floats]
@@ -199,6 +201,7 @@ class PolicyMapping:
         self.action_size: int = len(self.joints)
         self._qpos, self._qvel = _offsets(self.joints)
         self._scale, self._offset = _array(spec.action.scale), _array(spec.action.offset)
+        self._sensor_names: dict[str, str] = {}
         self._terms: list[tuple[_Read, Term]] = []
         self.observation_size: int = 0
         for index, term in enumerate(spec.observation):
@@ -215,7 +218,9 @@ class PolicyMapping:
         spread = self._joints(robot, spec.reward.spread_joints if spec.reward else [], "reward.spread_joints")
         self._spread = _offsets(spread)[0]
 
-    def observe(self, state: RobotState, command: Floats, last_action: Floats, time: float) -> Floats:
+    def observe(
+        self, state: RobotState, command: Floats, last_action: Floats, time: float, goal: Floats | None = None
+    ) -> Floats:
         """Return one observation, shape (…, observation_size).
 
         Args:
@@ -223,8 +228,9 @@ class PolicyMapping:
             command: (vx, vy, yaw rate), shape (…, 3).
             last_action: The last output after clipping, shape (…, action_size).
             time: Seconds since the start.
+            goal: What to reach, shape (…, n_goal); the declaration's default for None.
         """
-        moment = _Moment(state, command, last_action, time)
+        moment = _Moment(state, command, last_action, time, self.default_goal if goal is None else goal)
         parts: list[Floats] = []
         for read, term in self._terms:
             part = (read(moment) - _array(term.offset)) * _array(term.scale)
@@ -259,6 +265,17 @@ class PolicyMapping:
             name: dict(zip(names, np.broadcast_to(_array(value), self.action_size).tolist(), strict=True))
             for name, value in values.items()
         }
+
+    @property
+    def default_goal(self) -> Floats:
+        """The declared goal, shape (n_goal,); empty without one."""
+        return np.zeros(0) if self.spec.goal is None else np.array(self.spec.goal.default)
+
+    def goal_error(self, state: RobotState, goal: Floats) -> Floats | None:
+        """Return the distance from the goal, by the first goal term that is relative to a sensor; None without one."""
+        measured = [term.relative_to for term in self.spec.observation if isinstance(term, GoalTerm)]
+        name = next(filter(None, measured), None)
+        return None if name is None else np.linalg.norm(goal - state.sensors[self._sensor_names[name]], axis=-1)
 
     def fallen(self, state: RobotState) -> NDArray[np.bool_]:
         """Whether the robot has fallen, shape (…)."""
@@ -297,19 +314,33 @@ class PolicyMapping:
                 _, qvel = _offsets(self._joints(robot, term.joints, f"{where}.joints") or self.joints)
                 return len(qvel), lambda moment: moment.state.qvel[..., qvel]
             case SensorTerm():
-                sensor = robot.sensors.get(term.sensor)
-                if sensor is None:
-                    raise self._misfit(f"{where}.sensor", _unknown("sensor", term.sensor, robot.prefix, robot.sensors))
+                sensor = self._sensor(robot, term.sensor, f"{where}.sensor")
                 name = sensor.name
                 return sensor.dim, lambda moment: moment.state.sensors[name]
-            case LastAction():
-                return self.action_size, lambda moment: moment.last_action
-            case PhaseClock() | CommandTerm():
-                return _free_term(term)
+            case GoalTerm():
+                return self._goal_term(robot, term, where)
+            case PhaseClock() | CommandTerm() | LastAction():
+                return _free_term(term, self.action_size)
             case _:
                 if not self._has_base:
                     raise self._misfit(where, f"needs a free base; {robot.prefix!r} has none")
                 return _base_term(term)
+
+    def _goal_term(self, robot: PolicyRobot, term: GoalTerm, where: str) -> tuple[int, _Read]:
+        size = len(self.default_goal)
+        if not term.relative_to:
+            return size, lambda moment: moment.goal
+        sensor = self._sensor(robot, term.relative_to, f"{where}.relative_to")
+        if sensor.dim != size:
+            raise self._misfit(f"{where}.relative_to", f"{sensor.name!r} has {sensor.dim} numbers, the goal {size}")
+        name = self._sensor_names[term.relative_to] = sensor.name
+        return size, lambda moment: moment.goal - moment.state.sensors[name]
+
+    def _sensor(self, robot: PolicyRobot, name: str, where: str) -> Sensor:
+        sensor = robot.sensors.get(name)
+        if sensor is None:
+            raise self._misfit(where, _unknown("sensor", name, robot.prefix, robot.sensors))
+        return sensor
 
     def _joints(self, robot: PolicyRobot, names: Sequence[str], where: str) -> list[Joint]:
         found: list[Joint] = []
@@ -326,7 +357,9 @@ class PolicyMapping:
         return PolicyMismatch(f"{self._source}: {where}: {problem}.")
 
 
-def _free_term(term: PhaseClock | CommandTerm) -> tuple[int, _Read]:
+def _free_term(term: PhaseClock | CommandTerm | LastAction, action_size: int) -> tuple[int, _Read]:
+    if isinstance(term, LastAction):
+        return action_size, lambda moment: moment.last_action
     if isinstance(term, CommandTerm):
         return _COMMAND, lambda moment: moment.command
     rate = 2 * math.pi * term.hz

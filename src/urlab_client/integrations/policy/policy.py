@@ -39,6 +39,7 @@ class Policy:
         self.source = source
         self._network = network
         self._command: Floats = np.zeros(3) if spec.command is None else np.array(spec.command.default)
+        self._goal: Floats = np.zeros(0) if spec.goal is None else np.array(spec.goal.default)
         self._robot: PolicyRobot | None = None
         self._mapping: PolicyMapping | None = None
         self._targets: Floats = np.zeros(0)
@@ -66,6 +67,27 @@ class Policy:
                 f"not {given.tolist()}"
             )
         self._command = given
+
+    @property
+    def goal(self) -> Floats:
+        """The goal, as the declaration's table `goal` has it. May be assigned at any time.
+
+        Raises:
+            ValueError: On assigning another number of values, values it was not trained for, or any to a policy that
+                has none.
+        """
+        return self._goal.copy()
+
+    @goal.setter
+    def goal(self, values: Sequence[float] | Floats) -> None:
+        known = self.spec.goal
+        given = np.array(values, dtype=np.float64)
+        if known is None:
+            raise ValueError(f"{self.source} has no goal")
+        inside = given.shape == (len(known.default),) and np.all((given >= known.low) & (given <= known.high))
+        if not inside:
+            raise ValueError(f"a goal is from {known.low} to {known.high}, not {given.tolist()}")
+        self._goal = given
 
     @property
     def action(self) -> Floats:
@@ -118,7 +140,7 @@ class Policy:
         """
         mapping = self._mapping if robot is self._robot and self._mapping is not None else self.bind(robot)
         now = self._acted * self.spec.period if time is None else time
-        observation = mapping.observe(RobotState.of(robot), self._command, self._action, now)
+        observation = mapping.observe(RobotState.of(robot), self._command, self._action, now, self._goal)
         kept = self._history or [observation] * self.spec.history
         self._history = [*kept[1:], observation]
         output = self._network(np.concatenate(self._history))

@@ -49,6 +49,7 @@ class PolicyRun(Serializable, Struct):
         velocity_error: Root mean square of commanded minus actual horizontal velocity, m/s, base frame, smoothed over
             half a second.
         reward: Mean reward per action.
+        goal_error: Distance of a sensor from the goal at the end, in its unit; None where nothing measures it.
         late: Actions that came more than one period late, in live mode.
     """
 
@@ -64,6 +65,7 @@ class PolicyRun(Serializable, Struct):
     forward: float = 0.0
     velocity_error: float = 0.0
     reward: float = 0.0
+    goal_error: float | None = None
     late: int = 0
 
     @property
@@ -94,7 +96,7 @@ def require(client: AsyncClient, policy: Policy, articulation: str | None = None
     robot = client.articulations.get(name)
     if robot is None:
         raise PolicyMismatch(
-            f"{source}: robot: there is no articulation {name!r}; there are: {', '.join(client.articulations)}.",
+            f"{source}: robot: no articulation is called {name!r}; there are: {', '.join(client.articulations)}.",
             hint="Name one of them, by its key, actor id or class name.",
         )
     if client.step_mode not in spec.step_modes:
@@ -307,6 +309,8 @@ class _PolicyLoop:
             result.upright_time = result.sim_time
         self._rewards += float(self._mapping.reward(state, policy.command, policy.action, last_action))
         result.reward = self._rewards / result.actions
+        left = self._mapping.goal_error(state, policy.goal)
+        result.goal_error = None if left is None else float(left)
         if self._robot.has_free_base:
             way = state.qpos[:2] - self._start[:2]
             result.distance = self._travelled[0] + float(np.hypot(*way))

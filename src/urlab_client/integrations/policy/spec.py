@@ -25,6 +25,8 @@ __all__ = [
     "CommandTerm",
     "Fall",
     "Gains",
+    "Goal",
+    "GoalTerm",
     "Gravity",
     "JointPosition",
     "JointVelocity",
@@ -121,6 +123,16 @@ class CommandTerm(_Term, tag="command", kw_only=True, forbid_unknown_fields=True
     """The command (vx, vy, yaw rate), m/s and rad/s, base frame; 3 numbers. Needs the table `command`."""
 
 
+class GoalTerm(_Term, tag="goal", kw_only=True, forbid_unknown_fields=True, frozen=True):
+    """What the policy is to reach, such as a place in the world; as many numbers as the table `goal` has.
+
+    Attributes:
+        relative_to: Sensor whose reading is subtracted, so that the term is the way that is left; none if empty.
+    """
+
+    relative_to: str = ""
+
+
 class LastAction(_Term, tag="last_action", kw_only=True, forbid_unknown_fields=True, frozen=True):
     """The network's last output after clipping, zeros at the start; one number for each joint of the action."""
 
@@ -144,6 +156,7 @@ Term = (
     | JointVelocity
     | SensorTerm
     | CommandTerm
+    | GoalTerm
     | LastAction
     | PhaseClock
 )
@@ -219,6 +232,26 @@ class Command(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
             raise ValueError(f"default {list(self.default)} is not between low and high")
 
 
+class Goal(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
+    """The goals the network was trained for, in units and frame of its own: metres in the world's frame, for example.
+
+    Attributes:
+        default: Used when none is given.
+        low: Lowest of each number.
+        high: Highest of each number.
+    """
+
+    default: Annotated[list[float], Meta(min_length=1)]
+    low: list[float]
+    high: list[float]
+
+    def __post_init__(self) -> None:
+        if not len(self.default) == len(self.low) == len(self.high):
+            raise ValueError("default, low and high need the same number of numbers")
+        if not all(low <= value <= high for low, value, high in zip(self.low, self.default, self.high, strict=True)):
+            raise ValueError(f"default {self.default} is not between low and high")
+
+
 class Fall(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
     """When the robot has fallen, which ends an attempt.
 
@@ -280,6 +313,7 @@ class PolicySpec(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
         action: What the outputs mean.
         gains: Of the PD law; needed unless the action goes via `actuators`.
         command: Commands it understands; needed by the term `command`.
+        goal: Goals it can reach; needed by the term `goal`.
         fall: When it has fallen; never without.
         reward: What it was trained on, for the figures of a run.
     """
@@ -294,6 +328,7 @@ class PolicySpec(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
     action: Action
     gains: Gains | None = None
     command: Command | None = None
+    goal: Goal | None = None
     fall: Fall | None = None
     reward: TrackingReward | None = None
 
@@ -312,6 +347,8 @@ class PolicySpec(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
                 _check_numbers(f"gains.{name}", getattr(self.gains, name), len(self.action.joints))
         if self.command is None and (self.reward or any(isinstance(term, CommandTerm) for term in self.observation)):
             raise ValueError("the term 'command' and the table [reward] need the table [command]")
+        if self.goal is None and any(isinstance(term, GoalTerm) for term in self.observation):
+            raise ValueError("the term 'goal' needs the table [goal]")
 
     @property
     def period(self) -> float:
@@ -361,6 +398,7 @@ _TABLES: Final[dict[str, type[Struct]]] = {
     "action": Action,
     "gains": Gains,
     "command": Command,
+    "goal": Goal,
     "fall": Fall,
     "reward": TrackingReward,
 }

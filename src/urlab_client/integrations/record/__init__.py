@@ -7,13 +7,17 @@ from urlab_client._extras import need
 
 need("mcap", "PIL", extra="mcap")
 
+from urlab_client.integrations._feed.messages import EpisodeOutcome  # noqa: E402
 from urlab_client.integrations.record.reader import Camera, Run, Summary, Table, Topic, read_run  # noqa: E402
 from urlab_client.integrations.record.recorder import AsyncRecorder, Recorder, record  # noqa: E402
+from urlab_client.integrations.record.transitions import Episodes, transitions, transitions_of  # noqa: E402
 from urlab_client.integrations.record.writer import RecorderStats, RecordingError  # noqa: E402
 
 __all__ = [
     "AsyncRecorder",
     "Camera",
+    "EpisodeOutcome",
+    "Episodes",
     "Recorder",
     "RecorderStats",
     "RecordingError",
@@ -23,4 +27,6 @@ __all__ = [
     "Topic",
     "read_run",
     "record",
+    "transitions",
+    "transitions_of",
 ]

@@ -28,6 +28,12 @@ def main(work: Path) -> None:
         "observation.state": {"dtype": "float32", "shape": (len(plan["state"]),), "names": plan["state"]},
         "action": {"dtype": "float32", "shape": (len(plan["action"]),), "names": plan["action"]},
     }
+    if plan["goal"]:
+        features["observation.environment_state"] = {
+            "dtype": "float32",
+            "shape": (len(plan["goal"]),),
+            "names": plan["goal"],
+        }
     for i, name in enumerate(cameras):
         shape = np.array(Image.open(work / str(i) / "0.png")).shape
         features[f"observation.images.{name}"] = {
@@ -51,6 +57,8 @@ def main(work: Path) -> None:
             "action": arrays["action"][row],
             "task": plan["task"],
         }
+        if plan["goal"]:
+            frame["observation.environment_state"] = arrays["goal"][row]
         for i, name in enumerate(cameras):
             picture = work / str(i) / f"{arrays[f'picture{i}'][row]}.png"
             frame[f"observation.images.{name}"] = np.array(Image.open(picture))

@@ -19,7 +19,7 @@ from urlab_client._extras import need
 from urlab_client.integrations.record.lerobot_writer import write_lerobot
 from urlab_client.integrations.record.pixels import even, farthest, visible
 from urlab_client.integrations.record.reader import Run
-from urlab_client.integrations.record.transitions import transitions
+from urlab_client.integrations.record.transitions import Episodes, transitions_of
 from urlab_client.integrations.record.writer import RecordingError
 
 __all__ = ["write_csv", "write_lerobot", "write_mp4", "write_npz", "write_parquet"]
@@ -31,12 +31,12 @@ _TICK = Fraction(1, _TICKS)
 _CODECS = ("libx264", "mpeg4")
 
 
-def write_csv(run: Run, path: Path, progress: Progress | None = None) -> int:
+def write_csv(run: Run, path: Path, progress: Progress | None = None, *, episodes: Episodes = "kept") -> int:
     """Write observations and the actions taken at them, one column per value; return the number of rows.
 
-    Numbers read back to the same bits. See `transitions` for what is a row.
+    Numbers read back to the same bits. See `transitions` for what is a row, and `transitions_of` for `episodes`.
     """
-    flat = transitions(run.table(progress)).flat()
+    flat = transitions_of(run, only=episodes, progress=progress).flat()
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(flat)
@@ -72,10 +72,10 @@ def write_npz(run: Run, path: Path, cameras: Sequence[str] = (), progress: Progr
     return len(table)
 
 
-def write_parquet(run: Run, path: Path, progress: Progress | None = None) -> int:
+def write_parquet(run: Run, path: Path, progress: Progress | None = None, *, episodes: Episodes = "kept") -> int:
     """Write observations and the actions taken at them, one column per value; return the number of rows.
 
-    See `transitions` for what is a row.
+    See `transitions` for what is a row, and `transitions_of` for `episodes`.
 
     Raises:
         ImportError: The extra `dataset` is not installed.
@@ -84,7 +84,7 @@ def write_parquet(run: Run, path: Path, progress: Progress | None = None) -> int
     pa: Any = importlib.import_module("pyarrow")
     parquet: Any = importlib.import_module("pyarrow.parquet")
 
-    flat = transitions(run.table(progress)).flat()
+    flat = transitions_of(run, only=episodes, progress=progress).flat()
     parquet.write_table(pa.table(flat), path, compression="zstd")
     return len(flat["time"])
 

@@ -15,7 +15,7 @@ from PIL import Image
 
 from urlab_client.integrations.record.pixels import even, farthest, visible
 from urlab_client.integrations.record.reader import Run, Table
-from urlab_client.integrations.record.transitions import transitions
+from urlab_client.integrations.record.transitions import GOAL, Episodes, transitions_of
 from urlab_client.integrations.record.writer import RecordingError
 
 __all__ = ["write_lerobot"]
@@ -38,6 +38,7 @@ def write_lerobot(
     cameras: Sequence[str] | None = None,
     video: bool = True,
     max_picture_age: float | None = None,
+    episodes: Episodes = "kept",
     progress: Callable[[int], None] | None = None,
 ) -> int:
     """Write a LeRobot dataset with LeRobot itself, in an interpreter that has it; return the number of frames.
@@ -57,6 +58,7 @@ def write_lerobot(
         cameras: Cameras; all that were recorded by default.
         video: Store pictures as video, which loses some detail, rather than as PNG files.
         max_picture_age: Largest age of a picture beside its state, seconds; one frame by default.
+        episodes: Which episodes; see `transitions_of`. What they are about is in `observation.environment_state`.
         progress: Told now and then how many bytes have been read.
 
     Raises:
@@ -69,7 +71,7 @@ def write_lerobot(
         raise FileExistsError(f"{folder} exists: LeRobot makes the folder itself")
     _check(python)
     everything = run.table(progress)
-    table = transitions(everything)
+    table = transitions_of(run, only=episodes)
     names = run.cameras() if cameras is None else list(cameras)
     with tempfile.TemporaryDirectory(prefix="urlab-lerobot-") as temporary:
         work = Path(temporary)
@@ -81,9 +83,13 @@ def write_lerobot(
         limit = 1 / rate if max_picture_age is None else max_picture_age
         pictures = [_newest(run, name, when, table.time[rows], limit) for name, when in times.items()]
         state, action = _joined(table, "qpos"), _joined(table, "action")
+        goal = _goal(table)
+        if not np.isfinite(goal[1][rows]).all():
+            raise RecordingError(f"{run.path}: it is not known what some of its episodes were about.")
         arrays: dict[str, Any] = {
             "state": state[1][rows].astype(np.float32),
             "action": action[1][rows].astype(np.float32),
+            "goal": goal[1][rows].astype(np.float32),
             "episode": table.episode[rows],
             **{f"picture{i}": chosen for i, chosen in enumerate(pictures)},
         }
@@ -96,6 +102,7 @@ def write_lerobot(
             "robot_type": "+".join(robots) if robot_type is None else robot_type,
             "state": state[0],
             "action": action[0],
+            "goal": goal[0],
             "cameras": [name.replace("/", ".") for name in names],
             "video": video,
         }
@@ -204,6 +211,13 @@ def _newest(
             "--max-picture-age SECONDS.",
         )
     return chosen
+
+
+def _goal(table: Table) -> tuple[list[str], NDArray[np.float64]]:
+    chosen = {key.partition("/")[2]: column for key, column in table.columns.items() if key.startswith(f"{GOAL}/")}
+    names = [f"{key}.{name}" for key, column in chosen.items() for name in column.names]
+    values = [column.values for column in chosen.values()]
+    return names, np.concatenate(values, axis=1) if values else np.zeros((len(table), 0))
 
 
 def _joined(table: Table, field: str) -> tuple[list[str], NDArray[np.float64]]:

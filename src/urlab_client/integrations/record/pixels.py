@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.protocol.pixels import Pixels
+from urlab_client.protocol.pixels import Pixels, without_alpha
 
 __all__ = ["even", "farthest", "visible"]
 
@@ -21,7 +21,7 @@ def visible(pixels: Pixels, far: float) -> NDArray[np.uint8]:
     if pixels.dtype == np.float32:
         grey = np.clip(1.0 - np.nan_to_num(pixels, nan=far, posinf=far) / far, 0.0, 1.0)
         return np.repeat(np.rint(255 * grey).astype(np.uint8)[..., None], 3, axis=2)
-    return np.ascontiguousarray(pixels[..., :3], dtype=np.uint8)
+    return without_alpha(pixels)
 
 
 def even(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:

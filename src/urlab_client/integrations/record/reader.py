@@ -25,6 +25,7 @@ from urlab_client.integrations._feed.messages import (
     EntityMessage,
     EpisodeMessage,
     GapMessage,
+    OutcomeMessage,
     RawImage,
     schema_name,
 )
@@ -70,6 +71,7 @@ class _Entity(msgspec.Struct):
 _state = msgspec.json.Decoder(_State).decode
 _entity = msgspec.json.Decoder(_Entity).decode
 _episode = msgspec.json.Decoder(EpisodeMessage).decode
+_outcome = msgspec.json.Decoder(OutcomeMessage).decode
 _gap = msgspec.json.Decoder(GapMessage).decode
 _compressed = msgspec.json.Decoder(CompressedImage).decode
 _raw = msgspec.json.Decoder(RawImage).decode
@@ -113,6 +115,7 @@ class Summary:
         dropped_frames: Likewise pictures.
         topics: By name.
         varied: What the server varied, by episode.
+        outcomes: What became of the episodes that were marked.
     """
 
     path: Path
@@ -126,6 +129,7 @@ class Summary:
     dropped_frames: int
     topics: dict[str, Topic]
     varied: tuple[EpisodeMessage, ...] = ()
+    outcomes: tuple[OutcomeMessage, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,6 +253,7 @@ class Run:
         about: dict[str, str] = {}
         walls: list[int] = []
         varied: list[EpisodeMessage] = []
+        outcomes: dict[int, OutcomeMessage] = {}
         dropped = [0, 0]
         episode = -1
         complete = False
@@ -262,6 +267,9 @@ class Run:
                     dropped = [dropped[0] + gap.states, dropped[1] + gap.frames]
                 elif entry.schema == schema_name(EpisodeMessage):
                     varied.append(_episode(record.data))
+                elif entry.schema == schema_name(OutcomeMessage):
+                    outcome = _outcome(record.data)
+                    outcomes[outcome.episode] = outcome
                 elif entry.schema == schema_name(ArticulationMessage):
                     episode = _state(record.data).episode
             elif isinstance(record, Metadata) and record.name == "urlab":
@@ -281,6 +289,7 @@ class Run:
             dropped_frames=dropped[1],
             topics={name: describe_topic(name, schemas[name], times[name]) for name in sorted(times)},
             varied=tuple(varied),
+            outcomes=tuple(outcomes.values()),
         )
 
     def table(self, progress: Callable[[int], None] | None = None) -> Table:
@@ -360,13 +369,8 @@ class Run:
                 f"{self.path}: {key} changes its joints or actuators in the middle, which fits no one table.",
                 hint="Record each scene into a file of its own.",
             )
-        rows[state.sample] = (
-            record.log_time / _NS,
-            float(state.sim_time),
-            record.publish_time,
-            state.step,
-            state.episode,
-        )
+        times = record.log_time / _NS, float(state.sim_time), record.publish_time
+        rows[state.sample] = (*times, state.step, state.episode)
         if state.sensors and "sensors" not in builder.names:
             builder.names["sensors"] = [
                 name if len(reading) == 1 else f"{name}.{i}"
@@ -411,16 +415,12 @@ class Run:
                     record = next(records, None)
                 except InvalidMagic as error:
                     if not entries and not schemas and file.tell() <= 8:
-                        raise RecordingError(
-                            f"{self.path}: neither an MCAP file nor a recording of the server."
-                        ) from error
+                        raise RecordingError(f"{self.path}: {_UNKNOWN}") from error
                     self.damage = "the end of the file is missing"
                     return
                 except (McapError, ZstdError, struct.error, ValueError, OverflowError) as error:
                     if file.tell() < 8:
-                        raise RecordingError(
-                            f"{self.path}: neither an MCAP file nor a recording of the server."
-                        ) from error
+                        raise RecordingError(f"{self.path}: {_UNKNOWN}") from error
                     self.damage = f"{type(error).__name__}: {error}" if str(error) else "the end of the file is missing"
                     return
                 if record is None:

@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import logging
 import os
+import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Literal, Self, overload
+from types import MappingProxyType, TracebackType
+from typing import Literal, Self, get_args, overload
 
 import anyio.to_thread
+import numpy as np
+from numpy.typing import ArrayLike
 
 from urlab_client.aio.client import URLabClient as AsyncClient
+from urlab_client.aio.model.numbers import finite_array
 from urlab_client.integrations._feed.blocking import BlockingTwin
 from urlab_client.integrations._feed.follower import Follower
+from urlab_client.integrations._feed.messages import EpisodeOutcome
+from urlab_client.integrations._feed.samples import EpisodeMark
 from urlab_client.integrations.record.writer import RecorderStats, WriterOptions, WriterThread
 from urlab_client.protocol.errors import URLabError
 from urlab_client.randomise.variation import declared_in
@@ -51,6 +57,7 @@ class AsyncRecorder:
         self._options = options
         self._path = path
         self._writer: WriterThread | None = None
+        self._ended = False
 
     @property
     def path(self) -> Path:
@@ -75,6 +82,27 @@ class AsyncRecorder:
         there = frozenset[str]() if self._writer is None else self._writer.cameras
         return [name for name in self._follower.cameras if name not in there]
 
+    async def mark(self, outcome: EpisodeOutcome, *, goal: Mapping[str, ArrayLike] = MappingProxyType({})) -> None:
+        """Note what became of the present episode: the one since the last reset, up to the next one.
+
+        Conversions leave out episodes that are discarded, and in a recording with marks those without one, too. Marked
+        again, the last mark of an episode counts.
+
+        Args:
+            outcome: `success`, `failure` or `discarded`.
+            goal: What the episode was about, numbers or arrays by name, which becomes part of observations.
+
+        Raises:
+            ValueError: There is no such outcome, or the goal holds NaN or infinity.
+            URLabError: The recording has not begun, or has ended.
+        """
+        if outcome not in get_args(EpisodeOutcome):
+            raise ValueError(f"outcome must be one of {', '.join(get_args(EpisodeOutcome))}, not {outcome!r}")
+        given = {name: finite_array(f"goal {name!r}", np.ravel(values)).tolist() for name, values in goal.items()}
+        if self._writer is None or self._ended:
+            raise URLabError("There is no recording to mark an episode in.", hint="Call mark() inside the block.")
+        self._writer.mark(EpisodeMark(outcome, given, time.time_ns()))
+
     async def __aenter__(self) -> Self:
         if self._writer is not None:
             raise URLabError("A recorder records once.", hint="Call record() again.")
@@ -88,6 +116,7 @@ class AsyncRecorder:
         self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self._follower.detach()
+        self._ended = True
         writer = self._writer
         if writer is not None:
             writer.end()  # from here on it finishes the file, whatever becomes of the caller
@@ -140,6 +169,10 @@ class Recorder(BlockingTwin[AsyncRecorder]):
     def without_pictures(self) -> list[str]:
         """Cameras to record that have no picture in the file up to now."""
         return self._aio.without_pictures
+
+    def mark(self, outcome: EpisodeOutcome, *, goal: Mapping[str, ArrayLike] = MappingProxyType({})) -> None:
+        """Note what became of the present episode; see `AsyncRecorder.mark`."""
+        self._portal.call(self._aio.mark, outcome, goal=goal)
 
 
 @overload

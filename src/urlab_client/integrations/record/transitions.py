@@ -2,16 +2,64 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.integrations.record.reader import Table
+from urlab_client.integrations._feed.messages import OutcomeMessage
+from urlab_client.integrations.record.reader import Column, Run, Table
 
-__all__ = ["transitions"]
+__all__ = ["GOAL", "Episodes", "transitions", "transitions_of"]
+
+Episodes = Literal["kept", "success", "all"]
+"""Which episodes: those that were not discarded, successes alone, or all."""
+
+GOAL = "goal"
+"""What columns of an episode's goal are called: `goal/NAME`."""
 
 _SET_POINTS = "/set_points"
+
+
+def transitions_of(run: Run, *, only: Episodes = "kept", progress: Callable[[int], None] | None = None) -> Table:
+    """Return the pairs of a recording, as `transitions` has them, of the episodes that are wanted.
+
+    Where episodes were marked, `kept` leaves out those that were discarded, and those without a mark, which were broken
+    off; `success` leaves out failures, too. What an episode was about is in columns `goal/NAME`, the same in each row.
+
+    Args:
+        run: The recording.
+        only: Which episodes.
+        progress: Told now and then how many bytes have been read.
+
+    Raises:
+        ValueError: `only` is none of these.
+        RecordingError: The file is not a recording.
+    """
+    if only not in ("kept", "success", "all"):
+        raise ValueError(f"only must be kept, success or all, not {only!r}")
+    table, outcomes = transitions(run.table(progress)), run.summary().outcomes
+    if only != "all" and outcomes:
+        wanted = {"success"} if only == "success" else {"success", "failure"}
+        kept = [mark.episode for mark in outcomes if mark.outcome in wanted]
+        table = _rows(table, np.flatnonzero(np.isin(table.episode, kept)))
+    return _with_goals(table, outcomes)
+
+
+def _with_goals(table: Table, outcomes: Iterable[OutcomeMessage]) -> Table:
+    """Add what episodes were about; NaN for those of which it is not known."""
+    goals = {mark.episode: mark.goal for mark in outcomes}
+    widths = {name: len(values) for goal in goals.values() for name, values in goal.items()}
+    columns = dict(table.columns)
+    for name, width in widths.items():
+        values = np.full((len(table), width), np.nan)
+        for episode, goal in goals.items():
+            values[table.episode == episode, : len(goal.get(name, ()))] = goal.get(name, np.nan)
+        names = [str(i) for i in range(width)]
+        columns[f"{GOAL}/{name}"] = Column(names, values, [""] * width, names)
+    return replace(table, columns=columns)
 
 
 def transitions(table: Table) -> Table:
@@ -28,16 +76,17 @@ def transitions(table: Table) -> Table:
     if not keys:
         return table
     acted = np.flatnonzero((np.diff(table.episode) == 0) & (np.diff(table.sim_time) > 0))
-    columns = {key: replace(column, values=column.values[acted]) for key, column in table.columns.items()}
+    found = _rows(table, acted)
     for key in keys:
         led = table.columns[key + _SET_POINTS]
-        columns[f"{key}/action"] = replace(led, values=led.values[acted + 1])
-    return _rows(replace(table, columns=columns), acted)
+        found.columns[f"{key}/action"] = replace(led, values=led.values[acted + 1])
+    return found
 
 
 def _rows(table: Table, rows: NDArray[np.intp]) -> Table:
     return replace(
         table,
+        columns={key: replace(column, values=column.values[rows]) for key, column in table.columns.items()},
         time=table.time[rows],
         sim_time=table.sim_time[rows],
         wall_ns=table.wall_ns[rows],

@@ -27,6 +27,7 @@ from urlab_client.integrations._feed.messages import (
     FrameTransforms,
     GapMessage,
     JointStates,
+    OutcomeMessage,
     Time,
     VariedQuantity,
     encode,
@@ -34,7 +35,14 @@ from urlab_client.integrations._feed.messages import (
     schema_of,
     values,
 )
-from urlab_client.integrations._feed.samples import CameraPicture, SampleClock, Schedule, State, picture_message
+from urlab_client.integrations._feed.samples import (
+    CameraPicture,
+    EpisodeMark,
+    SampleClock,
+    Schedule,
+    State,
+    picture_message,
+)
 from urlab_client.integrations._feed.scene_messages import SceneMessages, Simulation, calibration, to_metadata
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import CameraFrame, EntityState, StepOk
@@ -117,7 +125,7 @@ class WriterThread:
         self.path = path
         self.error: OSError | RecordingError | None = None
         self._options = options
-        self._queue: deque[tuple[State | CameraPicture, int]] = deque()
+        self._queue: deque[tuple[State | CameraPicture | EpisodeMark, int]] = deque()
         # Each number has one writer, so no lock: the producer adds, the thread takes away.
         self._put_bytes = self._taken_bytes = 0
         self._dropped_states = self._dropped_frames = 0
@@ -176,6 +184,10 @@ class WriterThread:
             return
         self._put_bytes += size
         self._queue.append((item, size))
+
+    def mark(self, item: EpisodeMark) -> None:
+        """Queue what became of the episode; that is never dropped."""
+        self._queue.append((item, 0))
 
     def lose_frames(self, count: int) -> None:
         """Count pictures that never came; from the thread that calls `put`."""
@@ -250,7 +262,7 @@ class WriterThread:
             self._taken_bytes += size
             if isinstance(item, State):
                 self._dropped_states += 1
-            else:
+            elif isinstance(item, CameraPicture):
                 self._dropped_frames += 1
 
 
@@ -313,12 +325,17 @@ class _Sink:
         started = datetime.now(UTC).isoformat(timespec="milliseconds")
         self._writer.add_metadata("urlab", {"format": FORMAT, "started": started, **self.options.about})
 
-    def write(self, item: State | CameraPicture) -> None:
+    def write(self, item: State | CameraPicture | EpisodeMark) -> None:
         """Write one item."""
-        if isinstance(item, State):
-            self._write_state(item)
-        else:
-            self._write_picture(item)
+        match item:
+            case State():
+                self._write_state(item)
+            case CameraPicture():
+                self._write_picture(item)
+            case EpisodeMark():
+                now = self._clock.last or 0
+                outcome = OutcomeMessage(Time.of(now), self._clock.episode, item.outcome, item.goal)
+                self._add("/recording/outcomes", outcome, now, item.wall_ns, {})
 
     def flush_if_due(self, dropped_states: int, dropped_frames: int) -> None:
         """Write the chunk if its oldest message is old enough, so that a crash costs no more than that."""

@@ -173,17 +173,18 @@ class CameraSample(StreamItem, kw_only=True, eq=False):
         """
         return png(self.pixels, self.mode)
 
-    def jpeg(self, quality: int = JPEG_QUALITY) -> bytes:
+    def jpeg(self, quality: int = JPEG_QUALITY, *, max_size: int | None = None) -> bytes:
         """Return it as JPEG, to be looked at: colours, or depth as grey, near is bright.
 
         Args:
             quality: 1 to 100.
+            max_size: Pixels that the longer side may have, for a smaller picture; None leaves it as large as it is.
 
         Raises:
             MissingExtra: Pillow is not installed; the message has the command.
-            ValueError: There is no such quality.
+            ValueError: There is no such quality or size.
         """
-        return jpeg(self.pixels, self.mode, quality)
+        return jpeg(self.pixels, self.mode, quality, max_size=max_size)
 
 
 class ClientEvent(StreamItem, tag_field="event", kw_only=True, omit_defaults=True):

@@ -38,7 +38,7 @@ from urlab_client.server.assets.blueprint import (
     to_record,
 )
 from urlab_client.server.assets.bundled_robots import BUNDLED_PREFIX, bundled_models, bundled_root
-from urlab_client.server.assets.importer import Compiled, build_snapshot, one_line
+from urlab_client.server.assets.importer import Compiled, compile_snapshot, one_line, write_snapshot
 from urlab_client.server.assets.sandbox import build_confined
 from urlab_client.server.limits import Limits
 from urlab_client.server.refusal import Refusal
@@ -261,20 +261,19 @@ class ContentRoot:
             tempfile.TemporaryDirectory(dir=home, prefix=_UNDER_WAY) as temporary_folder,
         ):
             snapshot = Path(temporary_folder) / "snapshot"
-            compiled = self._build(file, snapshot, roots)
+            if roots is None or file.is_relative_to(bundled_root()):
+                compiled, folder, is_new = self._build(file, snapshot, home)
+            else:
+                compiled = build_confined(file, snapshot, roots, self.limits)
+                folder, is_new = _put_in_place(snapshot, home)
             for message in compiled.messages:
                 logger.warning("%s: %s", file, one_line(message))
-            digest = _digest(snapshot)
-            folder = home / digest
-            is_new = not folder.exists()
-            if is_new:
-                os.replace(snapshot, folder)
         record = BlueprintRecord(
             stem=stem,
             source=source,
             source_digest=source_digest,
             imported_at=datetime.now(UTC),
-            digest=digest,
+            digest=folder.name,
             model_name=compiled.model_name,
             joints=compiled.joints,
             actuators=compiled.actuators,
@@ -293,13 +292,19 @@ class ContentRoot:
                 shutil.rmtree(folder, ignore_errors=True)
             raise
 
-    def _build(self, file: Path, snapshot: Path, roots: tuple[Path, ...] | None) -> Compiled:
-        if roots is None or file.is_relative_to(bundled_root()):
-            try:
-                return build_snapshot(file, snapshot, self.limits)[0]
-            except (ValueError, mujoco.FatalError) as error:
+    def _build(self, file: Path, snapshot: Path, home: Path) -> tuple[Compiled, Path, bool]:
+        """Compile a file in this process; return what was learnt, its folder, and whether that is new."""
+        folder, is_new = home, False
+        try:
+            written = write_snapshot(file, snapshot)
+            folder, is_new = _put_in_place(snapshot, home)
+            return compile_snapshot(written, file, folder, self.limits)[0], folder, is_new
+        except BaseException as error:
+            if is_new:
+                shutil.rmtree(folder, ignore_errors=True)
+            if isinstance(error, (ValueError, mujoco.FatalError)):
                 raise Refusal("import_failed", f"MuJoCo rejects {file}: {one_line(error)}") from None
-        return build_confined(file, snapshot, roots, self.limits)
+            raise
 
     def _register(self, home: Path, folder: Path, record: BlueprintRecord) -> Blueprint:
         known = self._blueprints.get(record.stem)
@@ -338,6 +343,15 @@ def _warn_if_stale(known: Blueprint, source: str, text: bytes) -> None:
             source,
             known.imported_at.isoformat(timespec="seconds"),
         )
+
+
+def _put_in_place(snapshot: Path, home: Path) -> tuple[Path, bool]:
+    """Move a snapshot to the folder that its content names, unless that is there; return it, and whether it is new."""
+    folder = home / _digest(snapshot)
+    if folder.exists():
+        return folder, False
+    os.replace(snapshot, folder)
+    return folder, True
 
 
 def _digest(folder: Path) -> str:

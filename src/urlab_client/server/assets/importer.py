@@ -11,17 +11,35 @@ import logging
 import re
 import threading
 from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import msgspec
 import mujoco
 
-from urlab_client._mujoco import actuator_count, actuator_kind, asset_bytes, check_copy, write_model
+from urlab_client._mujoco import (
+    MODEL_FILE,
+    actuator_count,
+    actuator_kind,
+    asset_bytes,
+    check_copy,
+    compiled_file,
+    write_model,
+)
 from urlab_client.server.assets.option_ranges import options_problem
 from urlab_client.server.limits import Limits
 
-__all__ = ["Compiled", "build_snapshot", "mujoco_messages", "named_kinds", "one_line"]
+__all__ = [
+    "Compiled",
+    "Written",
+    "build_snapshot",
+    "compile_snapshot",
+    "mujoco_messages",
+    "named_kinds",
+    "one_line",
+    "write_snapshot",
+]
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
 
@@ -64,44 +82,99 @@ class Compiled(msgspec.Struct, frozen=True, kw_only=True):
     largest_image: int
 
 
+@dataclass(frozen=True, kw_only=True)
+class Written:
+    """What was learnt from writing a snapshot.
+
+    Attributes:
+        model_name: The MJCF's `model` attribute; empty if it gives none.
+        actuator_types: See `Blueprint`.
+        n_memory: Bytes of arena that its `<size>` asks for; 0 if it asks for none.
+        messages: MuJoCo's warnings.
+    """
+
+    model_name: str
+    actuator_types: dict[str, str]
+    n_memory: int
+    messages: list[str]
+
+
 def build_snapshot(file: Path, snapshot: Path, limits: Limits) -> tuple[Compiled, mujoco.MjModel]:
-    """Compile an MJCF file, write what is kept of it, and return what was learnt and the model.
+    """Do what `write_snapshot` and `compile_snapshot` do."""
+    return compile_snapshot(write_snapshot(file, snapshot), file, snapshot, limits)
+
+
+def write_snapshot(file: Path, snapshot: Path) -> Written:
+    """Write what is kept of an MJCF file.
 
     Args:
         file: The file.
         snapshot: Folder to write, which must not exist.
+
+    Raises:
+        ValueError, mujoco.FatalError: MuJoCo rejects it.
+    """
+    with mujoco_messages() as messages, _naming_the_source(file):
+        spec = mujoco.MjSpec.from_file(str(file))
+        if spec.compiler.settotalmass > 0.0 or any(len(key.mpos) or len(key.mquat) for key in spec.keys):
+            compiled_file(file)  # for what MuJoCo has to say about that: the snapshot does without
+        prepared = _prepared(spec)
+        kinds = {actuator.name: _actuator_kind(actuator) for actuator in prepared.actuators}
+        _write_snapshot(prepared, snapshot, messages)
+    return Written(
+        model_name="" if spec.modelname in DEFAULT_MODEL_NAMES else spec.modelname,
+        actuator_types=kinds,
+        n_memory=max(prepared.memory, 0),
+        messages=messages,
+    )
+
+
+def compile_snapshot(written: Written, file: Path, snapshot: Path, limits: Limits) -> tuple[Compiled, mujoco.MjModel]:
+    """Compile what was written of an MJCF file, and return what was learnt and the model.
+
+    MuJoCo keeps compiled meshes by the paths of their files, so a snapshot compiled where it stays is compiled quickly
+    from then on.
+
+    Args:
+        written: What `write_snapshot` returned.
+        file: The file.
+        snapshot: Folder of what was written.
         limits: For the ranges of its options; nothing is refused here.
 
     Raises:
         ValueError, mujoco.FatalError: MuJoCo rejects it.
     """
-    with mujoco_messages() as messages:
-        spec = mujoco.MjSpec.from_file(str(file))
-        # Compiles the file itself, so that an error names the source's own line.
-        original = mujoco.MjModel.from_xml_path(str(file))
-        prepared = _prepared(spec)
-        kinds = {actuator.name: _actuator_kind(actuator) for actuator in prepared.actuators}
-        _write_snapshot(prepared, snapshot, messages)
-        model = mujoco.MjModel.from_xml_path(str(snapshot / "model.xml"))
+    with mujoco_messages() as messages, _naming_the_source(file):
+        model = compiled_file(snapshot / MODEL_FILE)
         data = mujoco.MjData(model)
-        check_copy(original, model)
+        check_copy(file, model)
     compiled = Compiled(
-        model_name="" if spec.modelname in DEFAULT_MODEL_NAMES else spec.modelname,
+        model_name=written.model_name,
         joints=_names(model.njnt, model.joint),
         actuators=_names(actuator_count(model), model.actuator),
-        actuator_types=kinds,
+        actuator_types=written.actuator_types,
         sensors=_names(model.nsensor, model.sensor),
         cameras=_names(model.ncam, model.camera),
-        messages=tuple(dict.fromkeys(messages)),
+        messages=tuple(dict.fromkeys((*written.messages, *messages))),
         n_bytes=mujoco.mj_sizeModel(model),
         n_asset_bytes=asset_bytes(model),
-        n_data_bytes=data.nbuffer + max(prepared.memory, 0),
+        n_data_bytes=data.nbuffer + written.n_memory,
         n_arena_bytes=data.narena,
         n_sensor_values=model.nsensordata,
         options_problem=options_problem(model.opt, limits),
         largest_image=int(model.cam_resolution.max(initial=0)),
     )
     return compiled, model
+
+
+@contextlib.contextmanager
+def _naming_the_source(file: Path) -> Generator[None]:
+    """Let an error name the line of the file itself, if compiling that fails, too."""
+    try:
+        yield
+    except (ValueError, mujoco.FatalError):
+        compiled_file(file)
+        raise
 
 
 _hook_lock = threading.RLock()  # blocks may be nested: the inner one collects

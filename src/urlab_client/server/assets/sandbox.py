@@ -74,12 +74,14 @@ class _Child:
                 self._process, self._pid = None, os.getpid()
             for _ in range(2):  # a child that ended meanwhile is replaced, once
                 process = self._process or self._start()
-                line = self._exchange(process, msgspec.json.encode(order) + b"\n", order.limits.model_wall_s)
+                line, in_time = self._exchange(process, msgspec.json.encode(order) + b"\n", order.limits.model_wall_s)
                 if line:
                     if not hasattr(os, "fork"):
                         self._end()
                     return _OUTCOME.decode(line)
                 self._end()
+                if not in_time:
+                    return _took_too_long(order.limits)
         return _Outcome(refused="compilation ended without an answer: it exceeded its limits, or MuJoCo failed")
 
     def close(self) -> None:
@@ -98,10 +100,17 @@ class _Child:
         )
         return self._process
 
-    def _exchange(self, process: subprocess.Popen[bytes], line: bytes, wall_s: float) -> bytes:
+    def _exchange(self, process: subprocess.Popen[bytes], line: bytes, wall_s: float) -> tuple[bytes, bool]:
+        """Return the child's answer, if any, and whether it came, or the child ended by itself, in time."""
         if process.stdin is None or process.stdout is None:
             raise TypeError("the child's input and output must be pipes")
-        watchdog = threading.Timer(wall_s + _GRACE_S, process.kill)
+        too_late = threading.Event()
+
+        def kill() -> None:
+            too_late.set()
+            process.kill()
+
+        watchdog = threading.Timer(wall_s + _GRACE_S, kill)
         watchdog.daemon = True
         watchdog.start()
         try:
@@ -109,11 +118,11 @@ class _Child:
             process.stdin.flush()
             answer = process.stdout.readline(_REPLY_BYTES)
         except OSError:
-            return b""
+            answer = b""
         finally:
             watchdog.cancel()
             watchdog.join()
-        return answer if answer.endswith(b"\n") else b""
+        return answer if answer.endswith(b"\n") else b"", not too_late.is_set()
 
     def _end(self) -> None:
         process, self._process = self._process, None
@@ -184,13 +193,17 @@ def _fork(order: _SandboxJob) -> _Outcome:
         return _OUTCOME.decode(answer)
     limits = order.limits
     if not in_time:
-        return _Outcome(refused=f"compilation took longer than the limit model_wall_s, {limits.model_wall_s} s")
+        return _took_too_long(limits)
     if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU:
         return _Outcome(refused=f"compilation took more than the limit model_cpu_s, {limits.model_cpu_s} s")
     return _Outcome(
         refused="MuJoCo failed on it, or compilation needs more memory than the limit model_memory_bytes, "
         f"{limits.model_memory_bytes}"
     )
+
+
+def _took_too_long(limits: Limits) -> _Outcome:
+    return _Outcome(refused=f"compilation took longer than the limit model_wall_s, {limits.model_wall_s} s")
 
 
 def _read(descriptor: int, deadline: float) -> tuple[bytes, bool]:

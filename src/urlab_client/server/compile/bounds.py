@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from urlab_client._mujoco import MODEL_FILE, compiled_file
 from urlab_client.protocol.base import Vec3
 from urlab_client.protocol.rotation import rotate
 from urlab_client.server.assets.actors import Actor
@@ -83,4 +84,4 @@ def _boxes(model: mujoco.MjModel) -> _Boxes:
 @lru_cache(maxsize=64)
 def _blueprint_boxes(folder: Path) -> _Boxes:
     with mujoco_messages():
-        return _boxes(mujoco.MjModel.from_xml_path(str(folder / "model.xml")))
+        return _boxes(compiled_file(folder / MODEL_FILE))

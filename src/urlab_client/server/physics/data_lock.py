@@ -8,10 +8,15 @@ from collections.abc import Generator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from types import TracebackType
+from typing import Final
 
 from urlab_client.server.refusal import Refusal
 
 __all__ = ["DataLock", "MujocoCall", "Overdue", "busy"]
+
+
+LEAST_PATIENCE_S: Final = 1.0
+"""A call of MuJoCo does not count as overdue before; a slice of a long request may take a while on a busy machine."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +40,7 @@ class MujocoCall:
     __slots__ = ("_patience_s", "_under_way")
 
     def __init__(self, patience_s: float) -> None:
-        self._patience_s = patience_s
+        self._patience_s = max(patience_s, LEAST_PATIENCE_S)
         self._under_way: tuple[threading.Thread, float] | None = None
 
     def __enter__(self) -> None:

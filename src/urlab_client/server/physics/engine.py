@@ -41,9 +41,6 @@ logger: logging.Logger = logging.getLogger("urlab_client.server")
 
 T = TypeVar("T")
 
-LEAST_PATIENCE_S: Final = 1.0
-"""A call of MuJoCo does not count as overdue before; a slice of a long request may take a while on a busy machine."""
-
 INLINE_SHARE: Final = 0.02
 """A direct step expected to take less than this share of the step timeout runs on the calling thread."""
 
@@ -97,7 +94,7 @@ class Engine:
         """
         self.scene = scene
         self.dialect = dialect
-        self._call = MujocoCall(max(step_timeout_s, LEAST_PATIENCE_S))
+        self._call = MujocoCall(step_timeout_s)
         self.lock: DataLock = DataLock(step_timeout_s, self._call)
         self.on_tick: list[Hook] = []
         self.seed: int | None = None
@@ -244,9 +241,7 @@ class Engine:
         if not self.lock.acquire():
             if self._mode is not StepMode.DIRECT:
                 raise busy()
-            queued = QueuedStep(request, observe)
-            self._queue.append(queued)
-            return self._await(queued, 0.0)
+            return self._await(self._queued(request, observe), 0.0)
         try:
             mode = self._mode
             if self._thread.stopping:
@@ -275,12 +270,16 @@ class Engine:
                 if self._tick_due:
                     self._wake.notify()
                 return result
-            queued = QueuedStep(request, observe)
-            self._queue.append(queued)
+            queued = self._queued(request, observe)
             self._wake.notify()
         finally:
             self.lock.inner.release()
         return self._await(queued, deadline - time.monotonic())
+
+    def _queued(self, request: Step, observe: Callable[[StepMode], T]) -> QueuedStep[T]:
+        queued = QueuedStep(request, observe)
+        self._queue.append(queued)
+        return queued
 
     def _await(self, queued: QueuedStep[T], remaining: float) -> T:
         return queued.wait(remaining, self._step_timeout_s, runs_late=self.dialect.late_steps)
@@ -477,24 +476,14 @@ class Engine:
             self._iterate_live()
         elif self._mode is StepMode.DIRECT and self._queue and not self._paused:
             self._tick_if_due()
-            self._serve(self._queue.popleft())
+            self._queue.popleft().run(self._run_direct)
         elif self._tick_due or (self.on_tick and time.perf_counter() - self._last_tick >= IDLE_S):
             self._tick()
         else:
             self._wake.wait(IDLE_S)
 
-    def _serve(self, queued: QueuedStep[Any]) -> None:
-        if not queued.begin():
-            return
-        try:
-            self._run_direct(queued.request)
-            queued.succeed()
-        except Exception as error:  # noqa: BLE001 - raised again where the step was requested
-            queued.fail(error)
-
     def _iterate_live(self) -> None:
-        wait_s = self._pacing.take_slot(idle=self._paused and not self.on_tick)
-        if wait_s:
+        if wait_s := self._pacing.take_slot(idle=self._paused and not self.on_tick):
             self._wake.wait(wait_s)
             self._pacing.rested()
             return

@@ -19,7 +19,7 @@ class QueuedStep(Generic[T]):
     """A direct step that waits for the physics thread."""
 
     def __init__(self, request: Step, observe: Callable[[StepMode], T]) -> None:
-        self.request = request
+        self._request = request
         self._observe = observe
         self._settled = threading.Event()
         self._abandoned = False
@@ -29,17 +29,24 @@ class QueuedStep(Generic[T]):
         self._results: list[T] = []
         self._error: Exception | None = None
 
-    def begin(self) -> bool:
-        """Return whether it is to be done; its caller may have been told that it will not be."""
+    def run(self, advance: Callable[[Step], None]) -> None:
+        """Do the step, unless its caller was told that it is not done any more; observe, and release the caller.
+
+        Args:
+            advance: Does what the request asks for. The engine's lock is held.
+        """
         with self._lock:
             self._begun = True
-            return not self._dropped
-
-    def succeed(self) -> None:
-        """Observe for the caller, if it still waits, and release it. The engine's lock is held."""
-        if not self._abandoned:
-            self._results.append(self._observe(StepMode.DIRECT))
-        self._settled.set()
+            if self._dropped:
+                return
+        try:
+            advance(self._request)
+            if not self._abandoned:
+                self._results.append(self._observe(StepMode.DIRECT))
+        except Exception as error:  # noqa: BLE001 - raised again where the step was requested
+            self.fail(error)
+        else:
+            self._settled.set()
 
     def fail(self, error: Exception) -> None:
         """Release the caller with an error."""

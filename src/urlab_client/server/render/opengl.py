@@ -17,6 +17,7 @@ from urlab_client._children import APART
 from urlab_client.protocol.errors import URLabError
 
 __all__ = [
+    "ADVICE",
     "Backend",
     "RenderingUnavailable",
     "find_backend",
@@ -35,7 +36,10 @@ _CHOICE: Final = "MUJOCO_GL"
 
 _DISABLED: Final = ("disable", "disabled", "off", "false", "0")
 
-_PACKAGES: Final = "apt install libegl1 libgl1-mesa-dri, or libosmesa6"
+ADVICE: Final = (
+    "apt install libegl1 libgl1-mesa-dri, or libosmesa6" if sys.platform == "linux" else "install a graphics driver"
+)
+"""What to do where no OpenGL works."""
 
 _SOFTWARE: Final = ("llvmpipe", "softpipe", "swrast", "software", "swiftshader")
 
@@ -150,8 +154,7 @@ def _find(choice: str) -> Backend | str:
             logger.info("pictures are drawn with %s by %s", found.name, found.renderer)
             return found
         reasons.append(f"{name}: {found}")
-    advice = _PACKAGES if sys.platform == "linux" else "install a graphics driver"
-    return f"no OpenGL works here: {advice} ({'; '.join(reasons)})"
+    return f"no OpenGL works here: {ADVICE} ({'; '.join(reasons)})"
 
 
 def _candidates(choice: str) -> Sequence[str]:

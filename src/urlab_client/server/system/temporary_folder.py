@@ -7,19 +7,24 @@ nobody holds. Likewise `working_in` and `sweep`, for folders that several proces
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import shutil
 import sys
 import tempfile
+import time
 from collections.abc import Generator
 from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
+from urlab_client._windows import NamedLock
+
 __all__ = ["TemporaryFolder", "sweep", "working_in"]
 
 _PREFIX: Final = "urlab-"
 _LOCK: Final = ".alive"
+_LOOK_S: Final = 0.01
 
 
 class TemporaryFolder:
@@ -78,7 +83,13 @@ def _hold(file: Path, flags: int) -> int | None:
 
 
 def _remove_if_left(folder: Path) -> None:
-    if sys.platform == "win32" or folder.is_symlink() or folder.stat().st_uid != os.geteuid():
+    if folder.is_symlink():
+        return
+    if sys.platform == "win32":
+        (folder / _LOCK).unlink()  # refused while its owner has it open
+        shutil.rmtree(folder, ignore_errors=True)
+        return
+    if folder.stat().st_uid != os.geteuid():
         return
     descriptor = _hold(folder / _LOCK, os.O_RDWR)
     if descriptor is not None:
@@ -96,7 +107,15 @@ def working_in(folder: Path) -> Generator[None]:
         OSError: The folder cannot be opened.
     """
     if sys.platform == "win32":
-        yield
+        works = NamedLock(
+            _name("works", folder)
+        )  # before it looks whether somebody sweeps, who looks in this order, too
+        try:
+            while not _is_free("sweeps", folder):
+                time.sleep(_LOOK_S)
+            yield
+        finally:
+            works.close()
         return
     import fcntl  # noqa: PLC0415
 
@@ -132,7 +151,13 @@ def _alone_in(folder: Path) -> Generator[None]:
         OSError: Somebody does, or there is no such folder.
     """
     if sys.platform == "win32":
-        yield
+        sweeps = NamedLock(_name("sweeps", folder))
+        try:
+            if not sweeps.held or not _is_free("works", folder):
+                raise BlockingIOError(f"another process works in {folder}")
+            yield
+        finally:
+            sweeps.close()
         return
     import fcntl  # noqa: PLC0415
 
@@ -142,3 +167,16 @@ def _alone_in(folder: Path) -> Generator[None]:
         yield
     finally:
         os.close(descriptor)
+
+
+def _name(what: str, folder: Path) -> str:
+    """Return the name of a lock of Windows', whose folders cannot be locked themselves."""
+    place = os.path.normcase(folder.resolve())
+    return f"Local\\urlab_{what}_{hashlib.sha256(place.encode()).hexdigest()}"
+
+
+def _is_free(what: str, folder: Path) -> bool:
+    """Whether nobody has this lock of Windows'."""
+    lock = NamedLock(_name(what, folder))
+    lock.close()
+    return lock.held

@@ -1,0 +1,251 @@
+"""`urlab teleop`: the keyboard moves a robot's hand, and each episode is recorded."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import sys
+from collections.abc import AsyncGenerator, Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from urlab_client.aio.launch import with_model_options
+from urlab_client.cli._arguments import (
+    Commands,
+    ServerArguments,
+    add_address,
+    add_cameras,
+    add_keys,
+    add_ports,
+    cameras,
+    count,
+    hertz,
+    make_client,
+    seconds,
+)
+from urlab_client.cli._failure import CommandError
+from urlab_client.cli._files import check_ending
+from urlab_client.cli._mujoco import import_mujoco
+from urlab_client.cli._terminal_keys import terminal_keys
+from urlab_client.cli._watching import interruptible
+from urlab_client.protocol.names import did_you_mean
+
+if TYPE_CHECKING:
+    from urlab_client.aio import URLabClient
+    from urlab_client.integrations.gym import Task
+    from urlab_client.integrations.record import AsyncRecorder
+    from urlab_client.integrations.teleop import TeleopCommand, TeleopTally, TeleopView
+
+__all__ = ["add_parser", "run"]
+
+_SHOWN_S = 0.1
+
+
+class TeleopArguments(ServerArguments):
+    """What the command line says."""
+
+    address: str | None
+    output: Path | None
+    task: str | None
+    robot: str | None
+    site: str | None
+    gripper: str | None
+    speed: float
+    turn_speed: float
+    episodes: int | None
+    seconds: float | None
+    seed: int
+    camera: list[str]
+    camera_hz: float
+    overwrite: bool
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command to the parser."""
+    parser = commands.add_parser(
+        "teleop",
+        help="move a robot's hand by the keyboard, and record episodes",
+        description="Move a robot's hand with the keys of this terminal, by inverse kinematics within the limits of "
+        "its joints. The simulation is stepped along with the clock; an episode begins with the first key. "
+        "With --record each episode is kept with what became of it, as a key says, and `urlab convert` makes a LeRobot "
+        "dataset of those that were not discarded. Opens a session, which takes the server over from the client that "
+        "drives it. `urlab console` takes a gamepad. Needs the extra 'urlab-client[teleop]', and --task "
+        "'urlab-client[gym]'.",
+        examples=(
+            ("urlab teleop --task urlab/Reach-v0 --record reach.mcap", "a task on a simulated robot, recorded"),
+            ("urlab teleop sim://arm", "try it, without a recording"),
+            (
+                "urlab teleop tcp://localhost --robot arm --site grip --record run.mcap --camera arm/wrist",
+                "the robot of a running server, with pictures",
+            ),
+        ),
+    )
+    add_address(parser, default=None, otherwise="a simulated server for --task, else tcp://localhost")
+    parser.add_argument("--record", dest="output", type=Path, metavar="FILE", help="the file to write, a .mcap file")
+    parser.add_argument("--task", metavar="ID", help="a task of this package, such as urlab/Reach-v0")
+    parser.add_argument("--robot", metavar="KEY", help="the articulation (default: the only one)")
+    parser.add_argument("--site", metavar="NAME", help="the hand, a site of the robot (default: the only one)")
+    parser.add_argument(
+        "--gripper", metavar="NAME", help="actuator of the gripper (default: the one that does not move the hand)"
+    )
+    parser.add_argument(
+        "--speed", type=hertz, default=0.25, metavar="M/S", help="largest speed of the hand (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--turn-speed", type=hertz, default=1.0, metavar="RAD/S", help="largest rate of turn (default: %(default)s)"
+    )
+    parser.add_argument("--episodes", type=count, metavar="N", help="end after so many that were not discarded")
+    parser.add_argument("--seconds", type=seconds, metavar="S", help="simulated seconds after which an episode ends")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of starts and goals (default: 0)")
+    add_cameras(parser, "with --record: a camera to record")
+    parser.add_argument(
+        "--camera-hz", type=hertz, default=30.0, metavar="HZ", help="pictures per second (default: %(default)s)"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="with --record: replace FILE if it exists")
+    add_ports(parser)
+    add_keys(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: TeleopArguments) -> int:
+    """Teleoperate; return 0.
+
+    Raises:
+        CommandError: The terminal, the file or an option cannot be used.
+        MissingExtra: A library is missing.
+        URLabError: The server refused something, or the robot cannot be moved so.
+    """
+    import_mujoco()
+    if arguments.output is not None:
+        check_ending(arguments.output, ".mcap")
+        if arguments.output.exists() and not arguments.overwrite:
+            raise CommandError(f"{arguments.output} exists; --overwrite replaces it")
+        import urlab_client.integrations.record  # noqa: PLC0415  # pyright: ignore[reportUnusedImport]  # is it there?
+    elif arguments.camera or arguments.overwrite:
+        raise CommandError("--camera and --overwrite go with --record")
+    if arguments.seed < 0:
+        raise CommandError(f"--seed must be at least 0, not {arguments.seed}")
+    import urlab_client.integrations.teleop  # noqa: F401, PLC0415  # pyright: ignore[reportUnusedImport]
+
+    task = None if arguments.task is None else _task(arguments.task)
+    try:
+        with terminal_keys() as keys:
+            tally = asyncio.run(_teleoperate(arguments, task, keys))
+    except KeyError as error:
+        raise CommandError(str(error.args[0])) from None
+    except ValueError as error:
+        raise CommandError(str(error)) from error
+    where = "" if arguments.output is None else f"{arguments.output}  "
+    print(f"{where}{_counts(tally)}")
+    return 0
+
+
+def _task(name: str) -> Task:
+    from urlab_client._extras import need  # noqa: PLC0415
+
+    need("gymnasium", extra="gym")
+    from urlab_client.integrations.gym import TASKS  # noqa: PLC0415
+
+    if name not in TASKS:
+        raise CommandError(f"{name!r} is not a task.{did_you_mean(name, TASKS)} There are: {', '.join(TASKS)}")
+    return TASKS[name]()
+
+
+async def _teleoperate(arguments: TeleopArguments, task: Task | None, keys: Callable[[], str]) -> TeleopTally:
+    from urlab_client.aio import URLabClient  # noqa: PLC0415
+    from urlab_client.integrations.teleop import HandControl, KeyboardOperator, TeleopCommand, teleoperate  # noqa: PLC0415
+
+    address = arguments.address
+    if address is None:
+        address = "tcp://localhost" if task is None else with_model_options(task.scene_address)
+    client = make_client(URLabClient, address, arguments, step_mode="direct")
+    async with client:
+        await client.discover()
+        hand = HandControl(
+            client,
+            arguments.robot,
+            site=arguments.site,
+            gripper=arguments.gripper,
+            speed=arguments.speed,
+            turn_speed=arguments.turn_speed,
+        )
+        operator, shown = KeyboardOperator(keys), _Line()
+        with interruptible() as stop:
+            _print_keys()
+
+            def operate(view: TeleopView) -> TeleopCommand:
+                shown.show(view)
+                return TeleopCommand(verdict="quit") if stop.is_set() else operator(view)
+
+            async with _recorded(client, arguments) as recorder:
+                try:
+                    return await teleoperate(
+                        client,
+                        operate,
+                        hand=hand,
+                        task=task,
+                        recorder=recorder,
+                        episodes=arguments.episodes,
+                        seconds=arguments.seconds,
+                        seed=arguments.seed,
+                        paced=True,
+                    )
+                finally:
+                    shown.end()
+
+
+@contextlib.asynccontextmanager
+async def _recorded(client: URLabClient, arguments: TeleopArguments) -> AsyncGenerator[AsyncRecorder | None]:
+    if arguments.output is None:
+        yield None
+        return
+    from urlab_client.integrations.record import record  # noqa: PLC0415
+
+    wanted = cameras(arguments.camera)
+    async with record(
+        client, arguments.output, cameras=wanted, camera_hz=arguments.camera_hz, overwrite=arguments.overwrite
+    ) as recorder:
+        yield recorder
+
+
+def _print_keys() -> None:
+    from urlab_client.integrations.teleop.keyboard import HELP  # noqa: PLC0415
+
+    for key, what in HELP:
+        print(f"{key:>14}  {what}", flush=True)
+
+
+def _counts(tally: TeleopTally) -> str:
+    return f"{tally.success} successes, {tally.failure} failures, {tally.discarded} discarded"
+
+
+class _Line:
+    """One line on standard error that says how things stand."""
+
+    def __init__(self) -> None:
+        self._at = -np.inf
+        self._on = sys.stderr.isatty()
+
+    def show(self, view: TeleopView) -> None:
+        """Write it, if it is some time since the last."""
+        now = asyncio.get_running_loop().time()
+        if not self._on or now - self._at < _SHOWN_S:
+            return
+        self._at = now
+        parts = [f"episode {view.episode}", f"{view.time:.1f} s", f"hand {_numbers(view.position)}"]
+        parts += [f"{name} {_numbers(np.atleast_1d(value))}" for name, value in view.goal.items()]
+        parts += ["success"] if view.success else []
+        parts += ["at the edge of reach"] if view.blocked else []
+        sys.stderr.write(f"\r{'  '.join(parts)}  [{_counts(view.tally)}]\x1b[K")
+        sys.stderr.flush()
+
+    def end(self) -> None:
+        """Leave the line."""
+        if self._on and np.isfinite(self._at):
+            sys.stderr.write("\n")
+
+
+def _numbers(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> str:
+    return " ".join(f"{value:+.3f}" for value in values)

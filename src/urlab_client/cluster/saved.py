@@ -1,0 +1,125 @@
+"""Episodes as files of a folder, so that a run can go on where it was interrupted."""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from collections.abc import Iterator, Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, Final, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from urlab_client.cluster.episodes import Episode, seed_of
+
+__all__ = ["load_episodes", "missing_ids", "save_episode"]
+
+_ARRAYS: Final = ("observations", "actions", "rewards")
+_ABOUT: Final = "about"
+
+
+def save_episode(episode: Episode, folder: str | os.PathLike[str]) -> Path:
+    """Write an episode to `folder/episode_ID.npz`, in place of one that is there.
+
+    The file appears when it is whole: a driver that is killed meanwhile leaves none, or the one before.
+
+    Args:
+        episode: The episode.
+        folder: Made where there is none.
+
+    Returns:
+        The file. It holds plain arrays, and what is not one as JSON under `about`.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    path = _path(folder, episode.id)
+    arrays = dict[str, NDArray[Any]]()
+    places = list[list[str]]()
+    for name in _ARRAYS:
+        for place, array in _leaves(getattr(episode, name), (name,)):
+            arrays[str(len(places))] = array
+            places.append([*place])
+    about = {field.name: getattr(episode, field.name) for field in fields(episode) if field.name not in _ARRAYS}
+    arrays[_ABOUT] = np.array(json.dumps({**about, "arrays": places}))
+    part = path.with_suffix(f".{os.getpid()}.part")
+    try:
+        with part.open("wb") as file:
+            np.savez(file, **cast("Any", arrays))
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+    return path
+
+
+def load_episodes(folder: str | os.PathLike[str]) -> Iterator[Episode]:
+    """Read the episodes that were saved in a folder, in the order of their ids, one at a time.
+
+    Raises:
+        OSError: There is no such folder, or a file cannot be read.
+        ValueError: A file holds no episode.
+    """
+    for path in _saved(folder):
+        about, file = _opened(path)
+        with file:
+            values: dict[str, Any] = {}
+            for number, (*place, last) in enumerate(about.pop("arrays")):
+                at = values
+                for key in place:
+                    at = at.setdefault(key, {})
+                at[last] = file[str(number)]
+        yield Episode(**about, **values)
+
+
+def missing_ids(folder: str | os.PathLike[str], n: int, *, seed: int = 0) -> list[int]:
+    """Return the ids of a run's episodes that are not in a folder yet: `rollouts(…, n, seed=seed, ids=…)`.
+
+    Args:
+        folder: Where `save_episode` put the others; there may be none yet.
+        n: Number of episodes of the run.
+        seed: Seed of the run.
+
+    Raises:
+        ValueError: An episode in the folder belongs to another run: it has another seed, or an id above n - 1.
+    """
+    saved = set[int]()
+    for path in _saved(folder) if Path(folder).exists() else []:
+        about, file = _opened(path)
+        file.close()
+        i = int(about["id"])
+        if i >= n or about["seed"] != seed_of(seed, i):
+            raise ValueError(f"{path} is not of a run of {n} episodes with seed {seed}: use another folder")
+        saved.add(i)
+    return [i for i in range(n) if i not in saved]
+
+
+def _path(folder: str | os.PathLike[str], i: int) -> Path:
+    return Path(folder) / f"episode_{i:06}.npz"
+
+
+def _saved(folder: str | os.PathLike[str]) -> list[Path]:
+    return sorted(path for path in Path(folder).iterdir() if path.match("episode_*.npz"))
+
+
+def _opened(path: Path) -> tuple[dict[str, Any], Any]:
+    file = None
+    try:
+        file = np.load(path, allow_pickle=False)
+        return json.loads(str(file[_ABOUT])), file
+    except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        if file is not None:
+            file.close()
+        raise ValueError(f"{path} holds no episode: {error}") from error
+
+
+def _leaves(values: Any, place: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], NDArray[Any]]]:
+    """Yield the arrays of nested dictionaries with the keys that lead to them."""
+    if not isinstance(values, Mapping):
+        yield place, values
+        return
+    for key, inner in cast("Mapping[str, Any]", values).items():
+        yield from _leaves(inner, (*place, key))

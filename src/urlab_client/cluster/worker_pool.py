@@ -1,0 +1,98 @@
+"""Workers that stay up between runs."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from types import MappingProxyType, TracebackType
+from typing import Any, Self
+
+from urlab_client.cluster.worker import Worker
+from urlab_client.protocol.errors import URLabError
+
+__all__ = ["WorkerPool"]
+
+_ray: Any = import_module("ray")  # Any: Ray's hints leave every remote call unknown
+
+
+class WorkerPool:
+    """Workers for several runs, one run at a time: `rollouts(…, workers=pool)`.
+
+    They start with the first run that needs them. Between two runs they wait, each with the simulated server of its
+    last scene, which the next run goes on with if its scene and options are the same. Each holds its processor
+    meanwhile. A worker that died, alone or with its node, is replaced in the next run.
+    """
+
+    def __init__(self, n_workers: int = 0, *, worker_options: Mapping[str, Any] = MappingProxyType({})) -> None:
+        """Make a pool without workers.
+
+        Args:
+            n_workers: Largest number of workers; 0 for one per processor of the cluster, or per leased address.
+            worker_options: Options of the Ray actors, such as `num_cpus` or `resources`; one processor each by default.
+
+        Raises:
+            ValueError: `n_workers` is below 0.
+            URLabError: Ray is not initialised.
+        """
+        if n_workers < 0:
+            raise ValueError(f"n_workers is 0 or more, not {n_workers}")
+        if not _ray.is_initialized():
+            raise URLabError("Ray is not initialised.", hint="Call ray.init() first.")
+        self.n_workers = n_workers
+        # Ray's own restarts are off: an episode whose worker died must be counted as an attempt.
+        options = {"num_cpus": 1, "scheduling_strategy": "SPREAD", **worker_options, "max_restarts": 0}
+        self._actor = _ray.remote(Worker).options(**options)
+        self._waiting: list[Any] = []
+        self._run: weakref.ref[object] | None = None  # a run that nobody holds any more has no workers either
+        self._closed = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def size(self) -> int:
+        """Number of workers that wait for a run."""
+        return len(self._waiting)
+
+    def lend(self, run: object) -> list[Any]:
+        """Hand all workers to a run, which gives back those that are left of them; used by `rollouts`.
+
+        Raises:
+            URLabError: Another run has them, or the pool is closed.
+        """
+        if self._closed:
+            raise URLabError("The worker pool is closed.", hint="Make another one.")
+        if self._run is not None and self._run() is not None:
+            raise URLabError("Another run uses the worker pool.", hint="Take its episodes, or close it, first.")
+        self._run = weakref.ref(run)
+        lent, self._waiting = self._waiting, []
+        return lent
+
+    def start(self) -> Any:
+        """Start a worker for the run; used by `rollouts`."""
+        return self._actor.remote()
+
+    def give_back(self, workers: Sequence[Any]) -> None:
+        """Take the workers of a run that is over; used by `rollouts`."""
+        self._run = None
+        if self._closed:
+            _end(workers)
+        else:
+            self._waiting.extend(workers)
+
+    def close(self) -> None:
+        """End the workers and their servers; those of a run that goes on end with it. Idempotent; waits for nothing."""
+        self._closed = True
+        _end(self._waiting)
+        self._waiting.clear()
+
+
+def _end(workers: Sequence[Any]) -> None:
+    for worker in workers:
+        _ray.kill(worker)

@@ -1,0 +1,124 @@
+"""What `mujoco.batch` does for environments, by MuJoCo Warp, for NVIDIA GPUs. Needs the extra `warp`.
+
+Resets are MuJoCo's own, in this process and in float64. Only steps are Warp's, in float32: the state of all copies goes
+to its device before an action and comes back after it.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from urlab_client._extras import need
+from urlab_client.protocol.errors import URLabError
+
+__all__ = ["WarpBatch"]
+
+Indices = NDArray[np.intp]
+
+_STATE: Final = ("qpos", "qvel", "act", "ctrl", "xfrc_applied", "time", "qacc_warmstart")
+_TAKEN: Final = ("qpos", "qvel", "act", "time", "qacc_warmstart", "sensordata")
+
+
+class WarpBatch:
+    """Many simulations of one model.
+
+    Args:
+        model: The model, shared by all.
+        nsim: Number of simulations.
+        contacts: Most contacts of a simulation at one time; MuJoCo Warp's own guess for 0.
+        constraints: Most rows of constraints of a simulation at one time; likewise.
+
+    Raises:
+        MissingExtra: MuJoCo Warp is not installed.
+        URLabError: MuJoCo Warp has not what the model uses.
+    """
+
+    def __init__(self, model: mujoco.MjModel, nsim: int, contacts: int = 0, constraints: int = 0) -> None:
+        need("mujoco_warp", extra="warp")
+        self._warp: Any = importlib.import_module("mujoco_warp")
+        self._model = model
+        self._data = mujoco.MjData(model)
+        mujoco.mj_forward(model, self._data)
+        self._bound: dict[str, NDArray[Any]] = {}
+        for name in (*_STATE, *_TAKEN):
+            self.bind(name)
+        self._bound = {name: np.repeat(values, nsim, axis=0) for name, values in self._bound.items()}
+        try:
+            self._device_model: Any = self._warp.put_model(model)
+            self._device: Any = self._warp.put_data(
+                model, self._data, nworld=nsim, nconmax=contacts or None, njmax=constraints or None
+            )
+        except NotImplementedError as error:
+            raise URLabError(
+                f"MuJoCo Warp cannot step this scene: {error}", hint="Leave `engine` out: MuJoCo itself can."
+            ) from error
+
+    def bind(self, name: str) -> NDArray[Any]:
+        """Return an `MjData` field of all simulations, shape (nsim, …). Writing to a part of the state has effect.
+
+        Raises:
+            ValueError: It is not one of those that come back from the device.
+        """
+        if name not in self._bound:
+            if name not in {*_STATE, *_TAKEN}:
+                raise ValueError(
+                    f"{name} does not come back from MuJoCo Warp: there are {', '.join((*_STATE, *_TAKEN))}"
+                )
+            self._bound[name] = np.array([np.copy(getattr(self._data, name))])
+        return self._bound[name]
+
+    def expand(self, name: str) -> NDArray[Any]:
+        """Refuse a field of the model with a value for each simulation.
+
+        Raises:
+            ValueError: Always.
+        """
+        raise ValueError(f"with engine='warp' all copies have one model: {name} cannot vary among them")
+
+    def reset(self, ids: Indices, keyframe: int = -1) -> None:
+        """Reset some simulations to the model's defaults or a keyframe, and compute what follows from that."""
+        if keyframe < 0:
+            mujoco.mj_resetData(self._model, self._data)
+        else:
+            mujoco.mj_resetDataKeyframe(self._model, self._data, keyframe)
+        mujoco.mj_forward(self._model, self._data)
+        for name, values in self._bound.items():
+            values[ids] = getattr(self._data, name)
+
+    def forward(self, ids: Indices) -> None:
+        """Compute what follows from the state of some simulations."""
+        for i in map(int, ids):
+            for name in _STATE:
+                setattr(self._data, name, self._bound[name][i])
+            mujoco.mj_forward(self._model, self._data)
+            for name in _TAKEN:
+                self._bound[name][i] = getattr(self._data, name)
+
+    def step(self, ids: Indices, nstep: int = 1) -> None:
+        """Advance some simulations; the others stay as they are.
+
+        Raises:
+            URLabError: The device's arrays have no room for the contacts or constraints of one; all stay as they were.
+        """
+        for name in _STATE:
+            # Its arrays have the shapes of MuJoCo's with a leading axis; an empty one, as of no `act`, has no memory.
+            if self._bound[name].size:
+                getattr(self._device, name).assign(self._bound[name].astype(np.float32))
+        self._device.overflow.assign(np.zeros(len(self._bound["time"]), dtype=np.int32))
+        for _ in range(nstep):
+            self._warp.step(self._device_model, self._device)
+        overflow = self._device.overflow.numpy()[ids]
+        if overflow.any():
+            raise URLabError(
+                f"Copies {', '.join(map(str, ids[overflow != 0][:8]))} have more contacts or constraints than there is "
+                "room for.",
+                hint="Give engine_options={'contacts': …, 'constraints': …}.",
+            )
+        for name in _TAKEN:
+            if self._bound[name].size:
+                self._bound[name][ids] = getattr(self._device, name).numpy()[ids]

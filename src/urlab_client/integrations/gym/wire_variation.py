@@ -1,0 +1,124 @@
+"""Episodes that vary on a server that varies nothing by itself, such as an editor: by the ops of its protocol."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from urlab_client.aio.client import URLabClient
+from urlab_client.aio.controllers import URLabPDController
+from urlab_client.aio.model.layout import ArticulationLayout
+from urlab_client.integrations._varied import controlled_actuators
+from urlab_client.protocol.base import Floats
+from urlab_client.randomise.declaration import Quantity, Randomisation, UnsupportedRandomisation, Vary
+from urlab_client.randomise.quantities import START, elements_of
+from urlab_client.randomise.variation import EpisodeDraws, Variation, field_of
+
+if TYPE_CHECKING:
+    import mujoco
+
+__all__ = ["WireVariation"]
+
+_GAINS: Final[frozenset[Quantity]] = frozenset({"kp", "kv"})
+_SETTABLE: Final[frozenset[Quantity]] = START | frozenset[Quantity]({"gravity"})
+
+
+@dataclass(frozen=True, eq=False)
+class _Controlled:
+    controller: URLabPDController
+    actuators: NDArray[np.intp]
+    gains: dict[str, dict[str, float]]
+    """Without variation, by gain and actuator, in the order of `actuators`."""
+
+
+class WireVariation:
+    """What varies, applied before and after the reset that starts an episode.
+
+    Attributes:
+        variation: The numbers, the same as those of a server that varies by itself.
+        controlled: Controllers whose gains vary, by articulation.
+    """
+
+    def __init__(
+        self,
+        client: URLabClient,
+        model: mujoco.MjModel,
+        layouts: Mapping[str, ArticulationLayout],
+        declared: Randomisation,
+        earlier: WireVariation | None = None,
+    ) -> None:
+        """Look up what varies.
+
+        Args:
+            client: The client, after the handshake.
+            model: Its model.
+            layouts: Where the articulations are in the model, by key.
+            declared: What is to vary.
+            earlier: That of an earlier session with the server, which may have left gravity and gains varied; for None
+                the present ones are those without variation.
+
+        Raises:
+            UnsupportedRandomisation: No op changes one of the quantities.
+            ValueError: A name fits no element.
+        """
+        controlled = controlled_actuators(client, layouts)
+        _check(client, model, declared, controlled)
+        self.variation: Variation = Variation(declared, model, controlled) if earlier is None else earlier.variation
+        self._client = client
+        self._model_fields: dict[str, NDArray[Any]] = {
+            name: np.array(field_of(model, name)) for name in self.variation.fields
+        }
+        self.controlled: dict[str, _Controlled] = {}
+        for key, articulation in client.articulations.items() if self.variation.varied_gains else ():
+            controller = articulation.controller
+            if isinstance(controller, URLabPDController):
+                gains = {name: dict[str, float](controller.params[name]) for name in self.variation.varied_gains}
+                if earlier is not None and key in earlier.controlled:
+                    gains = earlier.controlled[key].gains
+                actuators = [layouts[key].actuators[name] for name in controller.kp]
+                self.controlled[key] = _Controlled(controller, np.array(actuators, dtype=np.intp), gains)
+
+    async def apply(self, draws: EpisodeDraws) -> None:
+        """Set what a reset leaves alone: gravity, and the gains of controllers."""
+        if self._model_fields:
+            self.variation.write(draws, self._model_fields.__getitem__)
+            await self._set_gravity()
+        for each in self.controlled.values():
+            factors = self.variation.gain_factors(draws, each.actuators)
+            scaled = {
+                name: dict(zip(by, (np.array([*by.values()]) * factors[name]).tolist(), strict=True))
+                for name, by in each.gains.items()
+            }
+            await each.controller.set_gains(scaled.get("kp"), scaled.get("kv"))
+
+    def start(self, draws: EpisodeDraws, qpos: Floats) -> None:
+        """Vary where the episode starts, in place; see `Variation.start`."""
+        self.variation.start(draws, qpos)
+
+    async def undo(self) -> None:
+        """Set gravity and gains as they were."""
+        if self._model_fields:
+            self.variation.restore(self._model_fields.__getitem__)
+            await self._set_gravity()
+        for each in self.controlled.values():
+            await each.controller.set_gains(each.gains.get("kp"), each.gains.get("kv"))
+
+    async def _set_gravity(self) -> None:
+        gravity = self._model_fields.get("opt.gravity")
+        if gravity is not None:
+            await self._client.runtime.set_sim_options(gravity=gravity)
+
+
+def _check(client: URLabClient, model: mujoco.MjModel, declared: Randomisation, controlled: frozenset[int]) -> None:
+    def settable(vary: Vary) -> bool:
+        if vary.what in _GAINS:
+            return controlled.issuperset(elements_of(vary, model, controlled).ids.tolist())
+        return vary.what in _SETTABLE
+
+    refused = [vary.what for vary in declared.vary if not settable(vary)]
+    if refused:
+        raise UnsupportedRandomisation(tuple(dict.fromkeys(refused)), str(client.address))

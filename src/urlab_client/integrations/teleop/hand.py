@@ -1,0 +1,189 @@
+"""`HandControl`: velocities of a hand become set-points of the joints that move it."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from urlab_client.aio.client import URLabClient as AsyncClient
+from urlab_client.aio.model.elements import Actuator
+from urlab_client.aio.model.mirror import model_names
+from urlab_client.aio.model.numbers import finite, finite_array
+from urlab_client.integrations.ik import IkSolution, InverseKinematics
+from urlab_client.integrations.ik.solver import Vector
+from urlab_client.protocol.base import Floats
+from urlab_client.protocol.errors import URLabError
+from urlab_client.sync.client import URLabClient
+
+__all__ = ["HandControl"]
+
+_LEASH_M: Final = 0.1
+"""How far the target may be ahead of the hand: no farther when the hand is stopped by what it pushes against."""
+
+_GRIPPER_S: Final = 0.5  # from open to closed
+_TOLERANCE_M: Final = 1e-3
+
+
+class HandControl:
+    """Moves a site of a robot, its hand, by velocities in the world's frame, and opens and closes its gripper.
+
+    A target moves with the velocity, and inverse kinematics turns it into set-points within all limits. It stops at the
+    edge of the reachable, and a tenth of a metre ahead of a hand that is held up. `hold` begins anew where the hand is,
+    which is right after a reset.
+
+    Attributes:
+        ik: The inverse kinematics.
+        key: Key of the articulation.
+        gripper: Name of the actuator that opens and closes the gripper, or None.
+        speed: Largest speed, m/s.
+        turn_speed: Largest rate of turn, rad/s.
+        set_points: Those that were set last, by actuator name.
+        blocked: Whether the target could not move as it was told to last.
+    """
+
+    def __init__(
+        self,
+        client: URLabClient | AsyncClient,
+        articulation: str | None = None,
+        *,
+        site: str | None = None,
+        gripper: str | None = None,
+        speed: float = 0.25,
+        turn_speed: float = 1.0,
+    ) -> None:
+        """Prepare, and hold the hand where it is.
+
+        Args:
+            client: A client of either flavour after `discover()`, with a local model.
+            articulation: Key of the robot; not needed where there is only one.
+            site: The hand; not needed where the robot has one site.
+            gripper: Actuator of the gripper; by default the one that does not move the hand, if there is just one.
+            speed: Largest speed, m/s.
+            turn_speed: Largest rate of turn, rad/s.
+
+        Raises:
+            KeyError: There is no such articulation, site or actuator.
+            ValueError: A speed is not above 0, the gripper has no range, or nothing that is held at a position moves
+                the hand.
+            URLabError: The client has no local model, or the robot or the site must be named.
+        """
+        robots = client.articulations
+        if articulation is None and len(robots) != 1:
+            raise URLabError(f"Name the articulation: the scene has {', '.join(robots) or 'none'}.")
+        self.key: str = next(iter(robots)) if articulation is None else robots[articulation].prefix
+        self._robot = robots[self.key]
+        self.ik: InverseKinematics = InverseKinematics(client, self.key, site=site or _only_site(client, self.key))
+        self.speed: float = _above_zero("speed", speed)
+        self.turn_speed: float = _above_zero("turn_speed", turn_speed)
+        self.blocked: bool = False
+        self.set_points: dict[str, float] = {}
+        present = self.ik.solve(self.ik.pose()[0], nearest=True, starts=1)
+        found = self._gripper(gripper, present)
+        self.gripper: str | None = None if found is None else found.name
+        self._range = (0.0, 0.0) if found is None else found.ctrlrange or (0.0, 0.0)
+        self.hold()
+
+    @property
+    def target(self) -> tuple[Floats, Floats]:
+        """Where the hand is to be: position, metres, and orientation (w, x, y, z), world frame."""
+        return self._position.copy(), self._quaternion.copy()
+
+    def hold(self) -> None:
+        """Aim at where the hand is, and set the set-points that keep it there. The gripper keeps its set-point."""
+        self._position, self._quaternion = self.ik.pose()
+        self._joints = {name: float(self._robot.joints[name].position) for name in self.ik.joints}
+        self._opening = 0.0 if self.gripper is None else self._robot.actuators[self.gripper].value
+        self.blocked = False
+        self._aim(self._position, self._quaternion)
+
+    def drive(self, linear: Vector, angular: Vector = (0, 0, 0), gripper: float = 0.0, *, dt: float) -> bool:
+        """Move the target on, and set the set-points. They travel with the next step.
+
+        Args:
+            linear: Velocity as a share of `speed`, world frame, shape (3,); a longer one than 1 counts as 1.
+            angular: Rate of turn as a share of `turn_speed`, likewise: about the world's axes.
+            gripper: Towards its largest set-point (1) or its smallest (-1); what is in between is slower.
+            dt: Seconds that this is for.
+
+        Returns:
+            Whether the target could move so; if not, it stays.
+
+        Raises:
+            ValueError: A number is NaN, infinite, or a vector has another length; nothing changed.
+        """
+        moving, turning = _within_one("linear", linear), _within_one("angular", angular)
+        dt, opening = _above_zero("dt", dt), float(np.clip(finite("gripper", gripper), -1.0, 1.0))
+        low, high = self._range
+        self._opening = float(np.clip(self._opening + opening * dt * (high - low) / _GRIPPER_S, low, high))
+        hand, _ = self.ik.pose()
+        ahead = self._position + self.speed * dt * moving - hand
+        distance = float(np.linalg.norm(ahead))
+        position = hand + ahead * min(1.0, _LEASH_M / distance if distance else 1.0)
+        quaternion = _turned(self._quaternion, self.turn_speed * dt * turning)
+        self.blocked = not self._aim(position, quaternion)
+        return not self.blocked
+
+    def _aim(self, position: Floats, quaternion: Floats) -> bool:
+        """Set the set-points for a pose; those of before if it is out of reach."""
+        found = self.ik.solve(position, quaternion, start=self._joints, starts=1, tolerance=_TOLERANCE_M, nearest=True)
+        if found.reached:
+            self._position, self._quaternion, self._joints = position, quaternion, found.joints
+            self.set_points |= found.set_points
+        if self.gripper is not None:
+            self.set_points[self.gripper] = self._opening
+        self._robot.set_ctrl(self.set_points)
+        return found.reached
+
+    def _gripper(self, name: str | None, solution: IkSolution) -> Actuator | None:
+        actuators = self._robot.actuators
+        if name is None:
+            others = [one for key, one in actuators.items() if key not in solution.set_points and one.ctrlrange]
+            return others[0] if len(others) == 1 else None
+        if actuators[name].ctrlrange is None:
+            raise ValueError(f"the gripper {name!r} has no control range to move in")
+        return actuators[name]
+
+    def __repr__(self) -> str:
+        return f"<HandControl of {self.ik.frame!r} of {self.key!r}>"
+
+
+def _only_site(client: URLabClient | AsyncClient, key: str) -> str:
+    prefix = f"{client.articulations[key].compiled_prefix}_"
+    names = [] if client.model is None else model_names(client.model, "site")
+    sites = [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
+    if client.model is not None and len(sites) != 1:
+        raise URLabError(f"Name the hand of {key!r}, one of its sites: it has {', '.join(sites) or 'none'}.")
+    return sites[0] if sites else ""
+
+
+def _within_one(what: str, values: Vector) -> Floats:
+    given = finite_array(what, values)
+    if given.shape != (3,):
+        raise ValueError(f"{what} takes 3 numbers, got an array of shape {given.shape}")
+    return given / max(1.0, float(np.linalg.norm(given)))
+
+
+def _above_zero(what: str, value: float) -> float:
+    number = finite(what, value)
+    if number <= 0:
+        raise ValueError(f"{what} must be above 0, not {number:g}")
+    return number
+
+
+def _turned(quaternion: Floats, turn: Floats) -> Floats:
+    """Return an orientation (w, x, y, z) after a turn about the world's axes, rad."""
+    angle = float(np.linalg.norm(turn))
+    if not angle:
+        return quaternion
+    w, (x, y, z) = np.cos(angle / 2), np.sin(angle / 2) / angle * turn
+    a, b, c, d = quaternion
+    turned = np.array(
+        [
+            w * a - x * b - y * c - z * d,
+            w * b + x * a + y * d - z * c,
+            w * c - x * d + y * a + z * b,
+            w * d + x * c - y * b + z * a,
+        ]
+    )
+    return turned / np.linalg.norm(turned)

@@ -1,0 +1,105 @@
+"""`KeyboardOperator`: keys as a terminal sends them, which tells when one is pressed but not when it is let go."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from urlab_client.integrations.teleop.session import TeleopCommand, TeleopView, Verdict
+
+__all__ = ["HELP", "KeyboardOperator"]
+
+_HELD_S: Final = 0.12
+"""How long one press moves the hand: a little longer than keys that are held take to repeat."""
+
+_FINE: Final = 0.2
+
+
+class _Motion(NamedTuple):
+    axis: int  # 0 to 2 linear, 3 to 5 angular
+    sign: float
+
+
+_MOTIONS: Final[dict[str, _Motion]] = {
+    "w": _Motion(0, 1.0),
+    "s": _Motion(0, -1.0),
+    "a": _Motion(1, 1.0),
+    "d": _Motion(1, -1.0),
+    "r": _Motion(2, 1.0),
+    "f": _Motion(2, -1.0),
+    "c": _Motion(3, 1.0),
+    "z": _Motion(3, -1.0),
+    "b": _Motion(4, 1.0),
+    "v": _Motion(4, -1.0),
+    "q": _Motion(5, 1.0),
+    "e": _Motion(5, -1.0),
+}
+_VERDICTS: Final[dict[str, Verdict]] = {
+    "\r": "success",
+    "\n": "success",
+    "n": "failure",
+    "\x7f": "discarded",
+    "\b": "discarded",
+    "\x03": "quit",
+    "\x04": "quit",
+}
+_ARROWS: Final = {"\x1b[A": "w", "\x1b[B": "s", "\x1b[D": "a", "\x1b[C": "d"}
+
+HELP: Final = (
+    ("w s, a d, r f", "move along x, y, z; also the arrows for x and y; with shift slowly"),
+    ("c z, b v, q e", "turn about x, y, z; with shift slowly"),
+    ("space", "close or open the gripper"),
+    ("enter, n", "the episode is a success, a failure"),
+    ("backspace", "discard the episode"),
+    ("ctrl-c", "end"),
+)
+"""Keys and what they do, world frame."""
+
+
+class KeyboardOperator:
+    """Turns key presses into commands.
+
+    Attributes:
+        keys: Returns the characters that have come since the last call; empty for none.
+    """
+
+    def __init__(self, keys: Callable[[], str], *, clock: Callable[[], float] = time.monotonic) -> None:
+        """Make an operator.
+
+        Args:
+            keys: Returns the characters that have come since the last call.
+            clock: Seconds, of what keys are held by.
+        """
+        self.keys = keys
+        self._clock = clock
+        self._until = np.full(6, -np.inf)
+        self._speed = np.zeros(6)
+        self._gripper = 0.0
+        self._rest = ""
+
+    def __call__(self, view: TeleopView, /) -> TeleopCommand:
+        """See `Operator`."""
+        del view
+        pressed, now = self._rest + self.keys(), self._clock()
+        self._rest = ""
+        for sequence, key in _ARROWS.items():
+            pressed = pressed.replace(sequence, key)
+        for i, key in enumerate(pressed):
+            if key in _VERDICTS:
+                self._until[:] = -np.inf
+                self._gripper = 0.0
+                self._rest = pressed[i + 1 :]  # belongs to the next episode
+                return TeleopCommand(verdict=_VERDICTS[key])
+            if key == " ":
+                self._gripper = 1.0 if self._gripper < 0 else -1.0
+            motion = _MOTIONS.get(key.lower())
+            if motion is not None:
+                self._speed[motion.axis] = motion.sign * (_FINE if key.isupper() else 1.0)
+                self._until[motion.axis] = now + _HELD_S
+        speed = np.where(self._until > now, self._speed, 0.0).tolist()
+        return TeleopCommand(
+            linear=(speed[0], speed[1], speed[2]), angular=(speed[3], speed[4], speed[5]), gripper=self._gripper
+        )

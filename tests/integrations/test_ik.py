@@ -1,0 +1,124 @@
+"""Inverse kinematics: poses of frames in the world to joints within their limits."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from urlab_client import URLabClient
+from urlab_client.integrations.ik import InverseKinematics, UnreachableTarget
+from urlab_client.server import ControllerConfig, SimulatedServer
+
+RIGHT_ANGLE = (math.cos(math.pi / 4), 0.0, 0.0, math.sin(math.pi / 4))
+
+
+@pytest.fixture(scope="module")
+def client() -> Iterator[URLabClient]:
+    """A client of an arm beside a quadruped with a PD controller, both away from the world's origin."""
+    pd = {"quadruped": ControllerConfig(kp=60.0, kv=2.0)}
+    with SimulatedServer("arm", "quadruped", play=True, controllers=pd) as server:
+        address = f"{server.address}:{server.step_port}"
+        with URLabClient(address, step_mode="direct") as client:
+            client.discover()
+            yield client
+
+
+@pytest.fixture
+def ik(client: URLabClient) -> InverseKinematics:
+    client.reset()
+    return InverseKinematics(client, "arm", site="grip")
+
+
+def test_the_hand_arrives_where_it_was_asked_to_be(client: URLabClient, ik: InverseKinematics) -> None:
+    before, _ = ik.pose()
+    aim = before + np.array([-0.1, 0.15, -0.05])
+    solution = ik.solve(aim, RIGHT_ANGLE)
+    assert solution.reached
+    arm = client.articulations["arm"]
+    arm.set_ctrl(solution.set_points, out_of_range="error")
+    client.run_for(2.0)
+    position = arm.get_sensors()["grip_position"]  # the server's own figures
+    quaternion = arm.get_sensors()["grip_orientation"]
+    assert np.linalg.norm(position - aim) < 0.002
+    assert abs(quaternion @ RIGHT_ANGLE) > math.cos(0.01)
+    assert np.allclose(ik.pose()[0], position, atol=1e-3)
+
+
+def test_what_stands_still_is_outside_of_the_problem(client: URLabClient, ik: InverseKinematics) -> None:
+    assert "left_finger" not in ik.joints
+    assert set(InverseKinematics(client, "arm", body="hand").joints) == set(ik.joints)
+    some = InverseKinematics(client, "arm", site="grip", joints=["shoulder_lift", "elbow"])
+    solution = some.solve(some.pose({"elbow": 0.3, "shoulder_lift": -0.1})[0])
+    assert list(solution.joints) == ["shoulder_lift", "elbow"]
+    assert solution.joints["elbow"] == pytest.approx(0.3, abs=0.02)
+
+
+def test_a_foot_below_a_free_base_moves_by_its_own_leg(client: URLabClient) -> None:
+    client.reset()
+    quadruped = client.articulations["quadruped"]
+    foot = next(name for name in quadruped.bodies if name.endswith("shin") or "calf" in name or "foot" in name)
+    leg = InverseKinematics(client, "quadruped", body=foot)
+    assert len(leg.joints) == 3
+    angles = {name: float(quadruped.joints[name].position) + 0.1 for name in leg.joints}
+    solution = leg.solve(leg.pose(angles)[0], tolerance=1e-4)
+    assert leg.pose(solution.joints)[0] == pytest.approx(leg.pose(angles)[0], abs=1e-4)
+
+
+def test_solutions_keep_within_limits(ik: InverseKinematics, client: URLabClient) -> None:
+    joints = client.articulations["arm"].joints
+    rng = np.random.default_rng(3)
+    for _ in range(8):
+        solution = ik.solve(ik.pose()[0] + rng.uniform(-0.8, 0.8, 3), nearest=True, starts=2)
+        for name, position in solution.joints.items():
+            low, high = joints[name].limits or (-math.inf, math.inf)
+            assert low <= position <= high
+
+
+def test_a_target_out_of_reach_is_reported_with_the_nearest(ik: InverseKinematics) -> None:
+    aim = ik.pose()[0] + [3.0, 0.0, 0.0]
+    with pytest.raises(
+        UnreachableTarget, match=r"'grip' of 'arm' does not reach .* nearest found is 2\.\d+ m"
+    ) as caught:
+        ik.solve(aim)
+    nearest = ik.solve(aim, nearest=True)
+    assert not nearest.reached
+    assert nearest == caught.value.nearest
+    assert pickle.loads(pickle.dumps(caught.value)).nearest == nearest
+    with pytest.raises(UnreachableTarget, match="rad from the orientation"):
+        ik.solve(aim, RIGHT_ANGLE, starts=1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options", "said"),
+    [
+        (([0.4, math.nan, 0.4],), {}, "position takes finite numbers, got nan at 1"),
+        (([0.4, 0.4],), {}, r"position takes 3 numbers, got an array of shape \(2,\)"),
+        (([0.4, 0.0, 0.4], [0, 0, 0, 0]), {}, "quaternion is all zeros"),
+        (([0.4, 0.0, 0.4], [math.inf, 0, 0, 0]), {}, "quaternion takes finite numbers"),
+        (([0.4, 0.0, 0.4],), {"starts": 0}, "starts must be at least 1"),
+        (([0.4, 0.0, 0.4],), {"tolerance": 0.0}, "tolerance must be above 0"),
+        (([0.4, 0.0, 0.4],), {"start": {"elbow": math.nan}}, "start: joint 'elbow' takes a finite number"),
+    ],
+)
+def test_bad_targets_are_refused(ik: InverseKinematics, arguments: tuple, options: dict, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        ik.solve(*arguments, **options)
+
+
+def test_bad_frames_are_refused(client: URLabClient, ik: InverseKinematics) -> None:
+    with pytest.raises(KeyError, match=r"has no site 'gripp'.*grip"):
+        InverseKinematics(client, "arm", site="gripp")
+    with pytest.raises(ValueError, match="either site=NAME or body=NAME"):
+        InverseKinematics(client, "arm")
+    with pytest.raises(ValueError, match="no position servo of joint 'right_finger' moves site 'grip'"):
+        InverseKinematics(client, "arm", site="grip", joints=["right_finger"])
+    with pytest.raises(ValueError, match="nothing that is held at a position moves body 'base'"):
+        InverseKinematics(client, "arm", body="base")
+    with pytest.raises(Exception, match="Name the articulation: the scene has arm, quadruped"):
+        InverseKinematics(client, site="grip")
+    with pytest.raises(KeyError, match="no joint 'left_finger' moves 'grip'"):
+        ik.solve([0.4, 0.0, 0.4], start={"left_finger": 0.0})

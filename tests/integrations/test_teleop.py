@@ -1,0 +1,240 @@
+"""Teleoperation: velocities of a hand, keys that move it, and recordings of episodes with what became of them."""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+import subprocess
+import sys
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from waiting import DEADLINE_S
+
+from urlab_client import URLabError
+from urlab_client.aio import URLabClient
+from urlab_client.cli import main
+from urlab_client.integrations.gym import Reach
+from urlab_client.integrations.record import read_run, record, transitions_of
+from urlab_client.integrations.teleop import (
+    HandControl,
+    KeyboardOperator,
+    TeleopCommand,
+    TeleopTally,
+    TeleopView,
+    teleoperate,
+)
+from urlab_client.server import SimulatedServer
+
+VIEW: Any = None
+"""What a keyboard's operator does not look at."""
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[SimulatedServer]:
+    with SimulatedServer("arm", play=True) as made:
+        yield made
+
+
+@pytest.fixture
+async def client(server: SimulatedServer) -> AsyncIterator[URLabClient]:
+    async with URLabClient(**server.client_options(), step_mode="direct") as made:
+        await made.discover()
+        await made.reset()
+        yield made
+
+
+def towards(view: TeleopView) -> TeleopCommand:
+    """Go straight to the target; a success after a moment there."""
+    ahead = view.goal["target"] - view.position
+    if np.linalg.norm(ahead) < 0.005:
+        return TeleopCommand(verdict="success")
+    return TeleopCommand(linear=tuple(ahead / 0.05))
+
+
+async def test_the_hand_moves_as_fast_as_it_is_told_and_keeps_its_orientation(client: URLabClient) -> None:
+    hand = HandControl(client, speed=0.2)
+    start, upright = hand.ik.pose()
+    for _ in range(50):
+        assert hand.drive((0.0, 3.0, 0.0), gripper=1.0, dt=0.02)  # longer than 1 counts as 1
+        await client.step(10)
+    at, turned = hand.target
+    assert at - start == pytest.approx([0.0, 0.2, 0.0], abs=1e-6)
+    await client.run_for(0.5)
+    assert hand.ik.pose()[0] == pytest.approx(at, abs=0.005)
+    assert abs(turned @ upright) == pytest.approx(1.0)
+    assert hand.gripper == "gripper"
+    assert client.articulations["arm"].get_ctrl()["gripper"] == 0.04
+    for _ in range(25):
+        hand.drive((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), dt=0.02)
+        await client.step(10)
+    await client.run_for(0.5)
+    w, x, y, z = hand.ik.pose()[1]
+    assert 2 * math.atan2(z, w) == pytest.approx(0.5, abs=0.02)
+    assert abs(x) + abs(y) < 0.02
+
+
+async def test_the_target_stops_at_the_edge_and_does_not_run_ahead(client: URLabClient) -> None:
+    hand = HandControl(client, speed=1.0)
+    before = hand.ik.pose()[0]
+    assert hand.drive((1.0, 0.0, 0.0), dt=1.0)
+    assert np.linalg.norm(hand.target[0] - before) == pytest.approx(0.1)
+    set_points = client.articulations["arm"].get_ctrl()
+    for _ in range(100):
+        hand.drive((1.0, 0.0, 0.0), dt=0.02)
+        await client.step(10)
+    assert hand.blocked
+    assert client.articulations["arm"].get_ctrl() != set_points
+    assert hand.drive((-1.0, 0.0, 0.0), dt=0.02)
+    await client.reset()
+    hand.hold()
+    assert hand.target[0] == pytest.approx(before, abs=1e-6)
+
+
+async def test_bad_velocities_and_names_are_refused(client: URLabClient) -> None:
+    hand = HandControl(client, "arm", site="grip", gripper="gripper")
+    before, set_points = hand.target[0], client.articulations["arm"].get_ctrl()
+    for arguments, said in (
+        ({"linear": (math.nan, 0, 0)}, "linear takes finite numbers"),
+        ({"linear": (0, 0, 0), "angular": (0, 0)}, "angular takes 3 numbers"),
+        ({"linear": (0, 0, 0), "gripper": math.inf}, "gripper takes a finite number"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            hand.drive(**arguments, dt=0.02)
+    with pytest.raises(ValueError, match="dt must be above 0"):
+        hand.drive((1, 0, 0), dt=0.0)
+    assert (hand.target[0] == before).all()
+    assert client.articulations["arm"].get_ctrl() == set_points
+    with pytest.raises(KeyError, match="no site 'hand'"):
+        HandControl(client, "arm", site="hand")
+    with pytest.raises(ValueError, match="hz must be above 0 and at most"):
+        await teleoperate(client, towards, hz=5000.0)
+
+
+async def test_episodes_are_recorded_with_outcome_and_goal(client: URLabClient, tmp_path: Path) -> None:
+    def operate(view: TeleopView) -> TeleopCommand:
+        if view.episode == 1 and view.time > 0.1:
+            return TeleopCommand(verdict="discarded")
+        if view.episode == 2 and view.time > 0.1:
+            return TeleopCommand(verdict="failure")
+        return towards(view)
+
+    file = tmp_path / "reach.mcap"
+    async with record(client, file, pose_hz=0) as recorder:
+        tally = await teleoperate(
+            client, operate, hand=HandControl(client, speed=0.5), task=Reach(), recorder=recorder, episodes=3
+        )
+        await client.reset()
+        await client.step(10)  # an episode that nobody judged
+    assert tally == TeleopTally(success=2, failure=1, discarded=1)
+
+    run = read_run(file)
+    marks = {mark.episode: mark for mark in run.summary().outcomes}
+    assert [mark.outcome for mark in marks.values()] == ["success", "discarded", "failure", "success"]
+    kept, good = transitions_of(run), transitions_of(run, only="success")
+    assert set(kept.episode.tolist()) == {0, 2, 3}
+    assert set(good.episode.tolist()) == {0, 3}
+    assert set(transitions_of(run, only="all").episode.tolist()) == {0, 1, 2, 3, 4}
+    for episode in (0, 3):
+        rows = kept.episode == episode
+        target = np.array(marks[episode].goal["target"])
+        assert (kept.columns["goal/target"].values[rows] == target).all()
+        last = kept.columns["arm/sensors"]
+        hand = [last.names.index(f"grip_position.{axis}") for axis in range(3)]
+        assert np.linalg.norm(last.values[rows][-1][hand] - target) < 0.02
+
+    table = tmp_path / "reach.csv"
+    assert main(["convert", str(file), str(table), "--episodes", "success"]) == 0
+    with table.open(encoding="utf-8") as lines:
+        found = list(csv.DictReader(lines))
+    assert len(found) == len(good)
+    assert float(found[0]["goal/target/2"]) == marks[0].goal["target"][2]
+
+
+async def test_what_is_broken_off_is_discarded(client: URLabClient, tmp_path: Path) -> None:
+    def operate(view: TeleopView) -> TeleopCommand:
+        if view.time > 0.1:
+            return TeleopCommand(verdict="quit")
+        return TeleopCommand(gripper=1.0)
+
+    async with record(client, tmp_path / "run.mcap", pose_hz=0) as recorder:
+        assert await teleoperate(client, operate, recorder=recorder) == TeleopTally(discarded=1)
+        with pytest.raises(ValueError, match="outcome must be one of success, failure, discarded, not 'won'"):
+            await recorder.mark("won")  # type: ignore[arg-type]
+        with pytest.raises(ValueError, match="goal 'target' takes finite numbers"):
+            await recorder.mark("success", goal={"target": [math.nan]})
+    with pytest.raises(URLabError, match="no recording to mark an episode in"):
+        await recorder.mark("success")
+    assert len(transitions_of(read_run(tmp_path / "run.mcap"))) == 0
+
+
+async def test_an_episode_ends_by_itself_as_the_task_judges(client: URLabClient) -> None:
+    def linger(view: TeleopView) -> TeleopCommand:
+        command = towards(view) if view.episode else TeleopCommand(gripper=1.0)
+        return TeleopCommand(gripper=1.0) if command.verdict else command
+
+    hand = HandControl(client, speed=0.5)
+    tally = await teleoperate(client, linger, hand=hand, task=Reach(), episodes=2, seconds=2.0)
+    assert tally == TeleopTally(success=1, failure=1)
+
+
+def test_keys_move_while_they_repeat() -> None:
+    typed, now = [""], [0.0]
+    operator = KeyboardOperator(lambda: typed.pop(0) if typed else "", clock=lambda: now[0])
+    assert not operator(VIEW).moves
+    typed.append("w\x1b[DF")
+    assert operator(VIEW).linear == (1.0, 1.0, -0.2)
+    now[0] = 0.1
+    assert operator(VIEW).linear == (1.0, 1.0, -0.2)
+    typed.append("s")
+    now[0] = 0.15
+    assert operator(VIEW).linear == (-1.0, 0.0, 0.0)
+    now[0] = 1.0
+    assert not operator(VIEW).moves
+    typed += ["q ", " "]
+    assert operator(VIEW) == TeleopCommand(angular=(0.0, 0.0, 1.0), gripper=-1.0)
+    assert operator(VIEW).gripper == 1.0
+    verdicts = {"\r": "success", "n": "failure", "\x7f": "discarded", "\x03": "quit"}
+    for key, verdict in verdicts.items():
+        typed.append(f"w{key}")
+        assert operator(VIEW).verdict == verdict
+        assert not operator(VIEW).moves
+    typed.append("wd\rr")
+    assert operator(VIEW).verdict == "success"
+    assert operator(VIEW).linear == (0.0, 0.0, 1.0)  # of the next episode
+
+
+@pytest.mark.long
+def test_the_command_records_what_is_typed(tmp_path: Path, server: SimulatedServer) -> None:
+    import pty
+
+    options, file = server.client_options(), tmp_path / "typed.mcap"
+    arguments = [f"tcp://{server.address.rpartition('/')[2]}:{options['step_port']}", "--record", str(file)]
+    keyboard, screen = pty.openpty()
+    command = [sys.executable, "-m", "urlab_client", "teleop", *arguments, "--task", "urlab/Reach-v0"]
+    with subprocess.Popen(command, stdin=screen, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for _ in range(6):  # the keys and what they do: from here on it listens
+            process.stdout.readline()
+        os.write(keyboard, b"w\nr\x04")  # nothing moved yet when the first episode is judged
+        out, error = process.communicate(timeout=DEADLINE_S)
+    os.close(keyboard)
+    os.close(screen)
+    assert process.returncode == 0, error
+    assert out == f"{file}  0 successes, 0 failures, 0 discarded\n"
+    assert read_run(file).summary().complete
+
+
+def test_the_command_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments, said in (
+        (["sim://arm", "--record", "x.csv"], ".mcap"),
+        (["sim://arm", "--camera", "arm/wrist"], "--camera and --overwrite go with --record"),
+        (["--task", "urlab/Reech-v0"], "'urlab/Reech-v0' is not a task. Did you mean 'urlab/Reach-v0'"),
+        (["sim://arm"], "keys are read from a terminal"),
+    ):
+        assert main(["teleop", *arguments]) == 2
+        assert said in capsys.readouterr().err
