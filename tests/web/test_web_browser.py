@@ -423,7 +423,7 @@ def test_the_3d_view_shows_the_robot_and_follows_it(page: Page, tmp_path: Path) 
         point = one.driver.execute_async_script(
             ask + "import('/static/link.js').then(async ({ask}) => { for (let y = 0.2; y < 0.9; y += 0.04)"
             "for (let x = 0.2; x < 0.8; x += 0.04) { const {innerWidth: w, innerHeight: h} = frame.contentWindow;"
-            "const ray = frame.contentWindow.eval(`viewerHands.ray(${x * w}, ${y * h})`);"
+            "const ray = frame.contentWindow.eval(`viewerPointer.ray(${x * w}, ${y * h})`);"
             "const found = await ask('POST', 'api/pick', ray, {quiet: true});"
             "if (found?.body) return done([x * w, y * h, found.body.id]); } done(null); })"
         )

@@ -33,11 +33,11 @@ from urlab_client.protocol.messages.streams import (
     SessionOpened,
     StateSnapshot,
 )
+from urlab_client.web.body_pushing import BodyPushing
 from urlab_client.web.controls import Controls
 from urlab_client.web.description import WorldDescription, describe
 from urlab_client.web.driving_lease import DrivingLease, Viewer
 from urlab_client.web.hand_driving import HandDriving
-from urlab_client.web.handling import Handling
 from urlab_client.web.messages import ArticulationSample, Ctrl, EntitySample, Hand, Link, LogEntry, State, Status, World
 from urlab_client.web.mujoco_viewer import MujocoViewer
 from urlab_client.web.ops import encode
@@ -106,8 +106,8 @@ class ConsoleSession:
         self.hands: HandDriving = HandDriving(self)
         self.recordings: Recordings = Recordings(client, recordings)
         self.replay: Replay = Replay(self)
-        self.handling: Handling = Handling(self)
-        self.controls.before_step = self.handling.apply
+        self.body_pushing: BodyPushing = BodyPushing(self)
+        self.controls.before_step = self.body_pushing.apply
         self._handshake = handshake
         self._adopted = b""
         self._bells: set[asyncio.Event] = set()

@@ -43,7 +43,7 @@ SHOWN = "state_ack"
 TAKEN = 4001
 """Close code that tells a page that somebody else has MuJoCo's own panels."""
 
-_SHIM = '<script src="../static/viewer_hands.js"></script><script src="../static/mujoco_viewer.js"></script>'
+_SHIM = '<script src="../static/viewer_pointer.js"></script><script src="../static/mujoco_viewer.js"></script>'
 _INLINE = re.compile(r"<script>(.*?)</script>", re.DOTALL)
 
 

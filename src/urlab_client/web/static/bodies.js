@@ -77,8 +77,8 @@ export function makeBodies(frame) {
   }
 
   async function hear(data) {
-    if (data.viewer) bar.classList.toggle("unable", !data.hands);
-    if (data.viewer === "shown" && data.hands && !here.fitted) {
+    if (data.viewer) bar.classList.toggle("unable", !data.pointer);
+    if (data.viewer === "shown" && data.pointer && !here.fitted) {
       here.fitted = true;
       here.fitted = await fill();
       for (const one of [contacts, frames, push]) one.setAttribute("aria-pressed", "false");

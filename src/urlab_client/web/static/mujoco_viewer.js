@@ -6,7 +6,7 @@
 //   back by itself, the newest state is told again, and the page around says what is wrong, once.
 // - It draws whenever it can; here not while it is out of sight, and where drawing is slow, only half of the time:
 //   the page around it shares the thread.
-// - It neither tells where its camera is nor takes another one. Here the camera is ours (viewer_hands.js), and is
+// - It neither tells where its camera is nor takes another one. Here the camera is ours (viewer_pointer.js), and is
 //   written over its own before each frame. So are the selection and the overlays, into each state.
 // - It takes the keyboard once it was clicked; here the page around it gets the keys, which are the console's.
 
@@ -55,8 +55,8 @@
 
     /** Tell the newest state again before a frame that would else find none for a while, however long that took. */
     repeat() {
-      if (this.newest === null || (!viewerHands.undressed && performance.now() - this.toldAt < AGAIN_MS)) return;
-      viewerHands.dress(this.newest);
+      if (this.newest === null || (!viewerPointer.undressed && performance.now() - this.toldAt < AGAIN_MS)) return;
+      viewerPointer.dress(this.newest);
       this.repeats += 1;
       this.toldAt = performance.now();
       this.tell("message", { data: this.newest });
@@ -79,14 +79,14 @@
       };
       socket.onmessage = ({ data }) => {
         if (typeof data === "string" && data.startsWith(LAYOUT)) {
-          viewerHands.learn(JSON.parse(data.slice(LAYOUT.length)));
+          viewerPointer.learn(JSON.parse(data.slice(LAYOUT.length)));
           return;
         }
         if (data instanceof ArrayBuffer) {
           wanted = new DataView(data).getUint32(CRC_AT, true);
           this.newest = data;
           this.toldAt = performance.now();
-          viewerHands.dress(data);
+          viewerPointer.dress(data);
         }
         this.tell("message", { data });
       };
@@ -121,8 +121,8 @@
       tried = performance.now();
       reloadModel(wanted);
     }
-    if (shown) viewerHands.seek(currentModelCrc);
-    window.parent.postMessage({ viewer: shown ? "shown" : "loading", hands: viewerHands.found }, location.origin);
+    if (shown) viewerPointer.seek(currentModelCrc);
+    window.parent.postMessage({ viewer: shown ? "shown" : "loading", pointer: viewerPointer.found }, location.origin);
   }, 250);
 
   // Drawing
@@ -136,7 +136,7 @@
     const asked = performance.now();
     draw((now) => {
       sockets.forEach((socket) => socket.repeat());
-      viewerHands.aim();
+      viewerPointer.aim();
       callback(now);
       const took = performance.now() - asked;
       pause = took > SLOW_MS ? Math.min(took, 500) : 0;

@@ -9,28 +9,31 @@ import msgspec
 from starlette.requests import Request
 from starlette.responses import Response
 
+from urlab_client.web.body_pushing import BodyPushing, Pick, Push
 from urlab_client.web.driving_lease import Viewer
-from urlab_client.web.handling import Handling, Pick, Push
 from urlab_client.web.ops import encode
 
-__all__ = ["HandlingRoutes"]
+__all__ = ["BodyRoutes"]
 
 _Handler: TypeAlias = Callable[[Request], Awaitable[Response]]
 
 
-class HandlingRoutes:
+class BodyRoutes:
     """Handlers of `/api/bodies`, `/api/pick` and `/api/push`.
 
     Args:
-        handling: The bodies of the console.
+        body_pushing: The bodies of the console.
         viewer: Says who asks.
         body: Reads what a request carries.
     """
 
     def __init__(
-        self, handling: Handling, viewer: Callable[[Request], Viewer], body: Callable[[Request], Awaitable[bytes]]
+        self,
+        body_pushing: BodyPushing,
+        viewer: Callable[[Request], Viewer],
+        body: Callable[[Request], Awaitable[bytes]],
     ) -> None:
-        self._handling = handling
+        self._body_pushing = body_pushing
         self._viewer = viewer
         self._body = body
 
@@ -44,20 +47,20 @@ class HandlingRoutes:
         ]
 
     async def _bodies(self, request: Request) -> Response:
-        return _json(await self._handling.bodies())
+        return _json(await self._body_pushing.bodies())
 
     async def _one(self, request: Request) -> Response:
-        return _json(await self._handling.body(request.path_params["id"]))
+        return _json(await self._body_pushing.body(request.path_params["id"]))
 
     async def _pick(self, request: Request) -> Response:
-        return _json(await self._handling.pick(msgspec.json.decode(await self._body(request), type=Pick)))
+        return _json(await self._body_pushing.pick(msgspec.json.decode(await self._body(request), type=Pick)))
 
     async def _push(self, request: Request) -> Response:
         if request.method == "DELETE":
-            self._handling.release(self._viewer(request))
+            self._body_pushing.release(self._viewer(request))
         else:
             push = msgspec.json.decode(await self._body(request), type=Push)
-            await self._handling.push(self._viewer(request), push)
+            await self._body_pushing.push(self._viewer(request), push)
         return _json({})
 
 

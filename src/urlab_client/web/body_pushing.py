@@ -22,7 +22,7 @@ from urlab_client.web.replay import Replay
 if TYPE_CHECKING:
     from urlab_client.aio import URLabArticulation, URLabClient
 
-__all__ = ["BodyList", "BodyView", "Handling", "Pick", "Picked", "Push"]
+__all__ = ["BodyList", "BodyPushing", "BodyView", "Pick", "Picked", "Push"]
 
 _HELD_S = 0.6
 _VISIBLE_GROUPS = np.array([1, 1, 1, 0, 0, 0], np.uint8)
@@ -72,7 +72,7 @@ class Push(Struct):
 
 
 class Console(Protocol):
-    """What handling needs of the session that all viewers share."""
+    """What pushing needs of the session that all viewers share."""
 
     client: URLabClient
     lease: DrivingLease
@@ -80,7 +80,7 @@ class Console(Protocol):
     replay: Replay
 
 
-class Handling:
+class BodyPushing:
     """The bodies of one console and the one push there is at a time.
 
     Args:

@@ -3,7 +3,7 @@
 // The viewer keeps its camera to itself. It begins with the camera of the first state, so its places in memory are
 // found by that value; where they are not found, the viewer's own mouse control stays, and nothing can be picked.
 
-const viewerHands = (() => {
+const viewerPointer = (() => {
   const STATIC_BYTES = 8 * 1024 * 1024; // where a program keeps what lives as long as itself
   const CLICK_PIXELS = 4;
   const TURN = 180; // degrees for a drag over the whole height
@@ -32,12 +32,12 @@ const viewerHands = (() => {
       const [x, y, z, distance, azimuth, elevation] = first;
       Object.assign(camera, { lookat: [x, y, z], distance, azimuth, elevation });
     }
-    hands.found = places.length > 0 && layout.camera !== undefined;
+    pointer.found = places.length > 0 && layout.camera !== undefined;
   }
 
   /** Write our camera over the viewer's. */
   function aim() {
-    if (!hands.found) return;
+    if (!pointer.found) return;
     const memory = new Float64Array(wasmMemory.buffer, 0, STATIC_BYTES / 8);
     for (const place of places) memory.set(numbers(), place / 8);
   }
@@ -46,7 +46,7 @@ const viewerHands = (() => {
   function dress(data) {
     const view = new DataView(data);
     if (!layout) return;
-    if (layout.camera !== undefined && !hands.found) first = Array.from({ length: 6 }, (_, i) => view.getFloat64(layout.camera + 8 * i, true));
+    if (layout.camera !== undefined && !pointer.found) first = Array.from({ length: 6 }, (_, i) => view.getFloat64(layout.camera + 8 * i, true));
     const put = (name, value) => layout[name] !== undefined && view.setInt32(layout[name], value, true);
     put("select", wanted.select);
     put("frame", wanted.frames ? 1 : 0);
@@ -56,7 +56,7 @@ const viewerHands = (() => {
       wanted.pull.local.forEach((value, i) => view.setFloat64(layout.localpos + 8 * i, value, true));
       wanted.pull.target.forEach((value, i) => view.setFloat64(layout.refselpos + 8 * i, value, true));
     }
-    hands.undressed = false;
+    pointer.undressed = false;
   }
 
   // Geometry: MuJoCo's camera, z up
@@ -169,19 +169,19 @@ const viewerHands = (() => {
   function pull() {
     if (!drag.grip) return;
     wanted.pull = { local: drag.grip.local, target: onPlane(drag.grip.point, ray(...drag.at)) };
-    hands.undressed = true;
+    pointer.undressed = true;
     tell({ pull: wanted.pull });
   }
 
   function release() {
     wanted.pull = null;
-    hands.undressed = true;
+    pointer.undressed = true;
     tell({ release: true });
   }
 
   function handled(type, act) {
     window.addEventListener(type, (event) => {
-      if (!hands.found) return;
+      if (!pointer.found) return;
       event.stopImmediatePropagation();
       if (event.cancelable) event.preventDefault();
       act(event);
@@ -203,10 +203,10 @@ const viewerHands = (() => {
     if (data.pushing !== undefined) pushing = data.pushing;
     if (data.show) {
       Object.assign(wanted, data.show);
-      hands.undressed = true;
+      pointer.undressed = true;
     }
   });
 
-  const hands = { found: false, undressed: false, learn: (one) => { layout = one; }, seek, aim, dress, ray };
-  return hands;
+  const pointer = { found: false, undressed: false, learn: (one) => { layout = one; }, seek, aim, dress, ray };
+  return pointer;
 })();
