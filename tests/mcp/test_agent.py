@@ -146,7 +146,7 @@ async def test_an_agent_that_looks_on_takes_nothing_from_whoever_drives() -> Non
 
 async def test_what_an_agent_gets_wrong_is_said_and_nothing_is_done(direct: Desk) -> None:
     for tool, arguments, words in (
-        ("nothing", {}, ["no tool 'nothing'", "move_to"]),
+        ("nothing", {}, ["No tool is called 'nothing'", "move_to"]),
         ("state", {"robot": "arn"}, ["'arm'"]),
         ("state", {}, ["robot"]),
         ("run", {}, ["seconds", "steps"]),
@@ -164,8 +164,8 @@ async def test_what_an_agent_gets_wrong_is_said_and_nothing_is_done(direct: Desk
         ("reset", {"joints": {"arm": {"elbow": 9}}}, ["got 9"]),
         ("play", {"action": "pause"}, ["direct", "run"]),
         ("record", {"action": "stop"}, ["no recording runs"]),
-        ("import_model", {"model": "/etc/passwd"}, ["no model"]),
-        ("spawn", {"blueprint": "../arm", "actor_id": "b", "position": [0, 0, 0]}, ["no blueprint"]),
+        ("import_model", {"model": "/etc/passwd"}, ["No model is called"]),
+        ("spawn", {"blueprint": "../arm", "actor_id": "b", "position": [0, 0, 0]}, ["No blueprint is called"]),
         ("spawn", {"blueprint": "arm", "actor_id": "b", "position": [0, 0]}, ["position"]),
         ("remove", {"actor": "nobody"}, ["There are: arm"]),
         ("picture", {"camera": "arm/nothing"}, ["nothing"]),

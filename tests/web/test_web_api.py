@@ -199,6 +199,56 @@ def test_set_points_move_joints_and_stay_when_unknown(http: TestClient) -> None:
         assert moved["articulations"]["arm"]["targets"][2] == 0.5
 
 
+@pytest.mark.long
+def test_a_hand_moves_for_a_moment_and_episodes_are_judged(http: TestClient, tmp_path: Path) -> None:
+    def hand(live: Any) -> np.ndarray:
+        state = heard(live, "state")
+        return np.array(state["articulations"]["arm"]["sensors"]["grip_position"])
+
+    def at_rest(live: Any) -> np.ndarray:
+        while True:
+            state = heard(live, "state")
+            then = state["time"] + 0.1
+            later = heard(live, "state", lambda one, then=then: one["time"] > then)
+            places = [np.array(one["articulations"]["arm"]["sensors"]["grip_position"]) for one in (state, later)]
+            if np.abs(places[1] - places[0]).max() < 1e-4:
+                return places[1]
+
+    with (
+        http.websocket_connect("ws://localhost/api/live") as live,
+        http.websocket_connect("ws://localhost/api/live") as other,
+    ):
+        me = {"X-URLab-Viewer": heard(live, "you")["viewer"]}
+        http.post("/api/run", json={"running": True}, headers=me)
+        http.post("/api/ops/reset", json={}, headers=me)
+        refused = http.post("/api/recording/outcome", json={"outcome": "success"}, headers=me).json()
+        assert "no recording runs" in refused["error"]["message"]
+        assert http.post("/api/recording", json={"cameras": False}, headers=me).status_code == 200
+        before = at_rest(live)
+        order = {"type": "hand", "articulation": "arm", "linear": [0.0, 0.0, -1.0], "gripper": 1.0}
+        while hand(live)[2] > before[2] - 0.05:
+            live.send_json(order)
+        other.send_json(order)
+        assert heard(other, "refused")["error"]["code"] == "not_driving"
+        last = at_rest(live)  # nobody says more: it stops by itself
+        assert 0.05 < before[2] - last[2] < 0.05 + 0.25 * (0.25 + 0.1) + 0.1
+        assert last[:2] == pytest.approx(before[:2], abs=0.01)
+        targets = heard(live, "state")["articulations"]["arm"]["targets"]
+        assert targets[6] > 0.0
+        for wrong, said in (
+            ({"articulation": "leg"}, "leg"),
+            ({"site": "toe"}, "no site 'toe'"),
+            ({"linear": [1.0, 0.0]}, "Expected `array` of length 3"),
+        ):
+            live.send_json({**order, **wrong})
+            assert said in heard(live, "refused")["error"]["message"]
+        assert http.post("/api/recording/outcome", json={"outcome": "won"}, headers=me).status_code == 400
+        assert http.post("/api/recording/outcome", json={"outcome": "success"}, headers=me).status_code == 200
+        name = http.delete("/api/recording", headers=me).json()["name"]
+    marks = read_run(tmp_path / "recordings" / name).summary().outcomes
+    assert [mark.outcome for mark in marks] == ["success"]
+
+
 def test_states_are_dropped_and_not_queued_for_a_viewer_that_is_busy(http: TestClient) -> None:
     http.post("/api/run", json={"running": True})
     with (

@@ -67,6 +67,54 @@ def test_cameras_and_curves_are_drawn(page: Page) -> None:
     page.until(f"{drawn}(document.querySelector('.curve canvas'))")
 
 
+GAMEPAD = """
+window.pad = {id: 'Pad', connected: true, mapping: 'standard', axes: [0, 0, 0, 0],
+  buttons: Array.from({length: 17}, () => ({pressed: false, value: 0}))};
+navigator.getGamepads = () => [null, window.pad];
+"""
+
+
+def test_keys_and_a_gamepad_move_the_hand_and_judge_episodes(page: Page) -> None:
+    def hand() -> list[float]:
+        return page.ask("api/state")["articulations"]["arm"]["sensors"]["grip_position"]
+
+    def key(kind: str, code: str) -> None:
+        page.driver.execute_script(
+            "document.body.dispatchEvent(new KeyboardEvent(arguments[0], {code: arguments[1], bubbles: true}))",
+            kind,
+            code,
+        )
+
+    page.until(RUNNING)
+    page.ask("api/ops/reset", {})
+    page.asked("api/state", lambda state: state["time"] < 1.0)
+    page.click("#record")
+    page.until("document.querySelector('[data-outcome=success]').disabled === false")
+    page.click("#drive-hand")
+    page.until("document.querySelector('#gamepad').textContent.startsWith('No gamepad')")
+    before = hand()
+    key("keydown", "KeyA")
+    WebDriverWait(page.driver, PATIENCE_S, 0.05).until(lambda _: hand()[1] > before[1] + 0.05)
+    key("keyup", "KeyA")
+    page.driver.execute_script(GAMEPAD)
+    page.until("document.querySelector('#gamepad').textContent === 'Pad'")
+    page.driver.execute_script("window.pad.axes = [0.1, 0, 0, 1]")  # within the dead zone, and down
+    WebDriverWait(page.driver, PATIENCE_S, 0.05).until(lambda _: hand()[2] < before[2] - 0.05)
+    page.driver.execute_script("window.pad.axes = [0, 0, 0, 0]; window.pad.buttons[0] = {pressed: true, value: 1}")
+    page.asked("api/state", lambda state: state["time"] < 1.0)  # a success, and reset
+    page.until("document.querySelector('#log').innerText.includes('success')")
+    page.driver.execute_script("window.pad.buttons[0] = {pressed: false, value: 0}")
+    page.click("#drive-hand")
+    page.click("#record")
+    page.until("document.querySelector('#record').textContent.includes('Record')")
+    page.until("document.querySelectorAll('.recorded').length === 1")
+    page.driver.execute_script(
+        "const name = document.querySelector('.recorded').dataset.recording;"
+        "import('/static/link.js').then(({ask}) => ask('DELETE', `api/recordings/${name}`))"
+    )
+    page.until("document.querySelectorAll('.recorded').length === 0")
+
+
 def test_the_stop_button_stops_and_space_goes_on(page: Page) -> None:
     page.until(RUNNING)
     page.click("#stop")

@@ -148,7 +148,7 @@ class Agent:
         if name in self._declared:
             option = self._declared[name].needs.value
             raise LookupError(f"{name} is not allowed here. Ask whoever started `urlab mcp` to start it with {option}.")
-        raise LookupError(f"There is no tool {name!r}. There are: {', '.join(self._offered)}.")
+        raise LookupError(f"No tool is called {name!r}. There are: {', '.join(self._offered)}.")
 
     def _answer(self, result: Struct | tuple[Struct, bytes]) -> CallToolResult:
         """Return a result with its structure, its text, and its picture if there is one.
@@ -180,7 +180,7 @@ class Agent:
     ) -> ReadResourceResult:
         uri = str(params.uri)
         if uri not in _RESOURCES:
-            raise MCPError(INVALID_PARAMS, f"There is no resource {uri!r}, only {' and '.join(_RESOURCES)}.")
+            raise MCPError(INVALID_PARAMS, f"No resource has the address {uri!r}, only {' and '.join(_RESOURCES)}.")
         shown = self._tools.client.describe() if uri == "urlab://model" else list(self._tools.console.entries)
         contents = TextResourceContents(uri=uri, text=encode(shown).decode(), mime_type="application/json")
         return ReadResourceResult(contents=[contents])

@@ -33,7 +33,7 @@ from urlab_client.web import mujoco_viewer
 from urlab_client.web.access import Access, Guarded
 from urlab_client.web.console_session import Audience, ConsoleSession
 from urlab_client.web.driving_lease import DrivingLease, NotDriving, Viewer
-from urlab_client.web.messages import Ack, Ctrl, FromViewer, Log, Name, Ping, Pong, Refused, You
+from urlab_client.web.messages import Ack, Ctrl, FromViewer, Hand, Log, Name, Ping, Pong, Refused, You
 from urlab_client.web.metrics import showing
 from urlab_client.web.model_upload import ModelRoutes
 from urlab_client.web.ops import encode, openapi, parse, served
@@ -209,7 +209,7 @@ class _Site:
     async def _op(self, request: Request) -> Response:
         op = served(request.path_params["op"])
         if op is None:
-            return _error(404, "unknown_op", f"There is no op {request.path_params['op']!r} here.", "See openapi.json.")
+            return _error(404, "unknown_op", f"No op is called {request.path_params['op']!r}.", "See openapi.json.")
         body = await _body(request)
         return _json(encode(await self.console.controls.do(self._viewer(request), parse(op, body))))
 
@@ -311,8 +311,8 @@ class _Site:
                     case Name(name=name):
                         one.viewer.name = " ".join(name.split())[:24] or one.viewer.name
                         self.console.tell()
-                    case Ctrl(values=values):
-                        self.console.controls.set_points(one.viewer, values)
+                    case Ctrl() | Hand():
+                        self.console.drive(one.viewer, message)
             except (NotDriving, ValueError, KeyError, RecursionError, msgspec.MsgspecError) as error:
                 await socket.send_text(encode(Refused(_explain(error)[1])).decode())
 

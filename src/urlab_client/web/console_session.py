@@ -36,7 +36,8 @@ from urlab_client.protocol.messages.streams import (
 from urlab_client.web.controls import Controls
 from urlab_client.web.description import WorldDescription, describe
 from urlab_client.web.driving_lease import DrivingLease, Viewer
-from urlab_client.web.messages import ArticulationSample, EntitySample, Link, LogEntry, State, Status, World
+from urlab_client.web.hand_driving import HandDriving
+from urlab_client.web.messages import ArticulationSample, Ctrl, EntitySample, Hand, Link, LogEntry, State, Status, World
 from urlab_client.web.mujoco_viewer import MujocoViewer
 from urlab_client.web.ops import encode
 from urlab_client.web.pictures import Feed
@@ -101,6 +102,7 @@ class ConsoleSession:
         self.snapshot: StateSnapshot | None = None
         self.mujoco_viewer: MujocoViewer = MujocoViewer(client)
         self.controls: Controls = Controls(self)
+        self.hands: HandDriving = HandDriving(self)
         self.recordings: Recordings = Recordings(client, recordings)
         self.replay: Replay = Replay(self)
         self._handshake = handshake
@@ -123,7 +125,12 @@ class ConsoleSession:
         """Keep the session and receive state while the body runs."""
         async with anyio.create_task_group() as tasks:
             controls = self.controls
-            jobs = (controls.send_set_points, controls.keep_stepping, self.replay.keep_playing)
+            jobs = (
+                controls.send_set_points,
+                controls.keep_stepping,
+                self.hands.keep_driving,
+                self.replay.keep_playing,
+            )
             for job in (self._keep, self._receive, self._pulse, *jobs):
                 tasks.start_soon(job)
             try:
@@ -212,6 +219,19 @@ class ConsoleSession:
                 self._begin_anew()
             case _:
                 pass
+
+    def drive(self, viewer: Viewer, order: Ctrl | Hand) -> None:
+        """Do what a viewer's message orders.
+
+        Raises:
+            NotDriving: Somebody else has the controls.
+            KeyError: A name is unknown; nothing was set.
+            ValueError: It cannot be done; nothing was set.
+        """
+        if isinstance(order, Hand):
+            self.hands.command(viewer, order)
+        else:
+            self.controls.set_points(viewer, order.values)
 
     def take_back(self) -> None:
         """Open a session again, after another program took the server over."""

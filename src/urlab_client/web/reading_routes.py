@@ -108,7 +108,7 @@ class ReadingRoutes:
 
 
 def _no_camera(request: Request) -> Response:
-    text = f"There is no camera {request.path_params['path']!r}."
+    text = f"No camera is called {request.path_params['path']!r}."
     return Response(encode({"error": {"code": "unknown_camera", "message": text}}), 404, media_type="application/json")
 
 
