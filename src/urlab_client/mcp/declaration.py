@@ -35,7 +35,7 @@ class Moment(Struct):
 
     Attributes:
         sim_time: Simulation time, seconds.
-        step: Physics steps since the session began or the last reset.
+        step: Physics steps since the session began or the last reset; not counted in mode `live`.
         mode: `direct`: time passes only while a tool lets it; `live`: time passes by itself unless paused.
     """
 
