@@ -281,6 +281,10 @@ def test_resets_refuse_masks_and_seeds_that_do_not_fit(made: list[Any]) -> None:
             env.reset(options={"reset_mask": np.asarray(mask)})
     with pytest.raises(ValueError, match="2 seeds for 3"):
         env.reset(seed=[1, 2])
+    env.reset()
+    for actions in (np.zeros(7), np.zeros((2, 7)), np.zeros((4, 7))):
+        with pytest.raises(ValueError, match="first axis must be 3 long"):
+            env.step(actions)
     with pytest.raises(urlab_client.UnknownKeyframe, match="arm_home"):
         env.reset(options={"keyframe": "away"})
     observations, _ = env.reset(options={"keyframe": "home"})

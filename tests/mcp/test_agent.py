@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import io
 import math
+import time
 from collections.abc import AsyncGenerator, Iterator
 from pathlib import Path
 
@@ -250,6 +251,7 @@ async def test_the_log_goes_on_from_the_last_call(direct: Desk) -> None:
     news = await direct.call("log")
     assert all(entry["n"] > first["next"] for entry in news["entries"])
     assert [entry["what"] for entry in news["entries"] if entry["who"] == "the agent"] == ["run"]
+    assert abs(news["entries"][-1]["at"] - time.time()) < 3600, "times keep their seconds"
     last = await direct.call("log")
     assert not [entry for entry in last["entries"] if entry["who"] == "the agent"]
     assert news["next"] > first["next"]

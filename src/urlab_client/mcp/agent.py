@@ -54,6 +54,7 @@ _RESOURCES = {
     "urlab://model": "Robots, joints, actuators, sensors, cameras, units and limits, as they are now.",
     "urlab://log": "Calls, errors and events, of people, too; the newest last.",
 }
+_LARGE = 1e3
 _FAILURES = (URLabError, NotDriving, Stopped, ValueError, TypeError, LookupError, OSError)
 _TOOLS = {
     "runtime.set_paused(False)": "play with action='resume'",
@@ -190,7 +191,7 @@ def _short(value: Any) -> Any:
     """Return what a result is made of with six digits of each number, and tools where it speaks of methods."""
     match value:
         case float() if math.isfinite(value):
-            return float(f"{value:.6g}")
+            return float(f"{value:.6g}") if abs(value) < _LARGE else round(value, 3)  # such as times
         case float():
             raise ValueError("The simulation has diverged: some values are not finite. Call reset.")
         case str():

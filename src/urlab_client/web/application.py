@@ -22,18 +22,14 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from urlab_client.protocol.errors import (
-    OutcomeUnknown,
-    URLabConnectionError,
-    URLabError,
-    URLabRPCError,
-    URLabTimeoutError,
-)
+from urlab_client.protocol.errors import URLabError
 from urlab_client.web import mujoco_viewer
 from urlab_client.web.access import Access, Guarded
+from urlab_client.web.body_routes import BodyRoutes
 from urlab_client.web.console_session import Audience, ConsoleSession
 from urlab_client.web.driving_lease import DrivingLease, NotDriving, Viewer
-from urlab_client.web.messages import Ack, Ctrl, FromViewer, Log, Name, Ping, Pong, Refused, You
+from urlab_client.web.explained_errors import explain_error
+from urlab_client.web.messages import Ack, Ctrl, FromViewer, Hand, Log, Name, Ping, Pong, Refused, You
 from urlab_client.web.metrics import showing
 from urlab_client.web.model_upload import ModelRoutes
 from urlab_client.web.ops import encode, openapi, parse, served
@@ -131,6 +127,7 @@ class _Site:
         self._reading = ReadingRoutes(console, self._viewer)
         self._recordings = RecordingRoutes(console, self._viewer)
         self._models = ModelRoutes(console, self._viewer)
+        self._body_pushing = BodyRoutes(console.body_pushing, self._viewer, _body)
 
     def routes(self) -> list[Route | WebSocketRoute | Mount]:
         def route(path: str, handler: Handler, *methods: str) -> Route:
@@ -151,7 +148,11 @@ class _Site:
             route("/api/step", self._step, "POST"),
             *(
                 route(path, handler, *methods)
-                for path, handler, methods in (*self._recordings.routes(), *self._models.routes())
+                for path, handler, methods in (
+                    *self._recordings.routes(),
+                    *self._models.routes(),
+                    *self._body_pushing.routes(),
+                )
             ),
             route("/api/lease", self._lease, "POST", "DELETE"),
             route("/api/connection", self._connection, "POST"),
@@ -310,10 +311,10 @@ class _Site:
                     case Name(name=name):
                         one.viewer.name = " ".join(name.split())[:24] or one.viewer.name
                         self.console.tell()
-                    case Ctrl(values=values):
-                        self.console.controls.set_points(one.viewer, values)
+                    case Ctrl() | Hand():
+                        self.console.drive(one.viewer, message)
             except (NotDriving, ValueError, KeyError, RecursionError, msgspec.MsgspecError) as error:
-                await socket.send_text(encode(Refused(_explain(error)[1])).decode())
+                await socket.send_text(encode(Refused(explain_error(error)[1])).decode())
 
     async def _pictures(self, socket: WebSocket) -> None:
         feed = self.console.feed(socket.path_params["path"])
@@ -367,12 +368,15 @@ class _Site:
         with self.console.bell() as changed:
 
             async def send() -> None:
-                sent = None
+                sent = told = None
                 with contextlib.suppress(WebSocketDisconnect, RuntimeError):
                     while True:
                         changed.clear()
                         snapshot = self.console.snapshot
                         shown = await self.console.mujoco_viewer.shown()
+                        if shown and shown is not told:
+                            told = shown
+                            await socket.send_text(mujoco_viewer.LAYOUT + shown.layout)
                         if shown and snapshot and snapshot is not sent and flow.sent - flow.acknowledged < _AHEAD:
                             sent = snapshot
                             flow.sent += 1
@@ -449,35 +453,10 @@ def _answering(handler: Handler) -> Handler:
         try:
             return await handler(request)
         except (NotDriving, URLabError, OSError, ValueError, TypeError, KeyError, RecursionError) as error:
-            status, said = _explain(error)
+            status, said = explain_error(error)
             return _json(encode({"error": said}), status)
 
     return answer
-
-
-def _explain(error: Exception) -> tuple[int, dict[str, Any]]:
-    """Return the status and what is said of an error."""
-    hint = (getattr(error, "hint", None) or "") if isinstance(error, URLabError) else ""
-    text = error.args[0] if isinstance(error, URLabError) and error.args else str(error)
-    match error:
-        case NotDriving():
-            status, code = 423, "not_driving"
-        case URLabRPCError():
-            status, code = 409, error.code
-            text = error.message
-        case URLabTimeoutError():
-            status, code = 504, "timeout"
-        case OutcomeUnknown():
-            status, code = 502, "outcome_unknown"
-        case URLabConnectionError():
-            status, code = 503, "unreachable"
-        case URLabError():
-            status, code = 502, "failed"
-        case OSError():
-            status, code = 500, "io_failed"
-        case _:
-            status, code = 400, "bad_request"
-    return status, {"code": code, "message": str(text), "hint": hint}
 
 
 async def _body(request: Request) -> bytes:

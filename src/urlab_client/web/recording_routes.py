@@ -8,6 +8,7 @@ from starlette.background import BackgroundTask
 from starlette.requests import Request
 from starlette.responses import FileResponse, Response
 
+from urlab_client.integrations._feed.messages import EpisodeOutcome
 from urlab_client.web.ops import encode
 from urlab_client.web.route_group import Handler, RouteGroup
 
@@ -16,6 +17,10 @@ __all__ = ["RecordingRoutes"]
 
 class _RecordRequest(Struct):
     cameras: bool = True
+
+
+class _OutcomeRequest(Struct):
+    outcome: EpisodeOutcome
 
 
 class _ReplayRequest(Struct):
@@ -33,6 +38,7 @@ class RecordingRoutes(RouteGroup):
         """Return path, handler and methods of each route."""
         return [
             ("/api/recording", self._record, ["POST", "DELETE"]),
+            ("/api/recording/outcome", self._mark, ["POST"]),
             ("/api/recordings", self._list, ["GET"]),
             ("/api/recordings/{name}", self._recording, ["GET", "PUT", "DELETE"]),
             ("/api/replay", self._replay, ["POST", "DELETE"]),
@@ -50,6 +56,14 @@ class RecordingRoutes(RouteGroup):
         name = await console.recordings.start(cameras=asked.cameras)
         console.note("call", viewer.name, "record", name)
         return _json({"name": name})
+
+    async def _mark(self, request: Request) -> Response:
+        viewer, console = self._viewer(request), self._console
+        console.lease.use(viewer)
+        outcome = msgspec.json.decode(await request.body(), type=_OutcomeRequest).outcome
+        await console.recordings.mark(outcome)
+        console.note("call", viewer.name, "episode", outcome)
+        return _json({})
 
     async def _list(self, request: Request) -> Response:
         return _json({"recordings": self._console.recordings.list(), "folder": str(self._console.recordings.folder)})
