@@ -336,7 +336,7 @@ def test_servers_and_batch_render_each_environment(servers: list[str], made: lis
         assert all(np.ptp(picture) > 100 for picture in first)
     drawn, again = (env.render()[0].astype(int) for env in (wire, batch))
     assert np.abs(drawn - again).mean() < 20, "the same robot in the same pose, with and without shadows"
-    with pytest.raises(ValueError, match="no camera 'arm/nose'"):
+    with pytest.raises(ValueError, match="no camera is called 'arm/nose'"):
         URLabBatchEnv("sim://arm", 1, render_mode="rgb_array", render_camera="arm/nose").render()
     for env in (URLabVectorEnv, URLabBatchEnv):
         with pytest.raises(ValueError, match="render_mode"):
