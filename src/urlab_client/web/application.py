@@ -6,9 +6,9 @@ import contextlib
 import os
 import secrets
 import time
-from collections.abc import AsyncGenerator, Awaitable, Callable
+from collections.abc import AsyncGenerator, Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any
 
 import anyio
 import anyio.to_thread
@@ -35,6 +35,7 @@ from urlab_client.web.model_upload import ModelRoutes
 from urlab_client.web.ops import encode, openapi, parse, served
 from urlab_client.web.reading_routes import ReadingRoutes
 from urlab_client.web.recording_routes import RecordingRoutes
+from urlab_client.web.route_group import Handler
 
 if TYPE_CHECKING:
     from prometheus_client import CollectorRegistry
@@ -47,8 +48,6 @@ _STATIC = Path(__file__).parent / "static"
 _LARGEST_BODY = 1024 * 1024
 _AHEAD = 2  # states or pictures on their way to a browser that has not said that they came
 _VIEWER = "x-urlab-viewer"
-
-_Handler: TypeAlias = Callable[[Request], Awaitable[Response]]
 
 
 def app(
@@ -95,7 +94,7 @@ def app(
     return application
 
 
-def entrance(access: Access) -> _Handler:
+def entrance(access: Access) -> Handler:
     """Return what answers `POST /api/session`: it spends a token for a key."""
 
     async def enter(request: Request) -> Response:
@@ -131,7 +130,7 @@ class _Site:
         self._body_pushing = BodyRoutes(console.body_pushing, self._viewer, _body)
 
     def routes(self) -> list[Route | WebSocketRoute | Mount]:
-        def route(path: str, handler: _Handler, *methods: str) -> Route:
+        def route(path: str, handler: Handler, *methods: str) -> Route:
             return Route(path, _answering(handler), methods=list(methods or ["GET"]))
 
         return [
@@ -447,7 +446,7 @@ def _now_ms() -> float:
     return time.time() * 1e3
 
 
-def _answering(handler: _Handler) -> _Handler:
+def _answering(handler: Handler) -> Handler:
     """Turn what a handler raises into an answer."""
 
     async def answer(request: Request) -> Response:

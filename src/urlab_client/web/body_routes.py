@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
-from typing import TypeAlias
 
 import msgspec
 from starlette.requests import Request
@@ -12,10 +11,9 @@ from starlette.responses import Response
 from urlab_client.web.body_pushing import BodyPushing, Pick, Push
 from urlab_client.web.driving_lease import Viewer
 from urlab_client.web.ops import encode
+from urlab_client.web.route_group import Handler
 
 __all__ = ["BodyRoutes"]
-
-_Handler: TypeAlias = Callable[[Request], Awaitable[Response]]
 
 
 class BodyRoutes:
@@ -37,7 +35,7 @@ class BodyRoutes:
         self._viewer = viewer
         self._body = body
 
-    def routes(self) -> list[tuple[str, _Handler, list[str]]]:
+    def routes(self) -> list[tuple[str, Handler, list[str]]]:
         """Return path, handler and methods of each route."""
         return [
             ("/api/bodies", self._bodies, ["GET"]),
