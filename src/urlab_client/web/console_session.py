@@ -33,6 +33,7 @@ from urlab_client.protocol.messages.streams import (
     SessionOpened,
     StateSnapshot,
 )
+from urlab_client.web.body_pushing import BodyPushing
 from urlab_client.web.controls import Controls
 from urlab_client.web.description import WorldDescription, describe
 from urlab_client.web.driving_lease import DrivingLease, Viewer
@@ -105,6 +106,8 @@ class ConsoleSession:
         self.hands: HandDriving = HandDriving(self)
         self.recordings: Recordings = Recordings(client, recordings)
         self.replay: Replay = Replay(self)
+        self.body_pushing: BodyPushing = BodyPushing(self)
+        self.controls.before_step = self.body_pushing.apply
         self._handshake = handshake
         self._adopted = b""
         self._bells: set[asyncio.Event] = set()
@@ -298,6 +301,7 @@ class ConsoleSession:
 
     def _publish(self, snapshot: StateSnapshot, targets: Mapping[str, list[float] | None]) -> None:
         self.snapshot = snapshot
+        self.mujoco_viewer.follow(snapshot)
         self.state_seq += 1
         wall = snapshot.wall_time.sec + snapshot.wall_time.nsec / 1e9
         received = snapshot.recv_wall_time_ns / 1e9

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
-from typing import TypeAlias
-
 import msgspec
 from msgspec import Struct
 from starlette.background import BackgroundTask
@@ -12,13 +9,10 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, Response
 
 from urlab_client.integrations._feed.messages import EpisodeOutcome
-from urlab_client.web.console_session import ConsoleSession
-from urlab_client.web.driving_lease import Viewer
 from urlab_client.web.ops import encode
+from urlab_client.web.route_group import Handler, RouteGroup
 
 __all__ = ["RecordingRoutes"]
-
-_Handler: TypeAlias = Callable[[Request], Awaitable[Response]]
 
 
 class _RecordRequest(Struct):
@@ -37,19 +31,10 @@ class _ReplayRequest(Struct):
     rate: float | None = None
 
 
-class RecordingRoutes:
-    """Handlers of `/api/recording`, `/api/recordings` and `/api/replay`.
+class RecordingRoutes(RouteGroup):
+    """Handlers of `/api/recording`, `/api/recordings` and `/api/replay`."""
 
-    Args:
-        console: The session that all viewers share.
-        viewer: Says who asks.
-    """
-
-    def __init__(self, console: ConsoleSession, viewer: Callable[[Request], Viewer]) -> None:
-        self._console = console
-        self._viewer = viewer
-
-    def routes(self) -> list[tuple[str, _Handler, list[str]]]:
+    def routes(self) -> list[tuple[str, Handler, list[str]]]:
         """Return path, handler and methods of each route."""
         return [
             ("/api/recording", self._record, ["POST", "DELETE"]),
