@@ -228,6 +228,16 @@ async def test_a_call_that_takes_too_long_is_broken_off() -> None:
             assert any("paused" in finding["text"] for finding in (await one.call("explain"))["findings"])
 
 
+async def test_another_program_takes_the_server_over_and_a_person_has_to_take_it_back() -> None:
+    with SimulatedServer("arm", play=True) as server:
+        async with desk(server) as one, URLabClient(**server.client_options()) as other:
+            await one.call("run", steps=1)
+            await other.discover()
+            assert "Ask a person to take it back" in await one.refused("run", steps=1)
+            await until(lambda: one.console.link.state == "taken_over")
+            assert "Ask a person to take it back" in await one.refused("state", robot="arm")
+
+
 async def test_a_person_takes_over_and_the_agent_waits(direct: Desk) -> None:
     lease = direct.console.lease
     await direct.client.runtime.set_sim_options(timestep=1e-5)

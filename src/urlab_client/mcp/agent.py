@@ -34,7 +34,8 @@ from msgspec import Struct
 from urlab_client.mcp.declaration import Declared, Moment, Needs, declared
 from urlab_client.mcp.driving import Limits, Stopped
 from urlab_client.mcp.editing import Tools
-from urlab_client.protocol.errors import URLabError
+from urlab_client.mcp.toolset import TAKEN_OVER
+from urlab_client.protocol.errors import SessionTakenOver, URLabError
 from urlab_client.web.console_session import ConsoleSession
 from urlab_client.web.driving_lease import NotDriving
 from urlab_client.web.ops import encode
@@ -136,6 +137,8 @@ class Agent:
             answer = self._answer(await getattr(self._tools, found.name)(**arguments))
         except _FAILURES as error:
             text = _in_tools(str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error))
+            if isinstance(error, SessionTakenOver):
+                text = TAKEN_OVER
             console.note("error", viewer.name, params.name, text)
             return CallToolResult(content=[TextContent(text=text)], is_error=True)
         if found.needs in {Needs.DRIVE, Needs.EDIT}:
