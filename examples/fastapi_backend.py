@@ -6,8 +6,9 @@ Run: uvicorn fastapi_backend:app --app-dir examples
 import os
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager, suppress
+from pathlib import Path
 
-from fastapi import FastAPI, Request, WebSocket, WebSocketDisconnect
+from fastapi import FastAPI, Request, Response, WebSocket, WebSocketDisconnect
 from fastapi.responses import JSONResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from pydantic import BaseModel
@@ -16,14 +17,16 @@ from urlab_client import URLabConnectionError, URLabError
 from urlab_client.aio import URLabClient
 from urlab_client.protocol.descriptions import ArticulationDescription, SceneDescription
 
-client = URLabClient(os.environ.get("URLAB_ADDRESS", "sim://arm?play&unpaused"), keep_session=True)
+address = os.environ.get("URLAB_ADDRESS", "sim://arm?play&unpaused")
+watched = os.environ.get("URLAB_WATCH")  # a file with what /handshake of the worker that drives answers
+hello = Path(watched).read_bytes() if watched else None
+client = URLabClient(address, keep_session=hello is None, read_only=hello is not None)
 
 
 @asynccontextmanager
 async def lifespan(_: FastAPI) -> AsyncGenerator[None]:
     async with client:
-        if "URLAB_WATCH" not in os.environ:  # a worker beside the one that drives only reads states
-            await client.discover()
+        await client.discover(handshake=hello)
         yield
 
 
@@ -38,6 +41,11 @@ class Moved(BaseModel):
 @app.get("/scene")
 async def scene() -> SceneDescription:
     return client.describe()
+
+
+@app.get("/handshake")
+async def handshake() -> Response:
+    return Response(client.handshake(), media_type="application/octet-stream")
 
 
 @app.post("/robots/{robot}/move")

@@ -14,8 +14,6 @@ from urlab_client.server import SimulatedServer
 TARGET = Path(__file__).resolve().parent.parent / "docs" / "images" / "trot.webp"
 SIZE = (640, 320)
 FRAMES_PER_S = 20
-START_X_M = -0.6
-"""So that it passes the middle, around which shadows are drawn."""
 START_S, LENGTH_S = 1.0, 2.0
 """From full stride on, and whole strides, so that the legs go on where the animation starts again."""
 
@@ -27,7 +25,7 @@ def main() -> int:
         URLabClient(**server.client_options(), step_mode="direct") as client,
     ):
         client.discover()
-        client.reset("home", per_articulation_qpos={"quadruped": {"root": START_X_M}})
+        client.reset("home")
         robot = client.articulations["quadruped"]
         trot = TrotController(robot)
         end = START_S + LENGTH_S

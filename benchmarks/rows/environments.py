@@ -19,6 +19,7 @@ _OWN = "Humanoid-v5"
 _SUBSTEPS = 5  # as Gymnasium's takes
 _SERVERS = 4
 _BATCH = 16
+_PROCESSOR_S = 2.0  # that figures per core are taken from
 _MORE = 256  # copies by which the memory of one is measured
 
 
@@ -52,7 +53,37 @@ def _against(
     figures: Callable[[], Sequence[Figure]] = tuple,
 ) -> Iterator[Pair]:
     with contextlib.closing(ours()) as environment, contextlib.closing(_own(own_copies)) as own:
-        yield Pair(ours=_stepping(environment, copies), floor=_stepping(own, own_copies or 1), figures=figures)
+        yield Pair(
+            ours=_stepping(environment, copies),
+            floor=_stepping(own, own_copies or 1),
+            figures=lambda: [
+                Figure(name="steps per second of a core, with the servers'", value=_per_core(environment, copies)),
+                Figure(name="the floor's", value=_per_core(own, own_copies or 1)),
+                *figures(),
+            ],
+        )
+
+
+def _per_core(environment: Any, copies: int) -> float:
+    """Return steps for each second of processor time, of this process with all its threads and of its children."""
+    action = 0 * environment.action_space.sample()
+    environment.reset(seed=0)
+    taken, started = 0, _processor_s()
+    while (used := _processor_s() - started) < _PROCESSOR_S:
+        for _ in range(20):
+            environment.step(action)
+        taken += 20 * copies
+    return taken / used
+
+
+def _processor_s() -> float:
+    """Return the processor time of this process and of its children, seconds."""
+    total = time.process_time()
+    for child in _children():
+        with contextlib.suppress(OSError):
+            after_name = Path(f"/proc/{child}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+            total += (int(after_name[11]) + int(after_name[12])) / os.sysconf("SC_CLK_TCK")
+    return total
 
 
 def _proportional(process: int | str) -> float:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from scripted import ScriptedServer
+from scripted import client_of
 from scripted_beta import ROBOT, ScriptedBeta
 from waiting import until
 
@@ -20,21 +19,8 @@ BOTH, NEITHER = (True, True), (False, False)
 
 
 @pytest.fixture
-def beta() -> Iterator[ScriptedBeta]:
-    server = ScriptedBeta()
-    yield server
-    server.close()
-
-
-def client_of(server: ScriptedServer, **options: Any) -> URLabClient:
-    return URLabClient("tcp://127.0.0.1", step_port=server.port, live_pictures=False, **options)
-
-
-@pytest.fixture
-async def client(beta: ScriptedBeta) -> AsyncIterator[URLabClient]:
-    async with client_of(beta, step_mode="direct") as made:
-        await made.discover()
-        yield made
+def client(beta_client: URLabClient) -> URLabClient:
+    return beta_client
 
 
 async def streams(beta: ScriptedBeta, expected: tuple[bool, bool], name: str = "arm_a/wrist") -> None:

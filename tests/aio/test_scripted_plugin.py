@@ -341,7 +341,7 @@ async def test_defaults_rebind_every_joint(plugin: Any, connect: Any) -> None:
         ({"default_kv": -1}, "default_kv must be at least 0"),
         ({"default_kv": float("nan")}, "default_kv must be at least 0"),
         ({"default_kv": "stiff"}, "default_kv takes a number"),
-        ({"stiffness": 3.0}, "there is no parameter 'stiffness'"),
+        ({"stiffness": 3.0}, "no parameter is called 'stiffness'"),
     ],
 )
 async def test_bad_parameters_are_refused_before_sending(

@@ -44,15 +44,20 @@ async def states(http: httpx2.AsyncClient) -> AsyncGenerator[Any]:
         yield socket
 
 
-async def test_one_client_serves_many_and_another_worker_watches(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_one_client_serves_many_and_another_worker_watches(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     with SimulatedServer("arm", play=True, unpaused=True) as server:
         options = server.client_options()
         driver = backend(monkeypatch, **options)
-        monkeypatch.setenv("URLAB_WATCH", "1")
-        watcher = backend(monkeypatch, **options)
-        async with served(watcher.app) as beside:
-            monkeypatch.delenv("URLAB_WATCH")
-            async with served(driver.app) as http, states(beside) as watching:
+        async with served(driver.app) as http:
+            (tmp_path / "robot.hello").write_bytes((await http.get("/handshake")).content)
+            monkeypatch.setenv("URLAB_WATCH", str(tmp_path / "robot.hello"))
+            watcher = backend(monkeypatch, **options)
+            async with served(watcher.app) as beside, states(beside) as watching:
+                assert (await beside.get("/scene")).json()["articulations"][0]["name"] == "arm"
+                refused = await beside.post("/robots/arm/move", json={"elbow": 0.5})
+                assert (refused.status_code, "read-only" in refused.json()["error"]) == (409, True)
                 scenes = await asyncio.gather(*(http.get("/scene") for _ in range(20)))
                 assert {scene.json()["articulations"][0]["name"] for scene in scenes} == {"arm"}
                 session = driver.client.session_id

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import pickle
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -122,3 +123,25 @@ def test_bad_frames_are_refused(client: URLabClient, ik: InverseKinematics) -> N
         InverseKinematics(client, site="grip")
     with pytest.raises(KeyError, match="no joint 'left_finger' moves 'grip'"):
         ik.solve([0.4, 0.0, 0.4], start={"left_finger": 0.0})
+
+
+def test_a_servo_that_is_told_less_than_its_joint_can_do_is_the_limit(tmp_path: Path) -> None:
+    model = tmp_path / "swing.xml"
+    model.write_text(
+        "<mujoco><compiler angle='radian'/><worldbody><body name='rod'>"
+        "<joint name='swing' axis='0 0 1' range='-3 3' limited='true'/>"
+        "<geom type='capsule' fromto='0 0 0 1 0 0' size='.02'/><site name='tip' pos='1 0 0'/></body></worldbody>"
+        "<actuator><position name='swing' joint='swing' gear='2' kp='50' ctrlrange='-1 1'/></actuator></mujoco>",
+        encoding="utf-8",
+    )
+    with (
+        SimulatedServer(str(model), play=True, model_roots=[tmp_path]) as server,
+        URLabClient(**server.client_options(), step_mode="direct") as client,
+    ):
+        client.discover()
+        ik = InverseKinematics(client, site="tip")
+        with pytest.raises(UnreachableTarget) as caught:
+            ik.solve([math.cos(1.0), math.sin(1.0), 0.0])
+        assert caught.value.nearest.joints == pytest.approx({"swing": 0.5}, abs=1e-3)  # of length over gear
+        reached = ik.solve([math.cos(0.4), math.sin(0.4), 0.0])
+        assert reached.set_points == pytest.approx({"swing": 0.8}, abs=2e-3)

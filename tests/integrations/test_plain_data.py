@@ -14,6 +14,8 @@ import msgspec
 import numpy as np
 import pytest
 from fastapi import Body, FastAPI
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from msgspec import Struct
 from pydantic import BaseModel, TypeAdapter, ValidationError
 from starlette.testclient import TestClient
@@ -28,7 +30,7 @@ from urlab_client.protocol.descriptions import Pose, SceneDescription
 from urlab_client.protocol.errors import UnknownArticulation
 from urlab_client.protocol.messages.session import ArticulationState, Clock, HelloOk
 from urlab_client.protocol.messages.streams import CameraSample, ClientEvent, RowSample, ServerLost, StateSnapshot
-from urlab_client.protocol.pydantic_schema import kinds_of
+from urlab_client.protocol.plain_reading import kinds_of
 from urlab_client.protocol.rows import BaseStateRow, JointRow
 from urlab_client.protocol.scene_types import ActorHierarchyNode, BlueprintInfo
 from urlab_client.protocol.serializable import Serializable
@@ -95,6 +97,73 @@ def test_every_struct_goes_out_as_json_and_comes_back(kind: type[Any]) -> None:
         assert type(back) is kind
         assert back.to_dict(arrays="base64") == value.to_dict(arrays="base64")
     assert kind.__name__ in json.dumps(adapter.json_schema(mode="serialization"))
+
+
+def values(kind: Any) -> st.SearchStrategy[Any]:
+    """Return what makes values of a type."""
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        return values(arguments[0])
+    if origin is np.ndarray:
+        dtype = get_args(arguments[1])[0]
+        pixels = st.just(np.arange(8, dtype=dtype).reshape(1, 2, 4))
+        return st.lists(st.floats(), max_size=4).map(np.array) if dtype is np.float64 else pixels
+    if origin is Literal:
+        return st.sampled_from(arguments)
+    if origin in {Union, UnionType}:
+        return st.one_of(*(values(NoneType if one is None else one) for one in arguments))
+    if origin is tuple and arguments[-1] is not ...:
+        return st.tuples(*map(values, arguments))
+    if origin is dict:
+        return st.dictionaries(values(arguments[0]), values(arguments[1]), max_size=2)
+    if isinstance(origin, type):
+        kinds = {tuple: tuple, frozenset: frozenset}
+        return st.lists(values(arguments[0]), max_size=2).map(kinds.get(origin, list))
+    if isinstance(kind, type) and issubclass(kind, Struct):
+        if several := kinds_of(kind):
+            return st.one_of(*map(values, several.values()))
+        fields = {one.name: one.type for one in msgspec.structs.fields(kind) if msgspec.Raw not in get_args(one.type)}
+        return st.deferred(
+            lambda: st.builds(
+                kind, **{name: st.just([]) if name == "children" else values(one) for name, one in fields.items()}
+            )
+        )
+    if isinstance(kind, type) and issubclass(kind, Enum):
+        return st.sampled_from(kind)
+    plain = {bool: st.booleans(), int: st.integers(-(2**53), 2**53), float: st.floats(), bytes: st.binary(max_size=4)}
+    return {**plain, str: st.text(max_size=5), NoneType: st.none(), Any: st.just({"any": [1, None]})}[kind]
+
+
+@given(st.sampled_from(structs()).flatmap(values), st.sampled_from(["list", "base64"]))
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+def test_whatever_a_call_returns_comes_back_from_its_data(value: Any, arrays: Any) -> None:
+    back = type(value).from_json(value.to_json(arrays=arrays))
+    assert type(back) is type(value)
+    assert back.to_dict(arrays="base64") == value.to_dict(arrays="base64")
+    assert type(value).from_dict(value.to_dict(arrays=arrays)).to_dict() == value.to_dict()
+
+
+@pytest.mark.parametrize(
+    ("kind", "data", "problem"),
+    [
+        (Pose, {"position": [0, 0], "quaternion": [1, 0, 0, 0]}, r"Pose\.position: 2 values, but it takes 3"),
+        (Pose, {"position": [0, 0, "up"], "quaternion": [1, 0, 0, 0]}, r"Pose\.position\[2\]: 'up' does not fit float"),
+        (Pose, {"position": [0, 0, 0]}, "the field 'quaternion' is missing"),
+        (Pose, {"positoin": [0, 0, 0]}, "no field 'positoin'. Did you mean 'position'"),
+        (Finding, {"verdict": "bad", "subject": "", "text": ""}, "Finding.verdict: 'bad' is not a valid Verdict"),
+        (ClientEvent, {"event": "losst"}, "'losst' is none of"),
+        (ServerLost, {"event": "connected", "endpoint": ""}, "event is 'connected', not 'lost'"),
+        (ArticulationState, {"qpos": "AAAA", "qvel": []}, r"qpos: an array is a list of numbers"),
+        (Diagnosis, {"findings": [7]}, r"findings\[0\]: 7 is not a mapping of fields"),
+        (Pose, [], r"Pose: \[\] is not a mapping"),
+        (CameraPose, {"location": [0, 0, True]}, "missing|does not fit float"),
+    ],
+)
+def test_data_that_do_not_fit_are_refused_by_name(kind: type[Any], data: Any, problem: str) -> None:
+    with pytest.raises(ValueError, match=problem):
+        kind.from_dict(data)
+    with pytest.raises(ValueError, match=f"{kind.__name__}: "):
+        kind.from_json("{")
 
 
 def test_numbers_that_are_not_finite_are_strings_that_pydantic_and_javascript_read() -> None:

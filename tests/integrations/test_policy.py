@@ -364,7 +364,7 @@ def test_the_term_needs_a_goal() -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (WALK.replace('"quadruped"', '"dog"'), r"no articulation 'dog'; there are: quadruped"),
+        (WALK.replace('"quadruped"', '"dog"'), r"no articulation is called 'dog'; there are: quadruped"),
         (walk(('"direct", "live"', '"live"')), r"in 'direct' mode; step_modes requires 'live'.*step_mode='live'"),
         (walk(("0.002", "0.005")), r"timestep of 0.002 s; timestep requires 0.005 s.*set_sim_options\(timestep=0.005"),
         (walk(('"FR_thigh"', '"XX_thigh"')), r"action.joints\[1\]: .*no joint 'XX_thigh'; it has .*FR_thigh"),

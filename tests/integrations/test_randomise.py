@@ -141,6 +141,20 @@ def test_a_server_that_varies_nothing_itself_varies_what_its_ops_reach(made: lis
             env.close()
             assert robot.controller.kp == before
             assert client.runtime.set_sim_options().gravity == gravity
+
+            wire = URLabVectorEnv([where(server)], task=FreeWalk(), **options)
+            made.append(wire)
+            first = wire.reset(seed=3)[0]
+
+            async def lose() -> None:
+                await wire._sessions[0].reopen()
+
+            wire._portal.call(lose)  # as after a failure: gravity and gains are those of an episode
+            assert np.array_equal(wire.reset(seed=3)[0], first)
+            wire.close()
+            client.discover()
+            assert client.articulations["quadruped"].controller.kp == before
+            assert client.runtime.set_sim_options().gravity == gravity
         servo = Randomisation(vary=(Vary(what="kp", scale=(0.5, 2.0)),))
         with SimulatedServer("arm", play=True) as arm, pytest.raises(UnsupportedRandomisation, match="changes kp"):
             URLabEnv.connect(where(arm), randomise=servo)

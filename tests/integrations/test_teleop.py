@@ -225,7 +225,7 @@ def test_the_command_records_what_is_typed(tmp_path: Path, server: SimulatedServ
     os.close(keyboard)
     os.close(screen)
     assert process.returncode == 0, error
-    assert out == f"{file}  0 successes, 0 failures, 0 discarded\n"
+    assert out == f"{file}  0 success, 0 failure, 0 discarded\n"
     assert read_run(file).summary().complete
 
 

@@ -281,6 +281,10 @@ def test_resets_refuse_masks_and_seeds_that_do_not_fit(made: list[Any]) -> None:
             env.reset(options={"reset_mask": np.asarray(mask)})
     with pytest.raises(ValueError, match="2 seeds for 3"):
         env.reset(seed=[1, 2])
+    env.reset()
+    for actions in (np.zeros(7), np.zeros((2, 7)), np.zeros((4, 7))):
+        with pytest.raises(ValueError, match="first axis must be 3 long"):
+            env.step(actions)
     with pytest.raises(urlab_client.UnknownKeyframe, match="arm_home"):
         env.reset(options={"keyframe": "away"})
     observations, _ = env.reset(options={"keyframe": "home"})
@@ -332,7 +336,7 @@ def test_servers_and_batch_render_each_environment(servers: list[str], made: lis
         assert all(np.ptp(picture) > 100 for picture in first)
     drawn, again = (env.render()[0].astype(int) for env in (wire, batch))
     assert np.abs(drawn - again).mean() < 20, "the same robot in the same pose, with and without shadows"
-    with pytest.raises(ValueError, match="no camera 'arm/nose'"):
+    with pytest.raises(ValueError, match="no camera is called 'arm/nose'"):
         URLabBatchEnv("sim://arm", 1, render_mode="rgb_array", render_camera="arm/nose").render()
     for env in (URLabVectorEnv, URLabBatchEnv):
         with pytest.raises(ValueError, match="render_mode"):

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import io
 import math
+import time
 from collections.abc import AsyncGenerator, Iterator
 from pathlib import Path
 
@@ -146,7 +147,7 @@ async def test_an_agent_that_looks_on_takes_nothing_from_whoever_drives() -> Non
 
 async def test_what_an_agent_gets_wrong_is_said_and_nothing_is_done(direct: Desk) -> None:
     for tool, arguments, words in (
-        ("nothing", {}, ["no tool 'nothing'", "move_to"]),
+        ("nothing", {}, ["No tool is called 'nothing'", "move_to"]),
         ("state", {"robot": "arn"}, ["'arm'"]),
         ("state", {}, ["robot"]),
         ("run", {}, ["seconds", "steps"]),
@@ -164,8 +165,8 @@ async def test_what_an_agent_gets_wrong_is_said_and_nothing_is_done(direct: Desk
         ("reset", {"joints": {"arm": {"elbow": 9}}}, ["got 9"]),
         ("play", {"action": "pause"}, ["direct", "run"]),
         ("record", {"action": "stop"}, ["no recording runs"]),
-        ("import_model", {"model": "/etc/passwd"}, ["no model"]),
-        ("spawn", {"blueprint": "../arm", "actor_id": "b", "position": [0, 0, 0]}, ["no blueprint"]),
+        ("import_model", {"model": "/etc/passwd"}, ["No model is called"]),
+        ("spawn", {"blueprint": "../arm", "actor_id": "b", "position": [0, 0, 0]}, ["No blueprint is called"]),
         ("spawn", {"blueprint": "arm", "actor_id": "b", "position": [0, 0]}, ["position"]),
         ("remove", {"actor": "nobody"}, ["There are: arm"]),
         ("picture", {"camera": "arm/nothing"}, ["nothing"]),
@@ -227,6 +228,16 @@ async def test_a_call_that_takes_too_long_is_broken_off() -> None:
             assert any("paused" in finding["text"] for finding in (await one.call("explain"))["findings"])
 
 
+async def test_another_program_takes_the_server_over_and_a_person_has_to_take_it_back() -> None:
+    with SimulatedServer("arm", play=True) as server:
+        async with desk(server) as one, URLabClient(**server.client_options()) as other:
+            await one.call("run", steps=1)
+            await other.discover()
+            assert "Ask a person to take it back" in await one.refused("run", steps=1)
+            await until(lambda: one.console.link.state == "taken_over")
+            assert "Ask a person to take it back" in await one.refused("state", robot="arm")
+
+
 async def test_a_person_takes_over_and_the_agent_waits(direct: Desk) -> None:
     lease = direct.console.lease
     await direct.client.runtime.set_sim_options(timestep=1e-5)
@@ -250,6 +261,7 @@ async def test_the_log_goes_on_from_the_last_call(direct: Desk) -> None:
     news = await direct.call("log")
     assert all(entry["n"] > first["next"] for entry in news["entries"])
     assert [entry["what"] for entry in news["entries"] if entry["who"] == "the agent"] == ["run"]
+    assert abs(news["entries"][-1]["at"] - time.time()) < 3600, "times keep their seconds"
     last = await direct.call("log")
     assert not [entry for entry in last["entries"] if entry["who"] == "the agent"]
     assert news["next"] > first["next"]

@@ -177,7 +177,7 @@ def test_seeds_differ() -> None:
 @pytest.mark.parametrize(
     ("kind", "options", "complaint"),
     [
-        (Drop, {"op": "fly"}, "no op 'fly'"),
+        (Drop, {"op": "fly"}, "no op is called 'fly'"),
         (Drop, {"op": "step", "topic": "state/full"}, "not both"),
         (Cut, {"topic": "state/full"}, "Cut concerns requests"),
         (Refuse, {"code": ""}, "needs a code"),

@@ -75,10 +75,18 @@ SHADE = """
 """
 
 
+# The same far from where the light is.
+FAR_SHADE = (
+    SHADE.replace('pos="0 0 8"', 'pos="30 0 8"')
+    .replace('pos="0 0 2.4"', 'pos="30 0 2.4"')
+    .replace('size="5 5 1"', 'size="50 50 1"')
+)
+
+
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("scenes")
-    for name, text in {"wall": WALL, "drop": DROP, "pair": PAIR, "shade": SHADE}.items():
+    for name, text in {"wall": WALL, "drop": DROP, "pair": PAIR, "shade": SHADE, "far": FAR_SHADE}.items():
         (folder / f"{name}.xml").write_text(text)
     return folder
 
@@ -137,6 +145,13 @@ def test_shadows_are_a_matter_of_quality(play: Play) -> None:
     backend = find_backend()
     assert backend is not None
     assert below_the_ball["auto"] == below_the_ball["fast" if backend.software else "high"]
+
+
+def test_shadows_follow_what_the_picture_shows(play: Play) -> None:
+    image = pixels(
+        play("far", render_quality="high").ask("step", include_cameras={"above": "sync"})["cameras"]["above"]
+    )
+    assert int(image[32, 8, :3].sum()) < 0.8 * int(image[8, 8, :3].sum())
 
 
 def test_an_unknown_quality_is_refused() -> None:

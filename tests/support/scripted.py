@@ -13,10 +13,11 @@ from hello import hello_ok
 from ports import free_port
 from waiting import DEADLINE_S
 
+from urlab_client.aio import URLabClient
 from urlab_client.protocol.base import DialectName
 from urlab_client.protocol.registry import dialect_ops
 
-__all__ = ["ScriptedServer", "meta_ok"]
+__all__ = ["ScriptedServer", "client_of", "meta_ok", "names"]
 
 HELLO = hello_ok(manager_present=False)
 
@@ -104,3 +105,13 @@ class ScriptedServer:
                     self._socket.send_multipart([*envelope, raw])
         self._socket.close(0)
         self._wake.close(0)
+
+
+def client_of(server: ScriptedServer, **options: Any) -> URLabClient:
+    """Return a client of a scripted server which receives no pictures in the background."""
+    return URLabClient("tcp://127.0.0.1", step_port=server.port, live_pictures=False, **options)
+
+
+def names(requests: list[dict[str, Any]]) -> list[str]:
+    """Return the ops of requests."""
+    return [request["op"] for request in requests]

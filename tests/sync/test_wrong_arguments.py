@@ -5,12 +5,15 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Iterator
+from functools import partial
+from itertools import product
 from typing import Any
 
 import pytest
 
 from urlab_client import URLabClient, URLabError
 from urlab_client.server import SimulatedServer
+from urlab_client.sync._facade import aio_of, portal_of
 
 STRANGE = (None, "x", 1.5, object(), {"x": "y"})
 # They end play or the client, take over the server, run for as long as they are told, or take any value.
@@ -37,11 +40,17 @@ def methods(of: object) -> list[tuple[str, inspect.Signature]]:
     return [(name, inspect.signature(method)) for name, method in found if name[0] != "_" and name not in LEFT_OUT]
 
 
-@pytest.mark.parametrize(
-    "part",
-    ["client", "articulation", "joint", "actuator", "camera", "scene", "outliner", "runtime", "debug", "viewport"],
+PARTS = (
+    *("client", "articulation", "camera"),
+    *("scene", "outliner", "runtime", "debug", "viewport", "sim", "recording", "replay", "farm"),
 )
-def test_the_error_says_what_was_wrong(client: URLabClient, part: str) -> None:
+
+
+@pytest.mark.parametrize(
+    ("part", "flavour"),
+    [("joint", "both"), ("actuator", "both"), *product(PARTS, ("blocking", "async"))],
+)
+def test_the_error_says_what_was_wrong(client: URLabClient, part: str, flavour: str) -> None:
     arm = client.articulations["arm"]
     parts: dict[str, Any] = {
         "client": client,
@@ -51,6 +60,8 @@ def test_the_error_says_what_was_wrong(client: URLabClient, part: str) -> None:
         "camera": arm.cameras["wrist"],
     }
     tried = parts.get(part) or getattr(client, part)
+    if flavour == "async":
+        tried = aio_of(tried)
     unnamed: list[str] = []
     for method, signature in methods(tried):
         named = [parameter for parameter in signature.parameters.values() if parameter.name not in {"self", "timeout"}]
@@ -60,7 +71,8 @@ def test_the_error_says_what_was_wrong(client: URLabClient, part: str) -> None:
                 given = dict.fromkeys(needed, "x") | {parameter.name: value}
                 shown = f"{part}.{method}({parameter.name}={value!r})"
                 try:
-                    getattr(tried, method)(**given)
+                    call = partial(getattr(tried, method), **given)
+                    portal_of(client).call(call) if inspect.iscoroutinefunction(call.func) else call()
                 except (URLabError, ValueError, KeyError, OSError):
                     pass
                 except TypeError as error:

@@ -199,6 +199,56 @@ def test_set_points_move_joints_and_stay_when_unknown(http: TestClient) -> None:
         assert moved["articulations"]["arm"]["targets"][2] == 0.5
 
 
+@pytest.mark.long
+def test_a_hand_moves_for_a_moment_and_episodes_are_judged(http: TestClient, tmp_path: Path) -> None:
+    def hand(live: Any) -> np.ndarray:
+        state = heard(live, "state")
+        return np.array(state["articulations"]["arm"]["sensors"]["grip_position"])
+
+    def at_rest(live: Any) -> np.ndarray:
+        while True:
+            state = heard(live, "state")
+            then = state["time"] + 0.1
+            later = heard(live, "state", lambda one, then=then: one["time"] > then)
+            places = [np.array(one["articulations"]["arm"]["sensors"]["grip_position"]) for one in (state, later)]
+            if np.abs(places[1] - places[0]).max() < 1e-4:
+                return places[1]
+
+    with (
+        http.websocket_connect("ws://localhost/api/live") as live,
+        http.websocket_connect("ws://localhost/api/live") as other,
+    ):
+        me = {"X-URLab-Viewer": heard(live, "you")["viewer"]}
+        http.post("/api/run", json={"running": True}, headers=me)
+        http.post("/api/ops/reset", json={}, headers=me)
+        refused = http.post("/api/recording/outcome", json={"outcome": "success"}, headers=me).json()
+        assert "no recording runs" in refused["error"]["message"]
+        assert http.post("/api/recording", json={"cameras": False}, headers=me).status_code == 200
+        before = at_rest(live)
+        order = {"type": "hand", "articulation": "arm", "linear": [0.0, 0.0, -1.0], "gripper": 1.0}
+        while hand(live)[2] > before[2] - 0.05:
+            live.send_json(order)
+        other.send_json(order)
+        assert heard(other, "refused")["error"]["code"] == "not_driving"
+        last = at_rest(live)  # nobody says more: it stops by itself
+        assert 0.05 < before[2] - last[2] < 0.05 + 0.25 * (0.25 + 0.1) + 0.1
+        assert last[:2] == pytest.approx(before[:2], abs=0.01)
+        targets = heard(live, "state")["articulations"]["arm"]["targets"]
+        assert targets[6] > 0.0
+        for wrong, said in (
+            ({"articulation": "leg"}, "leg"),
+            ({"site": "toe"}, "no site 'toe'"),
+            ({"linear": [1.0, 0.0]}, "Expected `array` of length 3"),
+        ):
+            live.send_json({**order, **wrong})
+            assert said in heard(live, "refused")["error"]["message"]
+        assert http.post("/api/recording/outcome", json={"outcome": "won"}, headers=me).status_code == 400
+        assert http.post("/api/recording/outcome", json={"outcome": "success"}, headers=me).status_code == 200
+        name = http.delete("/api/recording", headers=me).json()["name"]
+    marks = read_run(tmp_path / "recordings" / name).summary().outcomes
+    assert [mark.outcome for mark in marks] == ["success"]
+
+
 def test_states_are_dropped_and_not_queued_for_a_viewer_that_is_busy(http: TestClient) -> None:
     http.post("/api/run", json={"running": True})
     with (
@@ -430,6 +480,11 @@ def test_the_viewer_gets_the_model_and_the_state_that_is_shown(http: TestClient)
         http.websocket_connect("ws://localhost/api/live") as live,
     ):
         assert "role=spectator" in viewer.receive_text()
+        layout = viewer.receive_text()
+        assert layout.startswith("layout=")
+        # What a page needs to have a camera, a selection, overlays and a pull of its own.
+        wanted = {"camera", "select", "active", "localpos", "refselpos", "frame", "contacts", "fovy"}
+        assert wanted <= json.loads(layout.removeprefix("layout=")).keys()
         viewer.receive_bytes()
         viewer.receive_bytes()  # two on their way, and no more before it says that one came
         moved = heard(live, "state", lambda state: abs(state["articulations"]["arm"]["qpos"][2] - 0.7) < 0.02)
@@ -446,6 +501,41 @@ def test_the_viewer_gets_the_model_and_the_state_that_is_shown(http: TestClient)
     with pytest.raises(WebSocketDisconnect) as taken, http.websocket_connect("ws://localhost/viewer/ui") as panels:
         panels.receive_text()
     assert taken.value.code == 4001
+
+
+def test_a_body_is_found_by_a_ray_and_pushed_by_who_drives(http: TestClient) -> None:
+    with http.websocket_connect("ws://localhost/api/live") as live:
+        heard(live, "state")
+        found = http.get("/api/bodies").json()
+        hand = next(one for one in found["bodies"] if one["name"] == "hand")
+        assert hand["robot"] == "arm"
+        assert hand["mass"] > 0
+        assert np.linalg.norm(np.array(hand["position"]) - found["center"]) < found["radius"]
+        above = [hand["position"][0], hand["position"][1], 3.0]
+        picked = http.post("/api/pick", json={"origin": above, "direction": [0, 0, -1]}).json()
+        assert picked["body"]["robot"] == "arm"
+        assert http.post("/api/pick", json={"origin": above, "direction": [0, 0, 1]}).json()["body"] is None
+        up = {"body": hand["id"], "local": [0, 0, 0], "target": [hand["position"][0], 0.0, hand["position"][2] + 0.5]}
+        refused = http.post("/api/push", json=up)
+        assert refused.status_code == 400
+        assert "mode direct" in refused.json()["error"]["message"]
+        http.post("/api/ops/set_mode", json={"mode": "direct"})
+        try:
+            began = http.post("/api/step", json={"n_steps": 10}).json()["time"]
+            for _ in range(40):
+                assert http.post("/api/push", json=up).status_code == 200
+                http.post("/api/step", json={"n_steps": 5})
+            heard(live, "state", lambda state: state["time"] > began + 0.3)
+            assert http.get(f"/api/bodies/{hand['id']}").json()["position"][2] > hand["position"][2] + 0.005
+            assert http.delete("/api/push").status_code == 200
+            with http.websocket_connect("ws://localhost/api/live") as two:
+                other = {"x-urlab-viewer": heard(two, "you")["viewer"]}
+                assert http.post("/api/push", json=up, headers=other).status_code == 423
+            assert http.post("/api/push", json={**up, "body": 999}).status_code == 400
+            http.post("/api/ops/set_mode", json={"mode": "puppet"})
+            assert "fixed to the world" in http.post("/api/push", json=up).json()["error"]["message"]
+        finally:
+            http.post("/api/ops/set_mode", json={"mode": "live"})
 
 
 def test_the_viewer_is_behind_the_same_door(site: Starlette, http: TestClient) -> None:

@@ -67,6 +67,54 @@ def test_cameras_and_curves_are_drawn(page: Page) -> None:
     page.until(f"{drawn}(document.querySelector('.curve canvas'))")
 
 
+GAMEPAD = """
+window.pad = {id: 'Pad', connected: true, mapping: 'standard', axes: [0, 0, 0, 0],
+  buttons: Array.from({length: 17}, () => ({pressed: false, value: 0}))};
+navigator.getGamepads = () => [null, window.pad];
+"""
+
+
+def test_keys_and_a_gamepad_move_the_hand_and_judge_episodes(page: Page) -> None:
+    def hand() -> list[float]:
+        return page.ask("api/state")["articulations"]["arm"]["sensors"]["grip_position"]
+
+    def key(kind: str, code: str) -> None:
+        page.driver.execute_script(
+            "document.body.dispatchEvent(new KeyboardEvent(arguments[0], {code: arguments[1], bubbles: true}))",
+            kind,
+            code,
+        )
+
+    page.until(RUNNING)
+    page.ask("api/ops/reset", {})
+    page.asked("api/state", lambda state: state["time"] < 1.0)
+    page.click("#record")
+    page.until("document.querySelector('[data-outcome=success]').disabled === false")
+    page.click("#drive-hand")
+    page.until("document.querySelector('#gamepad').textContent.startsWith('No gamepad')")
+    before = hand()
+    key("keydown", "KeyA")
+    WebDriverWait(page.driver, PATIENCE_S, 0.05).until(lambda _: hand()[1] > before[1] + 0.05)
+    key("keyup", "KeyA")
+    page.driver.execute_script(GAMEPAD)
+    page.until("document.querySelector('#gamepad').textContent === 'Pad'")
+    page.driver.execute_script("window.pad.axes = [0.1, 0, 0, 1]")  # within the dead zone, and down
+    WebDriverWait(page.driver, PATIENCE_S, 0.05).until(lambda _: hand()[2] < before[2] - 0.05)
+    page.driver.execute_script("window.pad.axes = [0, 0, 0, 0]; window.pad.buttons[0] = {pressed: true, value: 1}")
+    page.asked("api/state", lambda state: state["time"] < 1.0)  # a success, and reset
+    page.until("document.querySelector('#log').innerText.includes('success')")
+    page.driver.execute_script("window.pad.buttons[0] = {pressed: false, value: 0}")
+    page.click("#drive-hand")
+    page.click("#record")
+    page.until("document.querySelector('#record').textContent.includes('Record')")
+    page.until("document.querySelectorAll('.recorded').length === 1")
+    page.driver.execute_script(
+        "const name = document.querySelector('.recorded').dataset.recording;"
+        "import('/static/link.js').then(({ask}) => ask('DELETE', `api/recordings/${name}`))"
+    )
+    page.until("document.querySelectorAll('.recorded').length === 0")
+
+
 def test_the_stop_button_stops_and_space_goes_on(page: Page) -> None:
     page.until(RUNNING)
     page.click("#stop")
@@ -195,6 +243,7 @@ def test_a_recording_is_made_offered_for_download_and_replayed_in_seconds(page: 
     page.click("[data-recording] .replay")
     page.until("!document.querySelector('#replay').hidden && +document.querySelector('#timeline').value > 0.1")
     page.until("document.querySelector('#time').textContent !== '0.00 s'")
+    assert "live, not the replay" in page.look("document.querySelector('#cameras').innerText")
     seconds = page.look("+document.querySelector('#timeline').max")
     page.click("#stop")  # whatever moves, physics as well
     page.until("document.querySelector('#replay-play').textContent === '▶'")
@@ -367,6 +416,26 @@ def test_the_3d_view_shows_the_robot_and_follows_it(page: Page, tmp_path: Path) 
         # A screenshot gets 10 seconds, which may be too few where the processor draws and has other things to do.
         wait = WebDriverWait(one.driver, 1.5 * PATIENCE_S, 0.3, ignored_exceptions=[TimeoutException])
         wait.until(lambda _: blue(), "the arm never appeared")
+        one.until("document.querySelector('#body').options.length > 3")
+        one.driver.execute_script("document.querySelector('#fit').click()")
+        # Where the hand is in the picture once everything is: a click there selects it.
+        ask = "const done = arguments[0]; const frame = document.querySelector('#view iframe');"
+        point = one.driver.execute_async_script(
+            ask + "import('/static/link.js').then(async ({ask}) => { for (let y = 0.2; y < 0.9; y += 0.04)"
+            "for (let x = 0.2; x < 0.8; x += 0.04) { const {innerWidth: w, innerHeight: h} = frame.contentWindow;"
+            "const ray = frame.contentWindow.eval(`viewerPointer.ray(${x * w}, ${y * h})`);"
+            "const found = await ask('POST', 'api/pick', ray, {quiet: true});"
+            "if (found?.body) return done([x * w, y * h, found.body.id]); } done(null); })"
+        )
+        assert point, "nothing is in the picture"
+        one.driver.execute_script(
+            "const [x, y] = arguments[0]; const {contentWindow: view} = document.querySelector('#view iframe');"
+            "for (const type of ['pointerdown', 'pointerup']) view.document.body.dispatchEvent(new view.PointerEvent("
+            "type, {clientX: x, clientY: y, button: 0, pointerId: 1, bubbles: true, cancelable: true}))",
+            point,
+        )
+        one.until(f"+document.querySelector('#body').value === {point[2]}")
+        one.until("document.querySelector('#body-facts').textContent.includes('kg')")
         (before,) = wait.until(lambda _: [picture()], "no picture")
         page.slide(1.2)
         wait.until(lambda _: differ(before, picture()) > 0.005, "the arm never moved")

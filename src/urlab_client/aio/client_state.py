@@ -224,7 +224,7 @@ class ClientState:
         objects = self._state.objects
         view = objects.camera(name)
         if view is None:
-            raise KeyError(f"there is no camera {objects.camera_name(name)!r}")
+            raise KeyError(f"no camera is called {objects.camera_name(name)!r}")
         return view
 
     def matches(self, snapshot: StateSnapshot) -> bool:

@@ -201,7 +201,7 @@ def _check_params(
     for name, value in params.items():
         rule = schema.get(name)
         if rule is None:
-            raise _violation(prefix, f"there is no parameter {name!r}; it has: {', '.join(schema) or 'none'}")
+            raise _violation(prefix, f"no parameter is called {name!r}; it has: {', '.join(schema) or 'none'}")
         if rule.get("type") == "per_joint":
             if not isinstance(value, Mapping):
                 raise _violation(prefix, f"{name} takes a mapping of actuator name to number, got {value!r}")

@@ -150,7 +150,7 @@ def _in_task(
     from urlab_client.integrations.policy import OnnxNetwork, PolicyFileError, evaluate_in  # noqa: PLC0415
 
     if task not in TASKS:
-        raise CommandError(f"--task: there is no {task!r}; there are: {', '.join(TASKS)}")
+        raise CommandError(f"--task: no task is called {task!r}; there are: {', '.join(TASKS)}")
     kind = TASKS[task]
     if kind.cameras:
         raise CommandError(f"--task: {task} observes pictures, which a batch has none of")

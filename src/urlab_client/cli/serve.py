@@ -7,21 +7,17 @@ import contextlib
 import json
 import os
 import queue
-import signal
-import sys
 import threading
 from collections.abc import Generator
-from enum import Enum
 from importlib.util import find_spec
 from pathlib import Path
-from types import FrameType
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
 
 from urlab_client._installation import install_command
-from urlab_client._windows import read_aside
 from urlab_client.cli._arguments import Commands, add_dialect, count, image_size, index, port
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._mujoco import import_mujoco
+from urlab_client.cli._serve_events import Event, Events, Starter, next_event, stop_on_signals, watch_input
 from urlab_client.protocol.controller_text import ControllerText
 from urlab_client.protocol.enums import CameraMode, StepMode
 
@@ -32,9 +28,6 @@ if TYPE_CHECKING:
 __all__ = ["add_parser", "run"]
 
 _PORTS = {"step": 5559, "state": 5555, "ctrl": 5556, "info": 5557, "camera": 5558}
-
-# A lock wait on Windows does not see Ctrl-C, so there it is taken in slices.
-_WAIT_S = 0.1 if sys.platform == "win32" else None
 
 _PATIENCE_S = 0.5  # of the second that ending may take, for a start under way
 
@@ -267,10 +260,10 @@ def run(arguments: ServeArguments) -> int:
     _check_ports(arguments)
     if arguments.metrics_port is not None and find_spec("prometheus_client") is None:
         raise CommandError(f"prometheus_client is not installed; run: {install_command('prometheus')}")
-    events: _Events = queue.SimpleQueue()
-    _stop_on_signals(events, ignore_interrupt=arguments.until_eof and not os.isatty(0))
+    events: Events = queue.SimpleQueue()
+    stop_on_signals(events, ignore_interrupt=arguments.until_eof and not os.isatty(0))
     if arguments.until_eof:
-        threading.Thread(target=_watch_input, args=[events], name="urlab-stdin", daemon=True).start()
+        threading.Thread(target=watch_input, args=[events], name="urlab-stdin", daemon=True).start()
     import_mujoco()
     _check_paths(arguments)
     from urlab_client.server.system.allocator import limit_arenas  # noqa: PLC0415
@@ -280,17 +273,17 @@ def run(arguments: ServeArguments) -> int:
 
     with TemporaryFolder() as temporary:
         server = _server(arguments, arguments.saved_dir or temporary.path)
-        starter = _Starter(server, events)
+        starter = Starter(server, events)
         starter.start()
-        if _next(events) is _Event.STARTED:
+        if next_event(events) is Event.STARTED:
             if starter.error is not None:
                 raise starter.error
             with server, _metrics(server, arguments) as metrics_port:
-                server.add_failure_callback(lambda _: events.put(_Event.FAILED))
+                server.add_failure_callback(lambda _: events.put(Event.FAILED))
                 _announce(server, arguments, metrics_port)
-                while (event := _next(events)) is _Event.STARTED:
+                while (event := next_event(events)) is Event.STARTED:
                     pass
-                if event is _Event.FAILED:
+                if event is Event.FAILED:
                     raise CommandError(str(server.failure))
             return 0
         starter.join(_PATIENCE_S)
@@ -301,64 +294,6 @@ def run(arguments: ServeArguments) -> int:
         # Inside MuJoCo's compiler, which nothing can break off, and which the interpreter must not be torn down under.
         os._exit(0)
     return 0
-
-
-class _Event(Enum):
-    """What the main thread waits for."""
-
-    STARTED = "started"
-    STOP = "stop"
-    FAILED = "failed"
-
-
-_Events: TypeAlias = "queue.SimpleQueue[_Event]"  # unlike a threading.Event, it may be used in signal handlers
-
-
-class _Starter(threading.Thread):
-    """Opens the server off the main thread, which so sees a signal at once, whatever is being compiled.
-
-    Attributes:
-        error: What went wrong, or None.
-    """
-
-    def __init__(self, server: SimulatedServer, events: _Events) -> None:
-        super().__init__(name="urlab-start", daemon=True)
-        self.error: Exception | None = None
-        self._server = server
-        self._events = events
-
-    def run(self) -> None:
-        try:
-            self._server.start()
-        except Exception as error:  # noqa: BLE001 - raised again by the main thread
-            self.error = error
-        self._events.put(_Event.STARTED)
-
-
-def _next(events: _Events) -> _Event:
-    while True:
-        with contextlib.suppress(queue.Empty):
-            return events.get(timeout=_WAIT_S)
-
-
-def _stop_on_signals(events: _Events, *, ignore_interrupt: bool) -> None:
-    def stop(number: int, frame: FrameType | None) -> None:
-        events.put(_Event.STOP)
-
-    # Ctrl-C reaches all processes of a terminal, but is meant for the one that a user runs and that holds our input.
-    signal.signal(signal.SIGINT, signal.SIG_IGN if ignore_interrupt else stop)
-    signal.signal(signal.SIGTERM, stop)
-    hangup = getattr(signal, "SIGHUP", None)
-    if hangup is not None and signal.getsignal(hangup) != signal.SIG_IGN:  # nohup wants it ignored
-        signal.signal(hangup, stop)
-
-
-def _watch_input(events: _Events) -> None:
-    # Not through sys.stdin, whose lock this thread would still hold when the interpreter ends.
-    with contextlib.suppress(OSError):  # there is no standard input
-        while read_aside(0, 4096):
-            pass
-    events.put(_Event.STOP)
 
 
 def _server(arguments: ServeArguments, saved_dir: Path) -> SimulatedServer:

@@ -218,7 +218,7 @@ def _print_keys() -> None:
 
 
 def _counts(tally: TeleopTally) -> str:
-    return f"{tally.success} successes, {tally.failure} failures, {tally.discarded} discarded"
+    return f"{tally.success} success, {tally.failure} failure, {tally.discarded} discarded"
 
 
 class _Line:

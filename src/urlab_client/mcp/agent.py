@@ -34,7 +34,8 @@ from msgspec import Struct
 from urlab_client.mcp.declaration import Declared, Moment, Needs, declared
 from urlab_client.mcp.driving import Limits, Stopped
 from urlab_client.mcp.editing import Tools
-from urlab_client.protocol.errors import URLabError
+from urlab_client.mcp.toolset import TAKEN_OVER
+from urlab_client.protocol.errors import SessionTakenOver, URLabError
 from urlab_client.web.console_session import ConsoleSession
 from urlab_client.web.driving_lease import NotDriving
 from urlab_client.web.ops import encode
@@ -54,6 +55,7 @@ _RESOURCES = {
     "urlab://model": "Robots, joints, actuators, sensors, cameras, units and limits, as they are now.",
     "urlab://log": "Calls, errors and events, of people, too; the newest last.",
 }
+_LARGE = 1e3
 _FAILURES = (URLabError, NotDriving, Stopped, ValueError, TypeError, LookupError, OSError)
 _TOOLS = {
     "runtime.set_paused(False)": "play with action='resume'",
@@ -135,6 +137,8 @@ class Agent:
             answer = self._answer(await getattr(self._tools, found.name)(**arguments))
         except _FAILURES as error:
             text = _in_tools(str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error))
+            if isinstance(error, SessionTakenOver):
+                text = TAKEN_OVER
             console.note("error", viewer.name, params.name, text)
             return CallToolResult(content=[TextContent(text=text)], is_error=True)
         if found.needs in {Needs.DRIVE, Needs.EDIT}:
@@ -148,7 +152,7 @@ class Agent:
         if name in self._declared:
             option = self._declared[name].needs.value
             raise LookupError(f"{name} is not allowed here. Ask whoever started `urlab mcp` to start it with {option}.")
-        raise LookupError(f"There is no tool {name!r}. There are: {', '.join(self._offered)}.")
+        raise LookupError(f"No tool is called {name!r}. There are: {', '.join(self._offered)}.")
 
     def _answer(self, result: Struct | tuple[Struct, bytes]) -> CallToolResult:
         """Return a result with its structure, its text, and its picture if there is one.
@@ -180,7 +184,7 @@ class Agent:
     ) -> ReadResourceResult:
         uri = str(params.uri)
         if uri not in _RESOURCES:
-            raise MCPError(INVALID_PARAMS, f"There is no resource {uri!r}, only {' and '.join(_RESOURCES)}.")
+            raise MCPError(INVALID_PARAMS, f"No resource has the address {uri!r}, only {' and '.join(_RESOURCES)}.")
         shown = self._tools.client.describe() if uri == "urlab://model" else list(self._tools.console.entries)
         contents = TextResourceContents(uri=uri, text=encode(shown).decode(), mime_type="application/json")
         return ReadResourceResult(contents=[contents])
@@ -190,7 +194,7 @@ def _short(value: Any) -> Any:
     """Return what a result is made of with six digits of each number, and tools where it speaks of methods."""
     match value:
         case float() if math.isfinite(value):
-            return float(f"{value:.6g}")
+            return float(f"{value:.6g}") if abs(value) < _LARGE else round(value, 3)  # such as times
         case float():
             raise ValueError("The simulation has diverged: some values are not finite. Call reset.")
         case str():

@@ -35,7 +35,7 @@ class Moment(Struct):
 
     Attributes:
         sim_time: Simulation time, seconds.
-        step: Physics steps since the session began or the last reset.
+        step: Physics steps since the session began or the last reset; not counted in mode `live`.
         mode: `direct`: time passes only while a tool lets it; `live`: time passes by itself unless paused.
     """
 
@@ -58,12 +58,12 @@ class Declared:
     """
 
     def __init__(self, method: Callable[..., Awaitable[Any]], needs: Needs, hints: ToolAnnotations) -> None:
-        self.name = method.__name__
+        self.name: str = method.__name__
         self.needs = needs
         self._method = method
         self._hints = hints
         parameters = inspect.signature(method).parameters
-        self.takes_progress = "progress" in parameters
+        self.takes_progress: bool = "progress" in parameters
         self._given = {name: one.default for name, one in parameters.items() if name not in {"self", "progress"}}
 
     def _arguments(self) -> type[Struct]:

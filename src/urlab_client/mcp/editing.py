@@ -32,7 +32,7 @@ class Tools(Moving):
     ) -> Edited:
         """Turn a model into a blueprint, which `spawn` then places. Takes a name, never a path."""
         if model not in self.models:
-            raise LookupError(f"There is no model {model!r}.{did_you_mean(model, self.models)} See `models` in look.")
+            raise LookupError(f"No model is called {model!r}.{did_you_mean(model, self.models)} See `models` in look.")
         file = self.models[model]
 
         async def work() -> str:
@@ -59,7 +59,7 @@ class Tools(Moving):
         """Place a robot or body. Restarts play: the simulation begins anew, with all robots at their start."""
         known = {one.short_name: one.class_path for one in await self.client.outliner.list_blueprints()}
         if blueprint not in known:
-            text = f"There is no blueprint {blueprint!r}.{did_you_mean(blueprint, known)} "
+            text = f"No blueprint is called {blueprint!r}.{did_you_mean(blueprint, known)} "
             raise LookupError(text + "See `blueprints` in look; import_model makes one.")
         if any(row.actor_id == actor_id for row in await self.client.outliner.list_actors()):
             raise ValueError(f"There is an actor {actor_id!r} already: move moves it, remove removes it.")
@@ -101,7 +101,7 @@ class Tools(Moving):
             if row.name in {named, None if art is None else art.compiled_prefix}:
                 return row.name, True
         known = [row.actor_id or row.name for row in rows]
-        raise LookupError(f"There is no actor {named!r}.{did_you_mean(named, known)} There are: {', '.join(known)}.")
+        raise LookupError(f"No actor is called {named!r}.{did_you_mean(named, known)} There are: {', '.join(known)}.")
 
     async def _edit(self, work: Callable[[], Awaitable[None]], progress: Progress, done: str) -> Edited:
         """Change the level and let play begin anew, if it ran."""

@@ -13,7 +13,9 @@ from urlab_client.web.console_session import ConsoleSession
 if TYPE_CHECKING:
     from urlab_client.aio import URLabArticulation
 
-__all__ = ["Toolset"]
+__all__ = ["TAKEN_OVER", "Toolset"]
+
+TAKEN_OVER = "Another program has taken the server over. Ask a person to take it back in the console."
 
 _PATIENCE_S = 10.0
 
@@ -45,12 +47,10 @@ class Toolset:
                 await changed.wait()
         link = self.console.link
         if link.state == "taken_over":
-            raise URLabConnectionError(
-                "Another program has taken the server over.", hint="Ask a person to take it back in the console."
-            )
+            raise URLabConnectionError(TAKEN_OVER)
         if link.state != "connected":
             raise URLabConnectionError(
-                f"There is no connection to {self.client.address}: {link.reason or link.state}.",
+                f"There is no connection to {self.client.address}: {(link.reason or link.state).rstrip('.?')}.",
                 hint="It is tried again all the time. Call again later.",
             )
         if self._known != self.client.session_id:

@@ -5,7 +5,6 @@ Pydantic is not imported: it calls this, from the hooks of `Serializable`. Value
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Callable, Mapping
 from contextvars import ContextVar
 from types import UnionType
@@ -16,10 +15,11 @@ import numpy as np
 from msgspec import NODEFAULT, Struct
 from numpy.typing import NDArray
 
+from urlab_client.protocol.plain_reading import kinds_of, read_array, read_bytes
 from urlab_client.protocol.schemas import field_notes, prose
 from urlab_client.protocol.serializable import plain
 
-__all__ = ["core_schema", "json_schema", "kinds_of"]
+__all__ = ["core_schema", "json_schema"]
 
 Schema = dict[str, Any]
 
@@ -66,17 +66,6 @@ def json_schema(struct: type[Struct], schema: Schema, handler: Any) -> Schema:
         if name in properties:
             properties[name]["description"] = note
     return made
-
-
-def kinds_of(struct: type[Struct]) -> dict[str, type[Struct]]:
-    """Return the structs that a base stands for, by tag; none if it stands for itself."""
-    config = struct.__struct_config__
-    if config.tag_field is None or config.tag != struct.__name__:  # which is what a struct gets that names no tag
-        return {}
-    kinds: dict[str, type[Struct]] = {}
-    for child in struct.__subclasses__():
-        kinds |= kinds_of(child) or {str(child.__struct_config__.tag): child}
-    return kinds
 
 
 def _one_of(kinds: Mapping[str, type[Struct]], handler: Any) -> Schema:
@@ -161,7 +150,7 @@ class _Bytes:
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> Schema:
-        return {"type": "function-plain", "function": {"type": "no-info", "function": _bytes}}
+        return {"type": "function-plain", "function": {"type": "no-info", "function": read_bytes}}
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: Any, handler: Any) -> Schema:
@@ -179,7 +168,7 @@ class _Array:
         items = handler.generate_schema(Number if self._dtype == np.float64 else list[Any])
 
         def read(value: Any, inner: object) -> NDArray[Any]:
-            return _array(value, self._dtype)
+            return read_array(value, self._dtype)
 
         return {
             "type": "function-wrap",
@@ -189,37 +178,3 @@ class _Array:
 
 
 _LEAVES: Final[Mapping[Any, Any]] = {float: Number, bytes: _Bytes}
-
-
-def _bytes(data: Any) -> bytes:
-    if isinstance(data, bytes):
-        return data
-    if not isinstance(data, str):
-        raise ValueError(f"{type(data).__name__} is not base64 text")  # noqa: TRY004  # pydantic reports ValueError only
-    return base64.b64decode(data, validate=True)
-
-
-def _array(data: Any, dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Read an array from either form, or take one as it is.
-
-    Raises:
-        ValueError: It is neither, or its numbers do not fit the type.
-    """
-    try:
-        match data:
-            case np.ndarray():
-                array = cast("NDArray[Any]", data)
-            case {"dtype": str(name), "shape": shape, "base64": numbers}:
-                stored = np.dtype(name).newbyteorder("<")
-                array = np.frombuffer(_bytes(numbers), stored).reshape(shape).astype(stored.newbyteorder("="))
-            case list():
-                array = np.array(data, dtype if dtype.kind == "f" or not data else None)
-            case _:
-                raise ValueError("an array is a list of numbers, or has dtype, shape and base64")
-    except TypeError as error:  # which pydantic does not report, but raises
-        raise ValueError(str(error)) from None
-    with np.errstate(invalid="ignore"):
-        exact = array.astype(dtype, copy=False)
-    if not np.can_cast(array.dtype, dtype, "same_kind") and (array != exact).any():
-        raise ValueError(f"the numbers are not {dtype.name}")
-    return exact

@@ -49,6 +49,33 @@ class Serializable:
         """Return `to_dict()` as JSON text."""
         return msgspec.json.encode(self.to_dict(arrays=arrays)).decode()
 
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """Return the value that plain data stand for: the way back from `to_dict()`, with arrays in either form.
+
+        What has no type of its own comes back as it is; NaN and infinities in it stay strings. The base of several
+        kinds, such as `ClientEvent`, finds the kind by its tag.
+
+        Raises:
+            ValueError: A field is missing, unknown or of another type; the text says which.
+        """
+        from urlab_client.protocol.plain_reading import read  # noqa: PLC0415  # which few programs need
+
+        return cast("Self", read(cls, data, cls.__name__))
+
+    @classmethod
+    def from_json(cls, text: str | bytes) -> Self:
+        """Return the value that JSON stands for: the way back from `to_json()`.
+
+        Raises:
+            ValueError: It is not JSON, or not that of such a value.
+        """
+        try:
+            data = msgspec.json.decode(text)
+        except msgspec.DecodeError as error:
+            raise ValueError(f"{cls.__name__}: {error}") from None
+        return cls.from_dict(data)
+
     def replace(self, **changes: Any) -> Self:
         """Return a copy in which some fields have other values.
 

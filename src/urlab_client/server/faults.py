@@ -76,7 +76,7 @@ class Fault:
             except msgspec.ValidationError as error:
                 raise TypeError(f"{type(self).__name__}: {name}: {error}") from None
         if self.op is not None and self.op not in OPS:
-            raise ValueError(f"there is no op {self.op!r}")
+            raise ValueError(f"no op is called {self.op!r}")
         if self.topic is not None and self.op is not None:
             raise ValueError("a fault concerns the requests of an op or the messages of a topic, not both")
         if self.after < 0 or (self.times is not None and self.times < 1):

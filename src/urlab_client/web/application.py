@@ -6,9 +6,9 @@ import contextlib
 import os
 import secrets
 import time
-from collections.abc import AsyncGenerator, Awaitable, Callable
+from collections.abc import AsyncGenerator, Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any
 
 import anyio
 import anyio.to_thread
@@ -22,23 +22,20 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from urlab_client.protocol.errors import (
-    OutcomeUnknown,
-    URLabConnectionError,
-    URLabError,
-    URLabRPCError,
-    URLabTimeoutError,
-)
+from urlab_client.protocol.errors import URLabError
 from urlab_client.web import mujoco_viewer
 from urlab_client.web.access import Access, Guarded
+from urlab_client.web.body_routes import BodyRoutes
 from urlab_client.web.console_session import Audience, ConsoleSession
 from urlab_client.web.driving_lease import DrivingLease, NotDriving, Viewer
-from urlab_client.web.messages import Ack, Ctrl, FromViewer, Log, Name, Ping, Pong, Refused, You
+from urlab_client.web.explained_errors import explain_error
+from urlab_client.web.messages import Ack, Ctrl, FromViewer, Hand, Log, Name, Ping, Pong, Refused, You
 from urlab_client.web.metrics import showing
 from urlab_client.web.model_upload import ModelRoutes
 from urlab_client.web.ops import encode, openapi, parse, served
 from urlab_client.web.reading_routes import ReadingRoutes
 from urlab_client.web.recording_routes import RecordingRoutes
+from urlab_client.web.route_group import Handler
 
 if TYPE_CHECKING:
     from prometheus_client import CollectorRegistry
@@ -51,8 +48,6 @@ _STATIC = Path(__file__).parent / "static"
 _LARGEST_BODY = 1024 * 1024
 _AHEAD = 2  # states or pictures on their way to a browser that has not said that they came
 _VIEWER = "x-urlab-viewer"
-
-_Handler: TypeAlias = Callable[[Request], Awaitable[Response]]
 
 
 def app(
@@ -99,7 +94,7 @@ def app(
     return application
 
 
-def entrance(access: Access) -> _Handler:
+def entrance(access: Access) -> Handler:
     """Return what answers `POST /api/session`: it spends a token for a key."""
 
     async def enter(request: Request) -> Response:
@@ -132,9 +127,10 @@ class _Site:
         self._reading = ReadingRoutes(console, self._viewer)
         self._recordings = RecordingRoutes(console, self._viewer)
         self._models = ModelRoutes(console, self._viewer)
+        self._body_pushing = BodyRoutes(console.body_pushing, self._viewer, _body)
 
     def routes(self) -> list[Route | WebSocketRoute | Mount]:
-        def route(path: str, handler: _Handler, *methods: str) -> Route:
+        def route(path: str, handler: Handler, *methods: str) -> Route:
             return Route(path, _answering(handler), methods=list(methods or ["GET"]))
 
         return [
@@ -152,7 +148,11 @@ class _Site:
             route("/api/step", self._step, "POST"),
             *(
                 route(path, handler, *methods)
-                for path, handler, methods in (*self._recordings.routes(), *self._models.routes())
+                for path, handler, methods in (
+                    *self._recordings.routes(),
+                    *self._models.routes(),
+                    *self._body_pushing.routes(),
+                )
             ),
             route("/api/lease", self._lease, "POST", "DELETE"),
             route("/api/connection", self._connection, "POST"),
@@ -209,7 +209,7 @@ class _Site:
     async def _op(self, request: Request) -> Response:
         op = served(request.path_params["op"])
         if op is None:
-            return _error(404, "unknown_op", f"There is no op {request.path_params['op']!r} here.", "See openapi.json.")
+            return _error(404, "unknown_op", f"No op is called {request.path_params['op']!r}.", "See openapi.json.")
         body = await _body(request)
         return _json(encode(await self.console.controls.do(self._viewer(request), parse(op, body))))
 
@@ -311,10 +311,10 @@ class _Site:
                     case Name(name=name):
                         one.viewer.name = " ".join(name.split())[:24] or one.viewer.name
                         self.console.tell()
-                    case Ctrl(values=values):
-                        self.console.controls.set_points(one.viewer, values)
+                    case Ctrl() | Hand():
+                        self.console.drive(one.viewer, message)
             except (NotDriving, ValueError, KeyError, RecursionError, msgspec.MsgspecError) as error:
-                await socket.send_text(encode(Refused(_explain(error)[1])).decode())
+                await socket.send_text(encode(Refused(explain_error(error)[1])).decode())
 
     async def _pictures(self, socket: WebSocket) -> None:
         feed = self.console.feed(socket.path_params["path"])
@@ -368,12 +368,15 @@ class _Site:
         with self.console.bell() as changed:
 
             async def send() -> None:
-                sent = None
+                sent = told = None
                 with contextlib.suppress(WebSocketDisconnect, RuntimeError):
                     while True:
                         changed.clear()
                         snapshot = self.console.snapshot
                         shown = await self.console.mujoco_viewer.shown()
+                        if shown and shown is not told:
+                            told = shown
+                            await socket.send_text(mujoco_viewer.LAYOUT + shown.layout)
                         if shown and snapshot and snapshot is not sent and flow.sent - flow.acknowledged < _AHEAD:
                             sent = snapshot
                             flow.sent += 1
@@ -443,42 +446,17 @@ def _now_ms() -> float:
     return time.time() * 1e3
 
 
-def _answering(handler: _Handler) -> _Handler:
+def _answering(handler: Handler) -> Handler:
     """Turn what a handler raises into an answer."""
 
     async def answer(request: Request) -> Response:
         try:
             return await handler(request)
         except (NotDriving, URLabError, OSError, ValueError, TypeError, KeyError, RecursionError) as error:
-            status, said = _explain(error)
+            status, said = explain_error(error)
             return _json(encode({"error": said}), status)
 
     return answer
-
-
-def _explain(error: Exception) -> tuple[int, dict[str, Any]]:
-    """Return the status and what is said of an error."""
-    hint = (getattr(error, "hint", None) or "") if isinstance(error, URLabError) else ""
-    text = error.args[0] if isinstance(error, URLabError) and error.args else str(error)
-    match error:
-        case NotDriving():
-            status, code = 423, "not_driving"
-        case URLabRPCError():
-            status, code = 409, error.code
-            text = error.message
-        case URLabTimeoutError():
-            status, code = 504, "timeout"
-        case OutcomeUnknown():
-            status, code = 502, "outcome_unknown"
-        case URLabConnectionError():
-            status, code = 503, "unreachable"
-        case URLabError():
-            status, code = 502, "failed"
-        case OSError():
-            status, code = 500, "io_failed"
-        case _:
-            status, code = 400, "bad_request"
-    return status, {"code": code, "message": str(text), "hint": hint}
 
 
 async def _body(request: Request) -> bytes:

@@ -33,10 +33,12 @@ from urlab_client.protocol.messages.streams import (
     SessionOpened,
     StateSnapshot,
 )
+from urlab_client.web.body_pushing import BodyPushing
 from urlab_client.web.controls import Controls
 from urlab_client.web.description import WorldDescription, describe
 from urlab_client.web.driving_lease import DrivingLease, Viewer
-from urlab_client.web.messages import ArticulationSample, EntitySample, Link, LogEntry, State, Status, World
+from urlab_client.web.hand_driving import HandDriving
+from urlab_client.web.messages import ArticulationSample, Ctrl, EntitySample, Hand, Link, LogEntry, State, Status, World
 from urlab_client.web.mujoco_viewer import MujocoViewer
 from urlab_client.web.ops import encode
 from urlab_client.web.pictures import Feed
@@ -101,8 +103,11 @@ class ConsoleSession:
         self.snapshot: StateSnapshot | None = None
         self.mujoco_viewer: MujocoViewer = MujocoViewer(client)
         self.controls: Controls = Controls(self)
+        self.hands: HandDriving = HandDriving(self)
         self.recordings: Recordings = Recordings(client, recordings)
         self.replay: Replay = Replay(self)
+        self.body_pushing: BodyPushing = BodyPushing(self)
+        self.controls.before_step = self.body_pushing.apply
         self._handshake = handshake
         self._adopted = b""
         self._bells: set[asyncio.Event] = set()
@@ -123,7 +128,12 @@ class ConsoleSession:
         """Keep the session and receive state while the body runs."""
         async with anyio.create_task_group() as tasks:
             controls = self.controls
-            jobs = (controls.send_set_points, controls.keep_stepping, self.replay.keep_playing)
+            jobs = (
+                controls.send_set_points,
+                controls.keep_stepping,
+                self.hands.keep_driving,
+                self.replay.keep_playing,
+            )
             for job in (self._keep, self._receive, self._pulse, *jobs):
                 tasks.start_soon(job)
             try:
@@ -213,6 +223,19 @@ class ConsoleSession:
             case _:
                 pass
 
+    def drive(self, viewer: Viewer, order: Ctrl | Hand) -> None:
+        """Do what a viewer's message orders.
+
+        Raises:
+            NotDriving: Somebody else has the controls.
+            KeyError: A name is unknown; nothing was set.
+            ValueError: It cannot be done; nothing was set.
+        """
+        if isinstance(order, Hand):
+            self.hands.command(viewer, order)
+        else:
+            self.controls.set_points(viewer, order.values)
+
     def take_back(self) -> None:
         """Open a session again, after another program took the server over."""
         self._want = "discover"
@@ -278,6 +301,7 @@ class ConsoleSession:
 
     def _publish(self, snapshot: StateSnapshot, targets: Mapping[str, list[float] | None]) -> None:
         self.snapshot = snapshot
+        self.mujoco_viewer.follow(snapshot)
         self.state_seq += 1
         wall = snapshot.wall_time.sec + snapshot.wall_time.nsec / 1e9
         received = snapshot.recv_wall_time_ns / 1e9

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Protocol
 
 import anyio
@@ -65,6 +65,7 @@ class Controls:
         speed: Pacing of live mode that somebody set, percent.
         source: Who drives the actuators, if somebody chose.
         twists: Velocities that were asked for, by articulation: x, y, yaw.
+        before_step: Called before each step of mode direct that the console makes.
     """
 
     def __init__(self, console: Console) -> None:
@@ -72,6 +73,7 @@ class Controls:
         self.speed: float | None = None
         self.source: str | None = None
         self.twists: dict[str, tuple[float, float, float]] = {}
+        self.before_step: Callable[[], None] = lambda: None
         self._console = console
         self._client = console.client
         self._lease = console.lease
@@ -196,6 +198,7 @@ class Controls:
     async def _step(self, n_steps: int) -> dict[str, Any]:
         for key, art in self._client.articulations.items():
             self._seed(key, art)
+        self.before_step()
         watched = dict.fromkeys(self._console.watched_cameras(), "latest")
         reply = await self._client.step(n_steps, include_cameras=watched or False)
         return {"time": reply.time, "step": reply.step}

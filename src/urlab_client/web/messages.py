@@ -17,6 +17,7 @@ __all__ = [
     "Ctrl",
     "EntitySample",
     "FromViewer",
+    "Hand",
     "Link",
     "Log",
     "LogEntry",
@@ -162,7 +163,21 @@ class Ctrl(Struct, tag_field="type", tag="ctrl"):
     values: Annotated[dict[str, dict[str, float]], Meta(description="Articulation to actuator to set-point.")] = {}
 
 
-FromViewer: TypeAlias = Ack | Ping | Name | Ctrl
+class Hand(Struct, tag_field="type", tag="hand"):
+    """Velocities of a robot's hand for a quarter of a second, or until the next one. Needs the controls.
+
+    Linear ones are shares of 0.25 m/s along the world's axes, angular ones of 1 rad/s about them. `gripper` is towards
+    its largest set-point (1) or its smallest (-1), and `site` names the hand where the robot has several sites.
+    """
+
+    articulation: str
+    linear: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    angular: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    gripper: float = 0.0
+    site: str = ""
+
+
+FromViewer: TypeAlias = Ack | Ping | Name | Ctrl | Hand
 """What a viewer says."""
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import re
+import struct
 import zlib
 from collections.abc import Mapping
 from functools import cache
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import anyio.to_thread
+import msgspec
 import numpy as np
 
 from urlab_client.aio.model.layout import articulation_layouts
@@ -27,10 +29,13 @@ if TYPE_CHECKING:
 
     from urlab_client.aio import URLabClient
 
-__all__ = ["SHOWN", "SPECTATOR", "TAKEN", "Files", "MujocoViewer", "Shown", "files"]
+__all__ = ["LAYOUT", "SHOWN", "SPECTATOR", "TAKEN", "Files", "MujocoViewer", "Shown", "files"]
 
 SPECTATOR = "viewers=1;role=spectator;queue_pos=0;queue_len=0;max_spectators=0"
 """Tells a page that it watches."""
+
+LAYOUT = "layout="
+"""Begins what tells a page where values lie in a state."""
 
 SHOWN = "state_ack"
 """What a page says when it has taken a state over."""
@@ -38,7 +43,7 @@ SHOWN = "state_ack"
 TAKEN = 4001
 """Close code that tells a page that somebody else has MuJoCo's own panels."""
 
-_SHIM = '<script src="../static/mujoco_viewer.js"></script>'
+_SHIM = '<script src="../static/viewer_pointer.js"></script><script src="../static/mujoco_viewer.js"></script>'
 _INLINE = re.compile(r"<script>(.*?)</script>", re.DOTALL)
 
 
@@ -88,15 +93,22 @@ def _payload() -> Any:
 
 
 class Shown(NamedTuple):
-    """A model as the page gets it: `bundle` with the number `crc` that tells it from others, and where values go."""
+    """A model as the page gets it: `bundle` with the number `crc` that tells it from others, and where values go.
+
+    `prefixes` are those of the robots' compiled names. `layout` tells a page where in a state the camera, the selection
+    and the overlays lie, so that each page can have its own.
+    """
 
     model: mujoco.MjModel
     data: mujoco.MjData
     bundle: bytes
     crc: int
     addresses: Mapping[str, Any]
+    velocities: Mapping[str, Any]
     camera: Any
     flags: list[int]
+    prefixes: Mapping[str, str]
+    layout: str
 
 
 class MujocoViewer:
@@ -110,6 +122,8 @@ class MujocoViewer:
         self._client = client
         self._shown: Shown | None = None
         self._written: tuple[StateSnapshot, bytes] | None = None
+        self._snapshot: StateSnapshot | None = None
+        self._placed: StateSnapshot | None = None
 
     @property
     def missing(self) -> str:
@@ -130,8 +144,26 @@ class MujocoViewer:
         if self._shown is None or self._shown.model is not model:
             prefixes = {key: art.compiled_prefix for key, art in self._client.articulations.items()}
             self._shown = await anyio.to_thread.run_sync(_prepare, model, prefixes)
-            self._written = None
+            self._written = self._placed = None
         return self._shown
+
+    def follow(self, snapshot: StateSnapshot) -> None:
+        """Take the newest state; it costs nothing until somebody looks."""
+        self._snapshot = snapshot
+
+    def latest(self) -> Shown | None:
+        """Return the model with the newest state in its data and bodies placed; None without one of them."""
+        import mujoco  # noqa: PLC0415
+
+        shown, snapshot = self._shown, self._snapshot
+        if shown is None or snapshot is None or shown.model is not self._client.model:
+            return None
+        if self._placed is not snapshot:
+            self._place(shown, snapshot)
+            mujoco.mj_kinematics(shown.model, shown.data)
+            mujoco.mj_comPos(shown.model, shown.data)
+            self._placed = snapshot
+        return shown
 
     def write(self, shown: Shown, snapshot: StateSnapshot) -> bytes:
         """Return a state as the page reads it."""
@@ -139,15 +171,17 @@ class MujocoViewer:
             self._written = snapshot, self._write(shown, snapshot)
         return self._written[1]
 
-    def _write(self, shown: Shown, snapshot: StateSnapshot) -> bytes:
-        import mujoco  # noqa: PLC0415
-
+    def _place(self, shown: Shown, snapshot: StateSnapshot) -> None:
+        """Put a state into the data: positions, and velocities, which contact forces depend on."""
         model, data = shown.model, shown.data
         data.time = snapshot.time
         for key, state in snapshot.per_articulation.items():
             addresses = shown.addresses.get(key)
             if addresses is not None and len(state.qpos) == len(addresses):
                 data.qpos[addresses] = state.qpos
+                velocities = shown.velocities[key]
+                if len(state.qvel) == len(velocities):
+                    data.qvel[velocities] = state.qvel
         for name, pose in snapshot.entities.items():
             entity = self._client.entities.get(name)
             if entity is None:
@@ -157,21 +191,17 @@ class MujocoViewer:
                 data.mocap_pos[mocap], data.mocap_quat[mocap] = pose.xpos, pose.xquat
             elif pose.qpos is not None and entity.qpos_offset is not None:
                 data.qpos[entity.qpos_offset : entity.qpos_offset + 7] = pose.qpos
-        what = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-        state = np.empty(mujoco.mj_stateSize(model, what))
-        mujoco.mj_getState(model, data, state, what)
-        payload = _payload()
-        return payload.serialize_state_payload(
-            shown.crc,
-            what,
-            state.tobytes(),
-            shown.camera,
-            mujoco.MjvPerturb(),
-            mujoco.MjvOption(),
-            model,
+
+    def _write(self, shown: Shown, snapshot: StateSnapshot) -> bytes:
+        import mujoco  # noqa: PLC0415
+
+        self._place(shown, snapshot)
+        return _serialize(
+            shown.model,
+            shown.data,
+            (shown.camera, mujoco.MjvPerturb(), mujoco.MjvOption()),
             shown.flags,
-            [],
-            payload.ViewerInputState(),
+            shown.crc,
         )
 
 
@@ -181,6 +211,72 @@ def _prepare(model: mujoco.MjModel, prefixes: Mapping[str, str]) -> Shown:
     bundle: bytes = _payload().serialize_model_bundle(model)
     camera = mujoco.MjvCamera()
     mujoco.mjv_defaultFreeCamera(model, camera)
-    addresses = {key: layout.qpos_adr for key, layout in articulation_layouts(model, prefixes).items()}
+    layouts = articulation_layouts(model, prefixes)
+    addresses = {key: layout.qpos_adr for key, layout in layouts.items()}
+    velocities = {key: layout.qvel_adr for key, layout in layouts.items()}
     flags = [int(flag) for flag in mujoco.MjvScene(model, maxgeom=1).flags]  # shadows, reflections, sky
-    return Shown(model, mujoco.MjData(model), bundle, zlib.crc32(bundle), addresses, camera, flags)
+    data, layout = mujoco.MjData(model), _layout(model)
+    return Shown(model, data, bundle, zlib.crc32(bundle), addresses, velocities, camera, flags, prefixes, layout)
+
+
+def _serialize(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    view: tuple[mujoco.MjvCamera, mujoco.MjvPerturb, mujoco.MjvOption],
+    flags: list[int],
+    crc: int = 0,
+) -> bytes:
+    import mujoco  # noqa: PLC0415
+
+    what = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+    state = np.empty(mujoco.mj_stateSize(model, what))
+    mujoco.mj_getState(model, data, state, what)
+    payload = _payload()
+    return payload.serialize_state_payload(
+        crc, what, state.tobytes(), *view, model, flags, [], payload.ViewerInputState()
+    )
+
+
+_MARK = 0x5A3C1E7B
+_PLACE = (12345.678, 23456.789, 34567.891)
+
+
+def _layout(model: mujoco.MjModel) -> str:
+    """Return as JSON where values lie in a state of this model, in bytes; what cannot be told is left out.
+
+    MuJoCo does not document the format. It is found by writing values that occur nowhere else.
+    """
+    import mujoco  # noqa: PLC0415
+
+    data = mujoco.MjData(model)
+    places: dict[str, Any] = {"fovy": float(model.vis.global_.fovy)}
+
+    def find(name: str, mark: bytes, camera: Any = None, perturb: Any = None, option: Any = None) -> None:
+        parts = camera or mujoco.MjvCamera(), perturb or mujoco.MjvPerturb(), option or mujoco.MjvOption()
+        written = _serialize(model, data, parts, [0] * int(mujoco.mjtRndFlag.mjNRNDFLAG))
+        if written.count(mark) == 1:
+            places[name] = written.index(mark)
+
+    camera = mujoco.MjvCamera()
+    camera.lookat[:] = _PLACE
+    find("camera", struct.pack("<3d", *_PLACE), camera=camera)
+    for name in ("select", "active"):
+        perturb = mujoco.MjvPerturb()
+        setattr(perturb, name, _MARK)
+        find(name, struct.pack("<i", _MARK), perturb=perturb)
+    for name in ("localpos", "refselpos"):
+        perturb = mujoco.MjvPerturb()
+        getattr(perturb, name)[:] = _PLACE
+        find(name, struct.pack("<3d", *_PLACE), perturb=perturb)
+    option = mujoco.MjvOption()
+    option.frame = _MARK
+    find("frame", struct.pack("<i", _MARK), option=option)
+    option = mujoco.MjvOption()
+    option.flags[:] = 0x5A
+    find("flags", bytes(option.flags), option=option)
+    if "flags" in places:
+        shown = mujoco.mjtVisFlag
+        places["contacts"] = [
+            places["flags"] + int(one) for one in (shown.mjVIS_CONTACTPOINT, shown.mjVIS_CONTACTFORCE)
+        ]
+    return msgspec.json.encode(places).decode()

@@ -242,6 +242,9 @@ _PATHS: dict[str, Any] = {
         **_path("post", "record", "Record into an MCAP file: `{cameras: bool}`. Needs the controls."),
         **_path("delete", "stop_recording", "End the recording, and describe it. Needs the controls."),
     },
+    "/api/recording/outcome": _path(
+        "post", "mark_episode", "Note `{outcome}` of the episode: success, failure, discarded. Needs the controls."
+    ),
     "/api/recordings": _path("get", "recordings", "The recordings, the newest first."),
     "/api/recordings/{name}": {
         **_path("get", "download", "A recording, `?as=csv`, `npz` or `mp4&camera=…`; `?as=about` describes it."),

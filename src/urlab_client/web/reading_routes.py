@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncGenerator, Awaitable, Callable
-from typing import TypeAlias
+from collections.abc import AsyncGenerator
 
 import anyio
 import anyio.to_thread
@@ -12,32 +11,21 @@ from starlette.responses import Response, StreamingResponse
 
 from urlab_client.protocol.enums import StepMode
 from urlab_client.web.asyncapi import asyncapi
-from urlab_client.web.console_session import ConsoleSession
 from urlab_client.web.driving_lease import Viewer
 from urlab_client.web.ops import encode
+from urlab_client.web.route_group import Handler, RouteGroup
 
 __all__ = ["ReadingRoutes"]
-
-_Handler: TypeAlias = Callable[[Request], Awaitable[Response]]
 
 _FLOWING_S = 5.0
 _ALIVE_S = 15.0
 """How long an event stream may be silent: proxies take longer silence for a dead connection."""
 
 
-class ReadingRoutes:
-    """Handlers of `/api/asyncapi.json`, `/api/explain`, `/api/events` and pictures.
+class ReadingRoutes(RouteGroup):
+    """Handlers of `/api/asyncapi.json`, `/api/explain`, `/api/events` and pictures."""
 
-    Args:
-        console: The session that all viewers share.
-        viewer: Says who asks.
-    """
-
-    def __init__(self, console: ConsoleSession, viewer: Callable[[Request], Viewer]) -> None:
-        self._console = console
-        self._viewer = viewer
-
-    def routes(self) -> list[tuple[str, _Handler, list[str]]]:
+    def routes(self) -> list[tuple[str, Handler, list[str]]]:
         """Return path, handler and methods of each route."""
         return [
             ("/api/asyncapi.json", self._asyncapi, ["GET"]),
@@ -108,7 +96,7 @@ class ReadingRoutes:
 
 
 def _no_camera(request: Request) -> Response:
-    text = f"There is no camera {request.path_params['path']!r}."
+    text = f"No camera is called {request.path_params['path']!r}."
     return Response(encode({"error": {"code": "unknown_camera", "message": text}}), 404, media_type="application/json")
 
 

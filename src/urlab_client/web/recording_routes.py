@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
-from typing import TypeAlias
-
 import msgspec
 from msgspec import Struct
 from starlette.background import BackgroundTask
 from starlette.requests import Request
 from starlette.responses import FileResponse, Response
 
-from urlab_client.web.console_session import ConsoleSession
-from urlab_client.web.driving_lease import Viewer
+from urlab_client.integrations._feed.messages import EpisodeOutcome
 from urlab_client.web.ops import encode
+from urlab_client.web.route_group import Handler, RouteGroup
 
 __all__ = ["RecordingRoutes"]
-
-_Handler: TypeAlias = Callable[[Request], Awaitable[Response]]
 
 
 class _RecordRequest(Struct):
     cameras: bool = True
+
+
+class _OutcomeRequest(Struct):
+    outcome: EpisodeOutcome
 
 
 class _ReplayRequest(Struct):
@@ -32,22 +31,14 @@ class _ReplayRequest(Struct):
     rate: float | None = None
 
 
-class RecordingRoutes:
-    """Handlers of `/api/recording`, `/api/recordings` and `/api/replay`.
+class RecordingRoutes(RouteGroup):
+    """Handlers of `/api/recording`, `/api/recordings` and `/api/replay`."""
 
-    Args:
-        console: The session that all viewers share.
-        viewer: Says who asks.
-    """
-
-    def __init__(self, console: ConsoleSession, viewer: Callable[[Request], Viewer]) -> None:
-        self._console = console
-        self._viewer = viewer
-
-    def routes(self) -> list[tuple[str, _Handler, list[str]]]:
+    def routes(self) -> list[tuple[str, Handler, list[str]]]:
         """Return path, handler and methods of each route."""
         return [
             ("/api/recording", self._record, ["POST", "DELETE"]),
+            ("/api/recording/outcome", self._mark, ["POST"]),
             ("/api/recordings", self._list, ["GET"]),
             ("/api/recordings/{name}", self._recording, ["GET", "PUT", "DELETE"]),
             ("/api/replay", self._replay, ["POST", "DELETE"]),
@@ -65,6 +56,14 @@ class RecordingRoutes:
         name = await console.recordings.start(cameras=asked.cameras)
         console.note("call", viewer.name, "record", name)
         return _json({"name": name})
+
+    async def _mark(self, request: Request) -> Response:
+        viewer, console = self._viewer(request), self._console
+        console.lease.use(viewer)
+        outcome = msgspec.json.decode(await request.body(), type=_OutcomeRequest).outcome
+        await console.recordings.mark(outcome)
+        console.note("call", viewer.name, "episode", outcome)
+        return _json({})
 
     async def _list(self, request: Request) -> Response:
         return _json({"recordings": self._console.recordings.list(), "folder": str(self._console.recordings.folder)})

@@ -19,6 +19,7 @@ from urlab_client.protocol.errors import URLabError
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabClient
+    from urlab_client.integrations._feed.messages import EpisodeOutcome
     from urlab_client.integrations.record.reader import Run
     from urlab_client.integrations.record.recorder import AsyncRecorder
 
@@ -135,6 +136,16 @@ class Recordings:
         finally:
             self._recorder = None
 
+    async def mark(self, outcome: EpisodeOutcome) -> None:
+        """Note what became of the present episode.
+
+        Raises:
+            ValueError: No recording is under way.
+        """
+        if self._recorder is None:
+            raise ValueError("no recording runs that could note the outcome of an episode: start one first")
+        await self._recorder.mark(outcome)
+
     async def stop(self) -> dict[str, Any]:
         """End the recording and describe it.
 
@@ -174,7 +185,7 @@ class Recordings:
         """
         file = self.folder / name
         if not _NAME.fullmatch(name) or not file.is_file():
-            raise KeyError(f"there is no recording {name!r}")
+            raise KeyError(f"no recording is called {name!r}")
         return file
 
     async def describe(self, name: str) -> dict[str, Any]:

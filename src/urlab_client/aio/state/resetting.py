@@ -74,6 +74,6 @@ def _compiled_keyframe(state: SimState, name: str) -> str:
     problem = (
         f"{name!r} could mean {', '.join(matches)}"
         if matches
-        else f"there is no {name!r}, only: {', '.join(compiled) or 'none'}"
+        else f"no keyframe is called {name!r}, only: {', '.join(compiled) or 'none'}"
     )
     raise UnknownKeyframe("unknown_keyframe", f"{problem}. Nothing was sent.", op="reset")

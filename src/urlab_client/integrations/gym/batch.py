@@ -214,11 +214,11 @@ class URLabBatchEnv(Vectorized):
         if pictures is not None:
             pictures.close()
 
-    def _reset_and_step(self, fresh: Indices, acting: Indices, actions: Any) -> tuple[Found, Found]:
+    def _reset_and_step(self, fresh: Indices, acting: Indices, set_points: Mapping[str, Floats]) -> tuple[Found, Found]:
         nothing: Found = (None, {})
         return (
             self._reset_some(fresh, self._keyframe) if len(fresh) else nothing,
-            self._step_some(acting, actions) if len(acting) else nothing,
+            self._step_some(acting, set_points) if len(acting) else nothing,
         )
 
     def _reset_some(self, indices: Indices, keyframe: str | None) -> Found:
@@ -249,10 +249,10 @@ class URLabBatchEnv(Vectorized):
         self._step_count[indices] = 0
         return self._observe(indices), {}
 
-    def _step_some(self, indices: Indices, actions: Any) -> Found:
+    def _step_some(self, indices: Indices, set_points: Mapping[str, Floats]) -> Found:
         ctrl = self._arrays["ctrl"]
         targets: dict[str, NDArray[Any]] = {}
-        for key, values in self.mapping.set_points(actions).items():
+        for key, values in set_points.items():
             controller = self._controllers.get(key)
             if controller is None or not controller.active:
                 ctrl[np.ix_(indices, self.mapping.layout(key).ctrl_adr)] = values[indices]

@@ -207,7 +207,11 @@ class EnvEpisode:
         Raises:
             ValueError: The action does not fit; nothing was sent.
         """
-        for key, values in self.mapping.set_points(action).items():
+        return await self.act(self.mapping.set_points(action), forces)
+
+    async def act(self, set_points: Mapping[str, Floats], forces: Mapping[str, Floats]) -> Observation:
+        """Do what `step` does, given the set-points of each articulation, shape (n_ctrl,)."""
+        for key, values in set_points.items():
             self.client.articulations[key].ctrl_array[:] = values
         for body, force in forces.items():
             articulation, name = self._pushed(body)

@@ -32,7 +32,7 @@ class BatchPictures:
         names = [model.camera(i).name for i in range(model.ncam)]
         wanted = names[0] if camera is None and names else (camera or "").replace("/", "_")
         if wanted not in names:
-            raise ValueError(f"there is no camera {camera!r} to render; the scene has {', '.join(names) or 'none'}")
+            raise ValueError(f"no camera is called {camera!r}; the scene has {', '.join(names) or 'none'}")
         self._model = copy.copy(model)
         self._data = mujoco.MjData(model)
         self._view = mujoco.MjvCamera()

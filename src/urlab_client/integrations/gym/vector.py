@@ -81,12 +81,12 @@ class _Session:
                 raise URLabError("The environment was closed.")
             return await self.episode.reset(rng, keyframe, seed)
 
-    async def step(self, action: Any, forces: Mapping[str, Floats], timeout: float) -> Observation:
+    async def step(self, set_points: Mapping[str, Floats], forces: Mapping[str, Floats], timeout: float) -> Observation:
         """Act."""
         if self.episode is None:
             raise URLabError("The environment failed before.", hint="Reset it, which starts it afresh.")
         async with asyncio.timeout(timeout):
-            return await self.episode.step(action, forces)
+            return await self.episode.act(set_points, forces)
 
     def reopen(self) -> asyncio.Task[None]:
         """Give up what there is, and begin to start a session in its place; whoever resets waits for that."""
@@ -308,15 +308,17 @@ class URLabVectorEnv(Vectorized):
         }
         return self._found(self._portal.call(self._all, calls))
 
-    def _reset_and_step(self, fresh: Indices, acting: Indices, actions: Any) -> tuple[Found, Found]:
-        each = list(iterate(self.action_space, actions))
+    def _reset_and_step(self, fresh: Indices, acting: Indices, set_points: Mapping[str, Floats]) -> tuple[Found, Found]:
         timeout, sessions = self._step_timeout, self._sessions
         resets = {
             i: partial(sessions[i].reset, self._rngs[i], self._keyframe, self._episode_seed(i), timeout)
             for i in map(int, fresh)
         }
         forces = self._forces(acting)
-        steps = {i: partial(sessions[i].step, each[i], forces.get(i, {}), timeout) for i in map(int, acting)}
+        steps = {
+            i: partial(sessions[i].step, {key: of[i] for key, of in set_points.items()}, forces.get(i, {}), timeout)
+            for i in map(int, acting)
+        }
         results = self._portal.call(self._all, {**resets, **steps})
         return self._found({i: results[i] for i in resets}), self._found({i: results[i] for i in steps})
 

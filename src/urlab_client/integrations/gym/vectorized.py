@@ -96,8 +96,8 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         """Reset some environments."""
 
     @abstractmethod
-    def _reset_and_step(self, fresh: Indices, acting: Indices, actions: Any) -> tuple[Found, Found]:
-        """Reset some environments into `_keyframe` and step others, given the actions of all."""
+    def _reset_and_step(self, fresh: Indices, acting: Indices, set_points: Mapping[str, Floats]) -> tuple[Found, Found]:
+        """Reset some environments into `_keyframe` and step others, given the set-points of all."""
 
     @abstractmethod
     def _states(self) -> States:
@@ -149,13 +149,16 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         """
         if not self._started:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
-        self.mapping.set_points(actions)  # refuses before anything moves
+        set_points = self._set_points(actions)  # refuses before anything moves
         next_step = self.autoreset_mode is AutoresetMode.NEXT_STEP
         fresh = np.flatnonzero(self._ended) if next_step else np.zeros(0, dtype=np.intp)
         acting = np.setdiff1d(np.arange(self.num_envs), fresh)
         before = self._copied()
         self._begin(fresh)
-        started, moved = self._reset_and_step(fresh, acting, self._delayed(acting, actions))
+        delayed = self._delayed(acting, actions)
+        if delayed is not actions:
+            set_points = self._set_points(delayed)
+        started, moved = self._reset_and_step(fresh, acting, set_points)
         if len(fresh):
             self._took(fresh, started)
         if len(acting):
@@ -246,6 +249,16 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
             for i, error in errors.items():
                 infos["error"][i], infos["_error"][i] = error, True
         return infos
+
+    def _set_points(self, actions: Any) -> dict[str, Floats]:
+        """Return the set-points of each articulation, shape (environments, n_ctrl)."""
+        found = self.mapping.set_points(actions)
+        for key, values in found.items():
+            if values.ndim != 2 or len(values) != self.num_envs:
+                raise ValueError(
+                    f"the actions of {key} have shape {values.shape}; their first axis must be {self.num_envs} long"
+                )
+        return found
 
     def _copied(self) -> Observation:
         """Return the observations as they are, which rewards and ends are judged by."""

@@ -96,7 +96,7 @@ def require(client: AsyncClient, policy: Policy, articulation: str | None = None
     robot = client.articulations.get(name)
     if robot is None:
         raise PolicyMismatch(
-            f"{source}: robot: there is no articulation {name!r}; there are: {', '.join(client.articulations)}.",
+            f"{source}: robot: no articulation is called {name!r}; there are: {', '.join(client.articulations)}.",
             hint="Name one of them, by its key, actor id or class name.",
         )
     if client.step_mode not in spec.step_modes:

@@ -38,6 +38,7 @@ class HandControl:
         gripper: Name of the actuator that opens and closes the gripper, or None.
         speed: Largest speed, m/s.
         turn_speed: Largest rate of turn, rad/s.
+        set_points: Those that were set last, by actuator name.
         blocked: Whether the target could not move as it was told to last.
     """
 
@@ -76,6 +77,7 @@ class HandControl:
         self.speed: float = _above_zero("speed", speed)
         self.turn_speed: float = _above_zero("turn_speed", turn_speed)
         self.blocked: bool = False
+        self.set_points: dict[str, float] = {}
         present = self.ik.solve(self.ik.pose()[0], nearest=True, starts=1)
         found = self._gripper(gripper, present)
         self.gripper: str | None = None if found is None else found.name
@@ -125,11 +127,12 @@ class HandControl:
     def _aim(self, position: Floats, quaternion: Floats) -> bool:
         """Set the set-points for a pose; those of before if it is out of reach."""
         found = self.ik.solve(position, quaternion, start=self._joints, starts=1, tolerance=_TOLERANCE_M, nearest=True)
-        set_points = {} if self.gripper is None else {self.gripper: self._opening}
         if found.reached:
             self._position, self._quaternion, self._joints = position, quaternion, found.joints
-            set_points |= found.set_points
-        self._robot.set_ctrl(set_points)
+            self.set_points |= found.set_points
+        if self.gripper is not None:
+            self.set_points[self.gripper] = self._opening
+        self._robot.set_ctrl(self.set_points)
         return found.reached
 
     def _gripper(self, name: str | None, solution: IkSolution) -> Actuator | None:

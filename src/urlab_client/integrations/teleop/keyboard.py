@@ -50,7 +50,7 @@ _ARROWS: Final = {"\x1b[A": "w", "\x1b[B": "s", "\x1b[D": "a", "\x1b[C": "d"}
 
 HELP: Final = (
     ("w s, a d, r f", "move along x, y, z; also the arrows for x and y; with shift slowly"),
-    ("z c, v b, q e", "turn about x, y, z; with shift slowly"),
+    ("c z, b v, q e", "turn about x, y, z; with shift slowly"),
     ("space", "close or open the gripper"),
     ("enter, n", "the episode is a success, a failure"),
     ("backspace", "discard the episode"),

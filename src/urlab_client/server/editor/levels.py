@@ -76,7 +76,7 @@ class Levels:
         self._refuse_during_play(code)
         package, file = self._locate(name, code)
         if not file.is_file():
-            raise Refusal(code, f"there is no level {package} (no file {file})")
+            raise Refusal(code, f"no level is called {package} (no file {file})")
         self._read(package, file, trusted=package in self.external)
         return package
 

@@ -236,7 +236,7 @@ def _check_owners(server: ServerCore, running: Running, request: Step) -> None:
             continue
         control = running.engine.articulations.find(name)
         if control is None:
-            raise Refusal("not_control_owner", f"there is no articulation '{name}'", owner=UNCLAIMED)
+            raise Refusal("not_control_owner", f"no articulation is called '{name}'", owner=UNCLAIMED)
         check_owner(server, request, control)
 
 

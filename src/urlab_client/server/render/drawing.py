@@ -16,6 +16,7 @@ from urlab_client.protocol.messages.session import CameraFrame
 from urlab_client.server.compile.scene_index import SceneCamera
 from urlab_client.server.editor.viewport import ViewMode
 from urlab_client.server.render.opengl import Backend, free_context, make_context
+from urlab_client.server.render.sunlight import follow_subject, moving_geoms, shadow_clip
 from urlab_client.server.render.tints import Tints
 from urlab_client.server.render.viewport_picture import (
     ViewportPicture,
@@ -72,12 +73,14 @@ class Stage:
             model.vis.quality.numslices, model.vis.quality.numstacks = _SLICES, _STACKS
         self._option = mujoco.MjvOption()
         self._option.sitegroup[:] = 0  # marks for the modeller, not things to be seen
+        self._subjects = moving_geoms(model)
         self._view = mujoco.MjvCamera()
         self._scene = mujoco.MjvScene(model, maxgeom=max(10_000, 2 * model.ngeom + 1000))
         width, height = model.vis.global_.offwidth, model.vis.global_.offheight
         self._gl = make_context(backend, width, height)
         self._renderer: Any = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._renderer)
+        self._renderer.shadowClip = shadow_clip(self._renderer.shadowClip)
         self._renderer.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
         self._opengl: Any = importlib.import_module("OpenGL.GL")  # only now: the context's module chooses its platform
         if self._fast:
@@ -109,6 +112,8 @@ class Stage:
         mujoco.mjv_updateScene(self._model, data, self._option, None, self._view, everything, self._scene)
         for side in self._scene.camera:
             _bring_near(side)
+        if not self._fast:
+            follow_subject(self._scene, self._model, data, self._subjects)
         flags, kinds = self._scene.flags, mujoco.mjtRndFlag
         flags[kinds.mjRND_SHADOW] = flags[kinds.mjRND_REFLECTION] = not self._fast
         flags[kinds.mjRND_WIREFRAME] = False
@@ -142,6 +147,8 @@ class Stage:
             mujoco.mjv_updateScene(self._model, data, self._option, None, self._view, kinds_of_geoms, self._scene)
         for side in self._scene.camera:
             side.forward[:], side.up[:] = view.forward, view.up
+        if not self._fast:
+            follow_subject(self._scene, self._model, data, self._subjects)
         if mode is ViewMode.UNLIT:
             light_evenly(self._scene)
         add_primitives(self._scene, picture.primitives)

@@ -13,7 +13,7 @@ class CameraView {
     this.state = h("span", { class: "waiting" }, "No picture yet. Cameras send while physics runs live.");
     this.element = h("figure", { class: "camera", "data-camera": camera.path },
       h("div", { class: "frame", onclick: () => this.element.classList.toggle("large") }, this.image, this.state),
-      h("figcaption", {}, h("b", {}, `${owner ? `${owner} / ` : ""}${camera.name}`), h("span", { class: "tag" }, camera.mode),
+      h("figcaption", {}, h("b", {}, `${owner ? `${owner} / ` : ""}${camera.name}`), h("span", { class: "tag" }, camera.mode), h("span", { class: "still-live" }, "live, not the replay"),
         h("span", { class: "space" }), this.note));
     this.frames = [];
     this.closed = false;

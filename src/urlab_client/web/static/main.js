@@ -10,6 +10,7 @@ import { makeReplay } from "./replay.js";
 import { makeRobots } from "./robots.js";
 import { makeContacts, makeScene } from "./scene.js";
 import { makeSensors } from "./sensors.js";
+import { makeTeleop } from "./teleop.js";
 import { makeView } from "./view.js";
 
 const KEYS = [
@@ -21,7 +22,7 @@ const KEYS = [
   ["?", "?", "this", () => $("help").showModal()],
 ];
 
-for (const make of [makeBar, makeView, makeCameras, makeSensors, makeRobots, makeScene, makeRecording, makeReplay, makeContacts, makeLog]) make();
+for (const make of [makeBar, makeView, makeCameras, makeSensors, makeRobots, makeTeleop, makeScene, makeRecording, makeReplay, makeContacts, makeLog]) make();
 
 $("help").append(h("h2", {}, "Keys"),
   h("dl", {}, ...KEYS.flatMap(([, shown, what]) => [h("dt", {}, h("kbd", {}, shown)), h("dd", {}, what)]),

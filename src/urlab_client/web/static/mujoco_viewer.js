@@ -6,6 +6,8 @@
 //   back by itself, the newest state is told again, and the page around says what is wrong, once.
 // - It draws whenever it can; here not while it is out of sight, and where drawing is slow, only half of the time:
 //   the page around it shares the thread.
+// - It neither tells where its camera is nor takes another one. Here the camera is ours (viewer_pointer.js), and is
+//   written over its own before each frame. So are the selection and the overlays, into each state.
 // - It takes the keyboard once it was clicked; here the page around it gets the keys, which are the console's.
 
 {
@@ -14,6 +16,7 @@
   const SLOW_MS = 25;
   const AGAIN_MS = 1000;
   const SHOWN = "state_ack";
+  const LAYOUT = "layout=";
   const TAKEN = 4001; // "somebody else has MuJoCo's own panels"
   const CRC_AT = 8; // bytes into a state: the number of the model that it belongs to
   let wanted = 0; // the model that the newest state belongs to
@@ -52,7 +55,8 @@
 
     /** Tell the newest state again before a frame that would else find none for a while, however long that took. */
     repeat() {
-      if (this.newest === null || performance.now() - this.toldAt < AGAIN_MS) return;
+      if (this.newest === null || (!viewerPointer.undressed && performance.now() - this.toldAt < AGAIN_MS)) return;
+      viewerPointer.dress(this.newest);
       this.repeats += 1;
       this.toldAt = performance.now();
       this.tell("message", { data: this.newest });
@@ -74,10 +78,15 @@
         this.tell("open", {});
       };
       socket.onmessage = ({ data }) => {
+        if (typeof data === "string" && data.startsWith(LAYOUT)) {
+          viewerPointer.learn(JSON.parse(data.slice(LAYOUT.length)));
+          return;
+        }
         if (data instanceof ArrayBuffer) {
           wanted = new DataView(data).getUint32(CRC_AT, true);
           this.newest = data;
           this.toldAt = performance.now();
+          viewerPointer.dress(data);
         }
         this.tell("message", { data });
       };
@@ -112,7 +121,8 @@
       tried = performance.now();
       reloadModel(wanted);
     }
-    window.parent.postMessage({ viewer: shown ? "shown" : "loading" }, location.origin);
+    if (shown) viewerPointer.seek(currentModelCrc);
+    window.parent.postMessage({ viewer: shown ? "shown" : "loading", pointer: viewerPointer.found }, location.origin);
   }, 250);
 
   // Drawing
@@ -126,6 +136,7 @@
     const asked = performance.now();
     draw((now) => {
       sockets.forEach((socket) => socket.repeat());
+      viewerPointer.aim();
       callback(now);
       const took = performance.now() - asked;
       pause = took > SLOW_MS ? Math.min(took, 500) : 0;

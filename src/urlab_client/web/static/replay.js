@@ -46,6 +46,7 @@ export function makeReplay() {
     replay = status.replay;
     $("replay").hidden = replay === null;
     document.body.classList.toggle("replaying", replay !== null);
+    document.body.classList.toggle("cameras-live", replay !== null && !replay.placing);
     if (!replay) return;
     text(name, replay.name.replace(/\.mcap$/, ""));
     text(play, replay.playing ? "❚❚" : "▶");

@@ -1,6 +1,7 @@
 // The 3-D view: MuJoCo's web viewer in a frame. It is loaded once there is a model and somebody looks, and let go when
 // it is closed. What covers it says what it waits for.
 
+import { makeBodies } from "./bodies.js";
 import { $, h, text } from "./dom.js";
 import { on } from "./link.js";
 
@@ -16,8 +17,9 @@ function lacking() {
 export function makeView() {
   const cover = h("p", { class: "cover", role: "status" });
   const stage = h("div", { class: "stage" }, cover);
-  const box = h("details", { id: "view-box" }, h("summary", {}, h("h2", {}, "3-D view")), stage,
-    h("p", { class: "hint" }, "Drag to turn, with the right button to move, scroll for the distance."));
+  const bodies = makeBodies(() => stage.querySelector("iframe")?.contentWindow);
+  const box = h("details", { id: "view-box" }, h("summary", {}, h("h2", {}, "3-D view")), bodies.bar, stage,
+    h("p", { class: "hint" }, "Drag to turn, with the right button or Shift to move, scroll for the distance. Click a body to select it; Push, or Ctrl, and drag to push it."));
   $("view").append(box);
   const here = { socket: false, link: "connecting", missing: "", shown: false };
   const unable = lacking();
@@ -37,12 +39,15 @@ export function makeView() {
     const wanted = box.open && !unable && (frame ? !here.missing : !why);
     if (wanted && !frame) {
       here.shown = false;
+      bodies.begun();
       frame = h("iframe", { src: "viewer/", title: "3-D view" });
       stage.prepend(frame);
     } else if (!wanted) frame?.remove();
     const said = wanted && here.shown ? "" : why || "Loading the model …";
     cover.hidden = !said;
     stage.classList.toggle("unable", unable !== "");
+    bodies.bar.hidden = !wanted;
+    cover.classList.toggle("busy", said !== "" && !unable && here.socket);
     text(cover, said);
   }
 
@@ -51,8 +56,11 @@ export function makeView() {
   box.addEventListener("toggle", () => { localStorage.setItem(OPEN, box.open ? "yes" : "no"); show(); });
   window.addEventListener("message", ({ source, data }) => {
     if (!source || source !== stage.querySelector("iframe")?.contentWindow) return;
-    here.shown = data.viewer === "shown";
-    show();
+    if (data.viewer) {
+      here.shown = data.viewer === "shown";
+      show();
+    }
+    bodies.hear(data);
   });
   on("open", () => { here.socket = true; show(); });
   on("closed", () => { here.socket = false; show(); });

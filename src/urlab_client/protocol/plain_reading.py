@@ -1,0 +1,181 @@
+"""Typed values from plain data: the way back from `Serializable.to_dict()`. No I/O."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Callable, Mapping, Sequence
+from enum import Enum
+from functools import cache
+from types import NoneType, UnionType
+from typing import Annotated, Any, Final, Literal, Union, cast, get_args, get_origin
+
+import msgspec
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from urlab_client.protocol.names import did_you_mean
+
+__all__ = ["kinds_of", "read", "read_array", "read_bytes"]
+
+
+def read(kind: Any, data: Any, where: str) -> Any:  # noqa: PLR0911 - one for each kind of type
+    """Return the value of a type that plain data stands for.
+
+    Args:
+        kind: The type, as a field of a struct is annotated.
+        data: What `plain` made of a value, or a JSON parser of that.
+        where: What the data are of, for errors.
+
+    Raises:
+        ValueError: They do not fit; the text says what, where.
+    """
+    origin: Any = get_origin(kind)
+    arguments = get_args(kind)
+    if origin is Annotated:
+        return read(arguments[0], data, where)
+    if origin in {Union, UnionType}:
+        return _read_one_of(arguments, data, where)
+    if origin is Literal and data in arguments:
+        return data
+    if origin is np.ndarray:
+        return _said(where, lambda: read_array(data, np.dtype(get_args(arguments[1])[0])))
+    if origin is dict and isinstance(data, Mapping):
+        items = cast("Mapping[Any, Any]", data).items()
+        return {_key(arguments[0], key): read(arguments[1], value, f"{where}[{key!r}]") for key, value in items}
+    if origin in {list, tuple, frozenset, Sequence} and isinstance(data, list | tuple):
+        return _read_items(origin, arguments, list(cast("Sequence[Any]", data)), where)
+    if isinstance(kind, type) and issubclass(kind, Struct):
+        return _read_struct(kind, data, where)
+    if isinstance(kind, type) and issubclass(kind, Enum):
+        return _said(where, lambda: kind(data))
+    if kind is bytes:
+        return _said(where, lambda: read_bytes(data))
+    if kind is float and isinstance(data, str) and data in _NAMES:
+        return _NAMES[data]
+    if kind is float and type(data) in {int, float}:
+        return float(data)
+    if kind is Any or (type(data) is kind and kind in _AS_THEY_ARE):
+        return data
+    raise ValueError(f"{where}: {data!r:.80} does not fit {_named(kind)}")
+
+
+_AS_THEY_ARE: Final = frozenset({bool, int, str, NoneType})
+_NAMES: Final[Mapping[Any, float]] = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
+
+
+def _said(where: str, make: Callable[[], Any]) -> Any:
+    try:
+        return make()
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+def _named(kind: Any) -> str:
+    return kind.__name__ if isinstance(kind, type) and not get_args(kind) else str(kind)
+
+
+def _key(kind: Any, key: Any) -> Any:
+    return int(key) if kind is int else key  # JSON makes text of them
+
+
+def _read_one_of(kinds: tuple[Any, ...], data: Any, where: str) -> Any:
+    """Read what fits one of several types; of several structs the one with these fields."""
+    problems: list[str] = []
+    for kind in sorted(kinds, key=lambda one: not _has_fields_of(one, data)):
+        try:
+            return read(NoneType if kind is None else kind, data, where)
+        except ValueError as error:
+            problems.append(str(error))
+    raise ValueError(problems[0] if isinstance(data, Mapping) else f"{where}: {data!r:.80} fits none of its types")
+
+
+def _has_fields_of(kind: Any, data: Any) -> bool:
+    known = _fields(kind) if isinstance(kind, type) and issubclass(kind, Struct) else {}
+    return isinstance(data, Mapping) and known.keys() == cast("Mapping[str, Any]", data).keys()
+
+
+def _read_items(origin: Any, kinds: tuple[Any, ...], data: list[Any], where: str) -> Any:
+    fixed = origin is tuple and kinds[-1] is not ...
+    if fixed and len(data) != len(kinds):
+        raise ValueError(f"{where}: {len(data)} values, but it takes {len(kinds)}")
+    each = kinds if fixed else kinds[:1] * len(data)
+    read_all = [read(kind, one, f"{where}[{at}]") for at, (kind, one) in enumerate(zip(each, data, strict=True))]
+    return tuple(read_all) if origin is tuple else frozenset(read_all) if origin is frozenset else read_all
+
+
+@cache
+def _fields(struct: type[Struct]) -> dict[str, msgspec.structs.FieldInfo]:
+    return {field.name: field for field in msgspec.structs.fields(struct)}
+
+
+def _read_struct(struct: type[Struct], data: Any, where: str) -> Struct:
+    if not isinstance(data, Mapping):
+        raise ValueError(f"{where}: {data!r:.80} is not a mapping of fields")  # noqa: TRY004 - the one error of reading
+    given = dict(cast("Mapping[str, Any]", data))
+    if kinds := kinds_of(struct):
+        tag = given.get(str(next(iter(kinds.values())).__struct_config__.tag_field))
+        if tag not in kinds:
+            raise ValueError(f"{where}: {tag!r} is none of {', '.join(sorted(kinds))}.{did_you_mean(str(tag), kinds)}")
+        return _read_struct(kinds[str(tag)], data, where)
+    config, known = struct.__struct_config__, _fields(struct)
+    if config.tag_field is not None and given.pop(config.tag_field, config.tag) != config.tag:
+        raise ValueError(f"{where}: {config.tag_field} is {data[config.tag_field]!r}, not {config.tag!r}")
+    for name in given:
+        if name not in known:
+            raise ValueError(f"{where}: there is no field {name!r}.{did_you_mean(name, known)}")
+    missing = [name for name, field in known.items() if field.required and name not in given]
+    if missing:
+        raise ValueError(f"{where}: the field {missing[0]!r} is missing")
+    return struct(**{name: read(known[name].type, one, f"{where}.{name}") for name, one in given.items()})
+
+
+def kinds_of(struct: type[Struct]) -> dict[str, type[Struct]]:
+    """Return the structs that a base stands for, by tag; none if it stands for itself."""
+    config = struct.__struct_config__
+    if config.tag_field is None or config.tag != struct.__name__:  # which is what a struct gets that names no tag
+        return {}
+    kinds: dict[str, type[Struct]] = {}
+    for child in struct.__subclasses__():
+        kinds |= kinds_of(child) or {str(child.__struct_config__.tag): child}
+    return kinds
+
+
+def read_bytes(data: Any) -> bytes:
+    """Read bytes from base64 text, or take them as they are.
+
+    Raises:
+        ValueError: It is neither.
+    """
+    if isinstance(data, bytes):
+        return data
+    if not isinstance(data, str):
+        raise ValueError(f"{type(data).__name__} is not base64 text")  # noqa: TRY004  # the one error of reading
+    return base64.b64decode(data, validate=True)
+
+
+def read_array(data: Any, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Read an array from either form, or take one as it is.
+
+    Raises:
+        ValueError: It is neither, or its numbers do not fit the type.
+    """
+    try:
+        match data:
+            case np.ndarray():
+                array = cast("NDArray[Any]", data)
+            case {"dtype": str(name), "shape": shape, "base64": numbers}:
+                stored = np.dtype(name).newbyteorder("<")
+                array = np.frombuffer(read_bytes(numbers), stored).reshape(shape).astype(stored.newbyteorder("="))
+            case list():
+                array = np.array(data, dtype if dtype.kind == "f" or not data else None)
+            case _:
+                raise ValueError("an array is a list of numbers, or has dtype, shape and base64")
+    except TypeError as error:  # numbers that are none
+        raise ValueError(str(error)) from None
+    with np.errstate(invalid="ignore"):
+        exact = array.astype(dtype, copy=False)
+    if not np.can_cast(array.dtype, dtype, "same_kind") and (array != exact).any():
+        raise ValueError(f"the numbers are not {dtype.name}")
+    return exact

@@ -1,0 +1,41 @@
+"""What HTTP answers and refusals say of an error."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from urlab_client.protocol.errors import (
+    OutcomeUnknown,
+    URLabConnectionError,
+    URLabError,
+    URLabRPCError,
+    URLabTimeoutError,
+)
+from urlab_client.web.driving_lease import NotDriving
+
+__all__ = ["explain_error"]
+
+
+def explain_error(error: Exception) -> tuple[int, dict[str, Any]]:
+    """Return the status and what is said of an error."""
+    hint = (getattr(error, "hint", None) or "") if isinstance(error, URLabError) else ""
+    text = error.args[0] if isinstance(error, URLabError) and error.args else str(error)
+    match error:
+        case NotDriving():
+            status, code = 423, "not_driving"
+        case URLabRPCError():
+            status, code = 409, error.code
+            text = error.message
+        case URLabTimeoutError():
+            status, code = 504, "timeout"
+        case OutcomeUnknown():
+            status, code = 502, "outcome_unknown"
+        case URLabConnectionError():
+            status, code = 503, "unreachable"
+        case URLabError():
+            status, code = 502, "failed"
+        case OSError():
+            status, code = 500, "io_failed"
+        case _:
+            status, code = 400, "bad_request"
+    return status, {"code": code, "message": str(text), "hint": hint}

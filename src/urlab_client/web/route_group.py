@@ -1,0 +1,29 @@
+"""A part of the HTTP API: handlers that share the console's session."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from typing import TypeAlias
+
+from starlette.requests import Request
+from starlette.responses import Response
+
+from urlab_client.web.console_session import ConsoleSession
+from urlab_client.web.driving_lease import Viewer
+
+__all__ = ["Handler", "RouteGroup"]
+
+Handler: TypeAlias = Callable[[Request], Awaitable[Response]]
+
+
+class RouteGroup:
+    """Handlers of some routes.
+
+    Args:
+        console: The session that all viewers share.
+        viewer: Says who asks.
+    """
+
+    def __init__(self, console: ConsoleSession, viewer: Callable[[Request], Viewer]) -> None:
+        self._console = console
+        self._viewer = viewer

@@ -1,0 +1,108 @@
+// Over the 3-D view: fit, overlays, and the selected body, which can be pushed.
+
+import { choices, h, number, text } from "./dom.js";
+import { ask, on } from "./link.js";
+
+const LOOK_MS = 300;
+const RENEW_MS = 150;
+
+/** `frame` returns the window of the viewer, or nothing. */
+export function makeBodies(frame) {
+  const say = (message) => frame()?.postMessage(message, location.origin);
+  const here = { selected: -1, pushing: false, pull: null, sending: false, fitted: false, mode: "", known: 0 };
+  const toggle = (id, label, title, act) => {
+    const button = h("button", { id, title, "aria-pressed": "false", onclick: () => {
+      const pressed = button.getAttribute("aria-pressed") !== "true";
+      button.setAttribute("aria-pressed", pressed);
+      act(pressed);
+    } }, label);
+    return button;
+  };
+  const fitted = h("button", { id: "fit", title: "Show all robots", onclick: fit }, "Fit");
+  const contacts = toggle("show-contacts", "Contacts", "Contact points and forces", (one) => say({ show: { contacts: one } }));
+  const frames = toggle("show-frames", "Frames", "Frames of the bodies: x red, y green, z blue", (one) => say({ show: { frames: one } }));
+  const list = h("select", { id: "body", "aria-label": "Selected body", onchange: () => select(+list.value) });
+  const push = toggle("push", "Push", "Drag in the view to push the selected body; also with Ctrl held", (one) => {
+    here.pushing = one;
+    say({ pushing: one });
+  });
+  const facts = h("span", { class: "num", id: "body-facts" });
+  const bar = h("div", { class: "row tools", role: "group", "aria-label": "3-D view" }, fitted, contacts, frames, list, push, facts);
+
+  async function fit() {
+    const found = await ask("GET", "api/bodies", undefined, { quiet: true });
+    if (found) say({ fit: found });
+    return found;
+  }
+
+  function select(id) {
+    here.selected = id;
+    list.value = id;
+    push.disabled = id < 1;
+    say({ show: { select: id } });
+    look();
+  }
+
+  async function look() {
+    if (here.selected < 1) return text(facts, "");
+    const id = here.selected;
+    const body = await ask("GET", `api/bodies/${id}`, undefined, { quiet: true });
+    if (body && id === here.selected) text(facts, `${body.position.map((one) => number(one, 2)).join(" ")} m · ${+body.mass.toPrecision(3)} kg`);
+  }
+
+  async function fill() {
+    const found = await fit();
+    if (!found) return false;
+    const named = found.bodies.map((one) => [String(one.id), [one.robot, one.name].filter(Boolean).join(" / ")]);
+    choices(list, [["-1", "no body selected"], ...named]);
+    select(named.some(([id]) => +id === here.selected) ? here.selected : -1);
+    return true;
+  }
+
+  /** Send the newest pull, and again while it is held: a console that hears nothing lets go. */
+  async function send() {
+    if (here.sending) return;
+    here.sending = true;
+    while (here.pull) {
+      const sent = here.pull;
+      const began = performance.now();
+      if (await ask("POST", "api/push", { body: here.selected, ...sent }) === null) {
+        here.pull = null;
+        say({ show: { pull: null } });
+        break;
+      }
+      if (here.pull === sent) await new Promise((go) => setTimeout(go, Math.max(0, RENEW_MS - (performance.now() - began))));
+    }
+    here.sending = false;
+  }
+
+  async function hear(data) {
+    if (data.viewer) bar.classList.toggle("unable", !data.pointer);
+    if (data.viewer === "shown" && data.pointer && !here.fitted) {
+      here.fitted = true;
+      here.fitted = await fill();
+      for (const one of [contacts, frames, push]) one.setAttribute("aria-pressed", "false");
+    }
+    if (data.pick) {
+      const found = await ask("POST", "api/pick", data.pick, { quiet: true });
+      if (found) select(found.body?.id ?? -1);
+    }
+    if (data.grip) {
+      const found = await ask("POST", "api/pick", data.grip, { quiet: true });
+      if (found?.body?.id === here.selected) say({ grip: { local: found.local, point: found.point } });
+    }
+    if (data.pull) {
+      here.pull = data.pull;
+      send();
+    }
+    if (data.release && here.pull) {
+      here.pull = null;
+      ask("DELETE", "api/push", undefined, { quiet: true });
+    }
+  }
+
+  on("world", () => { here.fitted = false; });
+  setInterval(look, LOOK_MS);
+  push.disabled = true;
+  return { bar, hear, begun: () => { here.fitted = false; } };
+}
