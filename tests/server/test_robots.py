@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
+import urlab_client
 from urlab_client.server.assets.bundled_robots import bundled_models
 from urlab_client.server.assets.content import ContentRoot
 from urlab_client.server.compile.scene import CompiledScene, compile_scene
@@ -62,7 +63,7 @@ def test_the_models_are_packaged() -> None:
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
 
     assert project["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"] == ["src/urlab_client", "src/pytest_urlab"]
-    assert all(path.is_relative_to(Path(__file__).parents[2] / "src") for path in bundled_models().values())
+    assert all(path.is_relative_to(Path(urlab_client.__file__).parent) for path in bundled_models().values())
 
 
 @pytest.mark.parametrize("name", sorted(bundled_models()))

@@ -270,7 +270,7 @@ class TestRefusals:
         assert gen_sync.main([], plan) == 1
         error = capsys.readouterr().err
         assert error.startswith("what was generated does not pass ruff check; correct its source:\n")
-        assert "toylab/sync/robots.py:" in error
+        assert f"{Path('toylab/sync/robots.py')}:" in error
         assert "D102" in error
 
 

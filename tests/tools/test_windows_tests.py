@@ -83,6 +83,13 @@ def test_a_crash_costs_one_test_and_not_those_whose_names_begin_alike(run_tests:
     assert outcome.passed == 2
 
 
+def test_an_interpreter_that_does_not_start_is_started_again(run_tests: ModuleType, tmp_path: Path) -> None:
+    program = f"mkdir {tmp_path}/once && exit 1; echo tests/x.py::test_a PASSED"
+    outcome = run(run_tests, tmp_path, program, "test_a")
+    assert outcome.passed == 1
+    assert outcome.problems == ["the interpreter ended with 1 outside tests"]
+
+
 def test_a_crash_after_the_last_test_is_told(run_tests: ModuleType, tmp_path: Path) -> None:
     outcome = run(run_tests, tmp_path, "echo tests/x.py::test_a PASSED; exit 9", "test_a")
     assert outcome.passed == 1

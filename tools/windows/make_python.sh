@@ -100,7 +100,7 @@ import tomllib
 with open(sys.argv[1], "rb") as file:
     project = tomllib.load(file)["project"]
 # pip asks Linux what Windows needs: the last ones are dependencies of dependencies there alone, and pip itself.
-for requirement in [*project["dependencies"], *project["optional-dependencies"]["test"], "cffi", "colorama", "pip"]:
+for requirement in [*project["dependencies"], *project["optional-dependencies"]["test"], "cffi", "colorama", "pywin32", "pip"]:
     if not requirement.startswith(("selenium", "uvloop")):
         print(requirement)
 EOF

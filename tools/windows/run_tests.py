@@ -159,7 +159,7 @@ def run(outcome: Outcome, prefix: Prefix, log: Path, clock: Clock) -> Outcome:
             outcome.broken_off = True
             break
         outcome.results |= dict.fromkeys(interrupted, "ERROR")
-        if (code in {0, 1} and not interrupted) or (code == NOTHING_LEFT and not met):
+        if (code in {0, 1} and met and not interrupted) or (code == NOTHING_LEFT and not met):
             break
         crashes += 1
         if not interrupted:
