@@ -210,6 +210,27 @@ def test_pictures_show_the_state_and_leave_physics_alone(make_env: MakeEnv) -> N
     assert not np.array_equal(first, last)
 
 
+def test_pictures_of_depths_and_segmentations_are_rendered_as_colours() -> None:
+    modes = {"arm/wrist": "depth", "arm/overview": "semantic"}
+    with SimulatedServer("arm", play=True, camera_size=(16, 12), camera_modes=modes) as server:
+        pictures: dict[str, Any] = {}
+        frames: dict[str, Any] = {}
+        for camera in modes:
+            with urlab_client.URLabClient(**server.client_options(), step_mode="direct") as client:
+                client.discover()
+                env = URLabEnv(
+                    client, space_mode="dict", cameras=[camera], render_mode="rgb_array", render_camera=camera
+                )
+                frames[camera] = env.reset(seed=0)[0]["cameras"][camera]
+                pictures[camera] = env.render()
+    assert all((picture.shape, picture.dtype) == ((12, 16, 3), np.uint8) for picture in pictures.values())
+    depth, grey = frames["arm/wrist"], pictures["arm/wrist"]
+    assert grey[depth == depth.min()].min() == 255, "near is bright"
+    assert grey[depth == depth.max()].max() == 0
+    assert np.array_equal(grey[..., 0], grey[..., 2])
+    assert np.array_equal(pictures["arm/overview"], frames["arm/overview"][..., 2::-1]), "these are blue first"
+
+
 def test_each_observation_is_the_users_to_keep(make_env: MakeEnv) -> None:
     env = make_env()
     first, _ = env.reset(seed=0)

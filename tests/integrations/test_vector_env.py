@@ -220,13 +220,13 @@ def test_no_more_servers_start_at_once_than_there_are_processors(
     assert env.reset()[0].shape[0] == 3
 
 
-@pytest.mark.long
-def test_sixteen_servers_come_up(made: list[Any]) -> None:
-    env = URLabVectorEnv("sim://quadruped", 16)
+@pytest.mark.parametrize("n", [pytest.param(16, marks=pytest.mark.long), pytest.param(64, marks=pytest.mark.matrix)])
+def test_many_servers_come_up(made: list[Any], n: int) -> None:
+    env = URLabVectorEnv("sim://quadruped", n)
     made.append(env)
     env.reset(seed=0)
     *_, infos = env.step(np.zeros(env.action_space.shape, dtype=np.float32))
-    assert infos["step_count"].tolist() == [1] * 16
+    assert infos["step_count"].tolist() == [1] * n
 
 
 def test_a_session_that_cannot_start_is_named(servers: list[str]) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from urlab_client._extras import need
 from urlab_client.protocol.enums import CameraMode
-from urlab_client.protocol.pixels import Pixels
+from urlab_client.protocol.pixels import Pixels, grey
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -61,7 +61,7 @@ def jpeg(pixels: Pixels, mode: CameraMode | str, quality: int = JPEG_QUALITY, *,
         raise ValueError(f"the quality of a JPEG is 1 to 100, got {quality}")
     if max_size is not None and max_size < 1:
         raise ValueError(f"max_size is at least 1 pixel, got {max_size}")
-    image = _image(_grey(pixels)) if mode == CameraMode.DEPTH else pillow_image(pixels, mode)
+    image = _image(grey(pixels)) if mode == CameraMode.DEPTH else pillow_image(pixels, mode)
     if max_size is not None:
         image.thumbnail((max_size, max_size))
     return _encoded(image, "JPEG", quality=quality)
@@ -100,12 +100,3 @@ def _encoded(image: Image.Image, kind: str, **options: Any) -> bytes:
     buffer = io.BytesIO()
     image.save(buffer, kind, **options)
     return buffer.getvalue()
-
-
-def _grey(depth: Pixels) -> NDArray[np.uint8]:
-    seen = depth[np.isfinite(depth)]
-    if not seen.size:
-        return np.zeros(depth.shape, np.uint8)
-    near, far = np.percentile(seen, [1, 95])
-    share = np.clip((far - np.nan_to_num(depth, posinf=far, neginf=near)) / max(far - near, 1e-6), 0, 1)
-    return (share * 255).astype(np.uint8)

@@ -21,7 +21,9 @@ __all__ = [
     "check_picture_size",
     "decode_camera",
     "encode_camera",
+    "grey",
     "picture_stamp",
+    "to_rgb",
     "without_alpha",
 ]
 
@@ -213,6 +215,28 @@ def without_alpha(pixels: Pixels) -> NDArray[np.uint8]:
     for channel in range(3):  # a slice of three is copied pixel by pixel, which takes four times as long
         opaque[..., channel] = pixels[..., channel]
     return opaque
+
+
+def grey(depth: Pixels) -> NDArray[np.uint8]:
+    """Return a picture of depths to be looked at, shape (H, W): near is bright."""
+    seen = depth[np.isfinite(depth)]
+    if not seen.size:
+        return np.zeros(depth.shape, np.uint8)
+    near, far = np.percentile(seen, [1, 95])
+    share = np.clip((far - np.nan_to_num(depth, posinf=far, neginf=near)) / max(far - near, 1e-6), 0, 1)
+    return (share * 255).astype(np.uint8)
+
+
+def to_rgb(pixels: Pixels, mode: CameraMode | str) -> NDArray[np.uint8]:
+    """Return a picture to be looked at, shape (H, W, 3), RGB: colours as they are, depths in grey.
+
+    Args:
+        pixels: As in `CameraSample`.
+        mode: What they mean.
+    """
+    if mode == CameraMode.DEPTH:
+        return np.repeat(grey(pixels)[..., None], 3, axis=2)
+    return without_alpha(pixels if mode == CameraMode.REAL else pixels[..., 2::-1])
 
 
 def encode_camera(pixels: Pixels, mode: CameraMode | str) -> bytes:

@@ -21,7 +21,6 @@ from urlab_client.integrations.gym.task import EpisodeSettings, Task, check_alon
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.names import NameMap
-from urlab_client.protocol.pixels import without_alpha
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.sync._facade import aio_of, portal_of
 from urlab_client.sync.articulation import URLabArticulation, URLabEntity
@@ -257,10 +256,10 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         if not self._rendered:
             gymnasium.logger.warn("render() without a render mode: make the environment with render_mode='rgb_array'")
             return None
-        frame = self._episode.frames.get(self._rendered[0])
-        if frame is None:
+        picture = self._episode.rendered(self._rendered[0])
+        if picture is None:
             raise gymnasium.error.ResetNeeded("call reset() before render()")
-        return without_alpha(frame)
+        return picture
 
     def close(self) -> None:
         """Close the client, if it was made for this environment; put back what this one varied on its server."""

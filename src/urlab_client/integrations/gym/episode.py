@@ -11,6 +11,7 @@ from typing import Any, cast
 import mujoco
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import NDArray
 
 from urlab_client.aio.articulation import URLabArticulation
 from urlab_client.aio.cameras import URLabCameraView
@@ -24,7 +25,7 @@ from urlab_client.protocol.enums import CameraMode, ObservationLevel, StepMode
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.cameras import CameraDelay
 from urlab_client.protocol.messages.session import StepOk
-from urlab_client.protocol.pixels import Pixels, without_alpha
+from urlab_client.protocol.pixels import Pixels, to_rgb, without_alpha
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.randomise.variation import EpisodeDraws, declared_in
 from urlab_client.sync.client import URLabClient as BlockingClient
@@ -353,6 +354,11 @@ class EnvEpisode:
         if self._observed_cameras:
             observation["cameras"] = {name: self._shown(name) for name in self._observed_cameras}
         return observation
+
+    def rendered(self, name: str) -> NDArray[np.uint8] | None:
+        """Return what `render` shows of a camera, shape (H, W, 3), RGB; None without a picture of it."""
+        frame = self.frames.get(name)
+        return None if frame is None else to_rgb(frame, self._cameras[name].mode)
 
     def _shown(self, name: str) -> Pixels:
         frame = self.frames[name]

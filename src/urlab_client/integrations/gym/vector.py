@@ -26,7 +26,6 @@ from urlab_client.integrations.gym.task import EpisodeSettings, States, Task, ch
 from urlab_client.integrations.gym.vectorized import Found, Indices, Vectorized, check_render_mode
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.errors import URLabError
-from urlab_client.protocol.pixels import without_alpha
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.sync._portal import Portal
 
@@ -274,8 +273,8 @@ class URLabVectorEnv(Vectorized):
             return None
         for i, session in enumerate(self._sessions):
             episode = session.episode
-            if episode is not None and session.shown and session.shown[0] in episode.frames:
-                self._pictures[i] = without_alpha(episode.frames[session.shown[0]])
+            if episode is not None and session.shown and (picture := episode.rendered(session.shown[0])) is not None:
+                self._pictures[i] = picture
         if not self._pictures:
             raise gymnasium.error.ResetNeeded("call reset() before render()")
         black = np.zeros_like(next(iter(self._pictures.values())))
