@@ -23,6 +23,7 @@ pytestmark = pytest.mark.browser
 COVER = "document.querySelector('#view .cover')"
 MODEL = "document.querySelector('.stage iframe')?.contentWindow.eval('currentModelCrc')"
 PRESS = "document.querySelector(arguments[0]).click()"
+INTO_VIEW = "document.querySelector('.stage').scrollIntoView({block: 'center', behavior: 'instant'})"
 UNFADED = """for (const [name, value] of [["transition", "none"], ["opacity", "1"], ["filter", "none"]])
   document.querySelector("main").style.setProperty(name, value, "important")"""
 
@@ -47,6 +48,7 @@ def page(console: tuple[subprocess.Popen[str], Page]) -> Page:
 
 def picture(page: Page) -> np.ndarray[Any, Any]:
     """Return the 3-D view as it is seen; a screenshot may take longer than it is given where others work, too."""
+    page.driver.execute_script(INTO_VIEW)
     wait = WebDriverWait(page.driver, PATIENCE_S, 0.2, ignored_exceptions=[TimeoutException])
     (taken,) = wait.until(lambda _: [page.find(".stage").screenshot_as_png], "no picture")
     return np.asarray(Image.open(io.BytesIO(taken)).convert("RGB"), dtype=np.float64)
@@ -67,13 +69,23 @@ def begin_play(page: Page) -> None:
     page.until(f"document.querySelector('{SLIDER}') !== null")
 
 
+@pytest.fixture
+def playing(page: Page) -> Page:
+    """The page of the console whose server plays; the tests of this file may run in several processes."""
+    page.until("['Begin play', 'Restart'].some(one => document.querySelector('#restart')?.textContent.includes(one))")
+    if page.look("document.querySelector('#restart').textContent") == "Begin play":
+        begin_play(page)
+    return page
+
+
 def test_the_3d_view_says_what_it_waits_for_and_loads_when_there_is_a_model(page: Page) -> None:
     page.until(f"{COVER}?.innerText.includes('begin play')")
     begin_play(page)
     drawn(page)
 
 
-def test_the_3d_view_shows_the_next_model(page: Page) -> None:
+def test_the_3d_view_shows_the_next_model(playing: Page) -> None:
+    page = playing
     first = page.look(MODEL)
     blueprint = page.look("document.querySelector('#blueprint').value")
     assert page.ask("api/ops/spawn_actor", {"blueprint": blueprint, "actor_id": "second", "location": [0, 2, 0]})
@@ -86,7 +98,8 @@ def test_the_3d_view_shows_the_next_model(page: Page) -> None:
     drawn(page)
 
 
-def test_keys_are_the_consoles_after_a_click_into_the_3d_view(page: Page) -> None:
+def test_keys_are_the_consoles_after_a_click_into_the_3d_view(playing: Page) -> None:
+    page = playing
     drawn(page)
     page.driver.execute_script("window.scrollTo(0, 0)")
 
@@ -104,7 +117,8 @@ def test_keys_are_the_consoles_after_a_click_into_the_3d_view(page: Page) -> Non
     page.ask("api/lease", {})
 
 
-def test_a_list_gives_the_keyboard_back(page: Page) -> None:
+def test_a_list_gives_the_keyboard_back(playing: Page) -> None:
+    page = playing
     page.driver.execute_script(
         "const mode = document.querySelector('#mode'); mode.focus();"
         "mode.dispatchEvent(new Event('change', {bubbles: true}))"
@@ -112,8 +126,9 @@ def test_a_list_gives_the_keyboard_back(page: Page) -> None:
     assert page.look("document.activeElement === document.body")
 
 
-def test_nobody_removes_the_manager_and_a_level_without_one_offers_it(page: Page) -> None:
-    page.until("document.querySelector('[data-actor=second]') !== null")
+def test_nobody_removes_the_manager_and_a_level_without_one_offers_it(playing: Page) -> None:
+    page = playing
+    page.until("document.querySelector('[data-actor]') !== null")
     shown = page.look("[...document.querySelectorAll('[data-actor]')].map(one => one.dataset.actor)")
     actors = page.ask("api/ops/list_actors", {})["actors"]
     manager = next(actor["name"] for actor in actors if "Manager" in actor["class"])
@@ -140,9 +155,9 @@ def test_no_message_covers_stop_on_a_phone(page: Page) -> None:
 
 
 def test_a_console_that_stands_still_or_ends_shows_as_such_and_only_once(
-    console: tuple[subprocess.Popen[str], Page],
+    console: tuple[subprocess.Popen[str], Page], playing: Page
 ) -> None:
-    process, page = console
+    process, page = console[0], playing
     drawn(page)
     gone = (
         "document.querySelector('#link').textContent === 'No console' && document.body.dataset.link === 'gone' "
