@@ -29,6 +29,7 @@ LONG = {
     "docs/environments.md",
     "docs/howto/agents.md",
     "docs/howto/cameras.md",
+    "docs/howto/data.md",
     "docs/howto/keys.md",
     "docs/howto/moving.md",
     "docs/howto/observing.md",
@@ -43,7 +44,9 @@ LONG = {
     "docs/reference/blocking.md",
     "docs/shared-memory.md",
     "docs/simulated-server.md",
+    "docs/start.md",
     "docs/tasks.md",
+    "docs/teleoperation.md",
     "docs/tutorials/policy.md",
 }
 """Pages whose code takes several seconds."""

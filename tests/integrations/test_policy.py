@@ -431,6 +431,7 @@ def test_a_fall_is_counted_and_the_robot_starts_again(quadruped: URLabClient) ->
     assert found.sim_time == pytest.approx(2.0)
 
 
+@pytest.mark.long
 async def test_in_live_mode_actions_keep_the_pace_of_the_simulation(monkeypatch: pytest.MonkeyPatch) -> None:
     times: list[float] = []
     async with aio.URLabClient(QUADRUPED, step_mode="live") as client:

@@ -42,7 +42,7 @@ class Toolset:
             URLabConnectionError: It is not, and why.
         """
         with self.console.bell() as changed, anyio.move_on_after(_PATIENCE_S):
-            while self.console.link.state != "connected":
+            while self.console.link.state not in {"connected", "taken_over"}:  # which only a person ends
                 changed.clear()
                 await changed.wait()
         link = self.console.link
