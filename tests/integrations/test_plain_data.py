@@ -28,8 +28,15 @@ from urlab_client.protocol.base import Request
 from urlab_client.protocol.client_types import Diagnosis, Finding, ServerInfo, Verdict
 from urlab_client.protocol.descriptions import Pose, SceneDescription
 from urlab_client.protocol.errors import UnknownArticulation
-from urlab_client.protocol.messages.session import ArticulationState, Clock, HelloOk
-from urlab_client.protocol.messages.streams import CameraSample, ClientEvent, RowSample, ServerLost, StateSnapshot
+from urlab_client.protocol.messages.session import ArticulationInfo, ArticulationState, Clock, HelloOk
+from urlab_client.protocol.messages.streams import (
+    CameraSample,
+    ClientEvent,
+    RowSample,
+    ServerLost,
+    StateSnapshot,
+)
+from urlab_client.protocol.pixels import CameraImage
 from urlab_client.protocol.plain_reading import kinds_of
 from urlab_client.protocol.rows import BaseStateRow, JointRow
 from urlab_client.protocol.scene_types import ActorHierarchyNode, BlueprintInfo
@@ -106,7 +113,7 @@ def values(kind: Any) -> st.SearchStrategy[Any]:
         return values(arguments[0])
     if origin is np.ndarray:
         dtype = get_args(arguments[1])[0]
-        pixels = st.just(np.arange(8, dtype=dtype).reshape(1, 2, 4))
+        pixels = st.just(np.arange(8, dtype=dtype).reshape((1, 2, 4) if dtype is np.uint8 else (2, 4)))
         return st.lists(st.floats(), max_size=4).map(np.array) if dtype is np.float64 else pixels
     if origin is Literal:
         return st.sampled_from(arguments)
@@ -132,6 +139,19 @@ def values(kind: Any) -> st.SearchStrategy[Any]:
         return st.sampled_from(kind)
     plain = {bool: st.booleans(), int: st.integers(-(2**53), 2**53), float: st.floats(), bytes: st.binary(max_size=4)}
     return {**plain, str: st.text(max_size=5), NoneType: st.none(), Any: st.just({"any": [1, None]})}[kind]
+
+
+def test_a_handshake_that_lists_its_entities_comes_back_as_it_was() -> None:
+    robot = sample(ArticulationInfo)
+    hello = sample(HelloOk).replace(articulations=[robot], entities=[robot.replace(prefix="other")])
+    assert [one.prefix for one in hello.articulations] == [robot.prefix, "other"]
+    assert [one.prefix for one in hello.replace(session_id="again").articulations] == [robot.prefix, "other"]
+    assert HelloOk.from_dict(hello.to_dict()).to_dict() == hello.to_dict()
+
+
+def test_depths_that_are_whole_come_back_as_depths() -> None:
+    seen = CameraImage(pixels=np.ones((2, 3), np.float32))
+    assert CameraImage.from_json(seen.to_json(arrays="list")).pixels.dtype == np.float32
 
 
 @given(st.sampled_from(structs()).flatmap(values), st.sampled_from(["list", "base64"]))

@@ -176,6 +176,7 @@ def read_array(data: Any, dtype: np.dtype[Any]) -> NDArray[Any]:
         raise ValueError(str(error)) from None
     with np.errstate(invalid="ignore"):
         exact = array.astype(dtype, copy=False)
-    if not np.can_cast(array.dtype, dtype, "same_kind") and (array != exact).any():
+    # Numbers with a point are none of a picture's bytes, even if they are whole: they are depths.
+    if not np.can_cast(array.dtype, dtype, "same_kind") and (array.dtype.kind == "f" or (array != exact).any()):
         raise ValueError(f"the numbers are not {dtype.name}")
     return exact

@@ -395,7 +395,9 @@ class HelloOk(Reply, tag="hello_ok", kw_only=True, omit_defaults=True):
     def __post_init__(self) -> None:
         """Bring a handshake of any generation into one shape."""
         if isinstance(self.entities, list):
-            self.articulations = [*self.articulations, *(entry for entry in self.entities if entry.prefix)]
+            known = {entry.prefix for entry in self.articulations}  # with these, if made of another one's fields
+            new = [entry for entry in self.entities if entry.prefix and entry.prefix not in known]
+            self.articulations = [*self.articulations, *new]
 
     @property
     def plain_entities(self) -> dict[str, EntityInfo]:
