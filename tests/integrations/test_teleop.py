@@ -167,7 +167,7 @@ async def test_what_is_broken_off_is_discarded(client: URLabClient, tmp_path: Pa
             await recorder.mark("won")  # type: ignore[arg-type]
         with pytest.raises(ValueError, match="goal 'target' takes finite numbers"):
             await recorder.mark("success", goal={"target": [math.nan]})
-    with pytest.raises(URLabError, match="no recording to mark an episode in"):
+    with pytest.raises(URLabError, match="No recording is under way"):
         await recorder.mark("success")
     assert len(transitions_of(read_run(tmp_path / "run.mcap"))) == 0
 

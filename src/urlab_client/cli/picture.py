@@ -130,6 +130,8 @@ def _main(folder: Path) -> None:
 def _render(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.uint8]:
     import mujoco  # noqa: PLC0415
 
+    from urlab_client.server.render.sunlight import follow_subject, moving_geoms, shadow_clip  # noqa: PLC0415
+
     box = _subject(model, data)
     floors = _floors(model, data)
     for twin in _coplanar_twins(floors):  # each robot's file may bring its own
@@ -138,6 +140,7 @@ def _render(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.uint8]:
     model.vis.global_.fovy = _FOVY
     model.vis.quality.offsamples = 8
     model.vis.quality.shadowsize = 4096
+    model.vis.map.shadowclip = shadow_clip(model.vis.map.shadowclip * model.stat.extent) / model.stat.extent
     model.vis.headlight.ambient[:] = 0.35
     model.vis.headlight.diffuse[:] = 0.45
     model.vis.headlight.specular[:] = 0.1
@@ -150,6 +153,7 @@ def _render(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.uint8]:
             _add_floor(scene, np.array(middle), reach=model.vis.map.zfar * model.stat.extent)
         if model.nlight == 0:
             _add_sun(scene, box)
+        follow_subject(scene, model, data, moving_geoms(model))
         return renderer.render()
 
 

@@ -97,7 +97,7 @@ class BodyPushing:
         """Return the bodies and where they are.
 
         Raises:
-            ValueError: There is no model here, or no state yet.
+            ValueError: The model or its first state has not arrived.
         """
         shown = await self._now()
         return BodyList([_view(shown, body) for body in range(1, shown.model.nbody)], *_sphere(shown))
@@ -115,7 +115,7 @@ class BodyPushing:
         """Return what a ray meets.
 
         Raises:
-            ValueError: The ray has no direction or is not finite, or there is no model or state.
+            ValueError: The ray has no direction or is not finite, or no model or state has arrived.
         """
         import mujoco  # noqa: PLC0415
 
@@ -195,7 +195,7 @@ class BodyPushing:
         """Return whose body it is.
 
         Raises:
-            ValueError: It is no robot's.
+            ValueError: The body does not belong to a robot.
         """
         robot = self._console.client.articulations.get(_owner(shown, body))
         if robot is None:

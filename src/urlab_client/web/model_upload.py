@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import zipfile
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
@@ -13,9 +13,8 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from urlab_client.protocol.errors import RPC_ERRORS
-from urlab_client.web.console_session import ConsoleSession
-from urlab_client.web.driving_lease import Viewer
 from urlab_client.web.ops import encode
+from urlab_client.web.route_group import Handler, RouteGroup
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabClient
@@ -27,19 +26,10 @@ _LARGEST_FILE = 256 << 20
 _LARGEST_CONTENT = 1 << 30
 
 
-class ModelRoutes:
-    """Handler of `/api/models`.
+class ModelRoutes(RouteGroup):
+    """Handler of `/api/models`."""
 
-    Args:
-        console: The session that all viewers share.
-        viewer: Says who asks.
-    """
-
-    def __init__(self, console: ConsoleSession, viewer: Callable[[Request], Viewer]) -> None:
-        self._console = console
-        self._viewer = viewer
-
-    def routes(self) -> list[tuple[str, Callable[[Request], Awaitable[Response]], list[str]]]:
+    def routes(self) -> list[tuple[str, Handler, list[str]]]:
         """Return path, handler and methods of each route."""
         return [("/api/models/{name}", self._take, ["PUT"])]
 

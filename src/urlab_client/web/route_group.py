@@ -21,7 +21,7 @@ class RouteGroup:
 
     Args:
         console: The session that all viewers share.
-        viewer: Says who asks.
+        viewer: Returns the viewer that sent a request.
     """
 
     def __init__(self, console: ConsoleSession, viewer: Callable[[Request], Viewer]) -> None:

@@ -100,7 +100,9 @@ class AsyncRecorder:
             raise ValueError(f"outcome must be one of {', '.join(get_args(EpisodeOutcome))}, not {outcome!r}")
         given = {name: finite_array(f"goal {name!r}", np.ravel(values)).tolist() for name, values in goal.items()}
         if self._writer is None or self._ended:
-            raise URLabError("There is no recording to mark an episode in.", hint="Call mark() inside the block.")
+            raise URLabError(
+                "No recording is under way, so no episode can be marked.", hint="Call mark() inside the block."
+            )
         self._writer.mark(EpisodeMark(outcome, given, time.time_ns()))
 
     async def __aenter__(self) -> Self:
