@@ -64,6 +64,13 @@ class Page:
         self.until(f"document.querySelector('{selector}')?.disabled === false")
         self.look(f"document.querySelector('{selector}').click()")
 
+    def choose(self, selector: str, value: str) -> None:
+        self.driver.execute_script(
+            "const [selector, value] = arguments; const list = document.querySelector(selector);"
+            "list.value = value; list.dispatchEvent(new Event('change'))",
+            selector, value,
+        )  # fmt: skip
+
     def find(self, selector: str) -> WebElement:
         return self.driver.find_element("css selector", selector)
 

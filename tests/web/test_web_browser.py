@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from console_page import PATIENCE_S, PHONE, RUNNING, SLIDER, SOLID, Page, command, link_in, opened, serve
-from PIL import Image
-from selenium.common.exceptions import TimeoutException
+from console_view import View
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import WebDriverWait
@@ -128,15 +125,14 @@ def test_the_stop_button_stops_and_space_goes_on(page: Page) -> None:
 
 
 def test_steps_and_reset_in_direct_mode(page: Page) -> None:
-    choose = "const m = document.querySelector('#mode'); m.value = '{}'; m.dispatchEvent(new Event('change'))"
-    page.driver.execute_script(choose.format("direct"))
+    page.choose("#mode", "direct")
     page.until("!document.querySelector('#step').disabled")
     page.click("#reset")
     page.until("parseFloat(document.querySelector('#time').textContent) === 0")
     page.driver.execute_script("document.querySelector('#steps').value = 50")
     page.click("#step")
     page.until("document.querySelector('#time').textContent === '0.10 s'")
-    page.driver.execute_script(choose.format("live"))
+    page.choose("#mode", "live")
     page.until(RUNNING)
 
 
@@ -395,50 +391,61 @@ def test_a_second_viewer_drives_only_when_the_first_lets_go(page: Page, tmp_path
         page.until("document.querySelector('#driver').dataset.who === 'other'")
 
 
-def test_the_3d_view_shows_the_robot_and_follows_it(page: Page, tmp_path: Path) -> None:
+@pytest.fixture
+def solid(page: Page, tmp_path: Path) -> Iterator[View]:
+    """The 3-D view of a browser that can draw it; all robots are seen, and nobody drives."""
     page.until("document.querySelector('#view').innerText.includes('no WebGL')")
     page.until("document.querySelector('#driver').dataset.who !== 'other'")  # who drove has closed their browser
-    page.slide(0.0)
-    page.until(page.elbow_is(0.0))
     with opened(tmp_path, page.invitation(), (*SOLID, "--window-size=1000,700")) as one:
         one.driver.execute_script("window.scrollTo(0, 0)")
-        stage = one.driver.find_element("css selector", ".stage")
-
-        def picture() -> np.ndarray[Any, Any]:
-            return np.asarray(Image.open(io.BytesIO(stage.screenshot_as_png)).convert("RGB"), dtype=np.float64)
-
-        def differ(one: np.ndarray[Any, Any], other: np.ndarray[Any, Any]) -> float:
-            return float((np.abs(one - other).max(axis=2) > 30).mean())
-
-        def blue() -> bool:  # as parts of the arm are, and nothing else
-            return bool(((picture() @ [-1.0, -0.5, 1.0]) > 60).mean() > 0.003)
-
-        # A screenshot gets 10 seconds, which may be too few where the processor draws and has other things to do.
-        wait = WebDriverWait(one.driver, 1.5 * PATIENCE_S, 0.3, ignored_exceptions=[TimeoutException])
-        wait.until(lambda _: blue(), "the arm never appeared")
+        view = View(one)
+        view.until_the_arm_is_seen()
         one.until("document.querySelector('#body').options.length > 3")
-        one.driver.execute_script("document.querySelector('#fit').click()")
-        # Where the hand is in the picture once everything is: a click there selects it.
-        ask = "const done = arguments[0]; const frame = document.querySelector('#view iframe');"
-        point = one.driver.execute_async_script(
-            ask + "import('/static/link.js').then(async ({ask}) => { for (let y = 0.2; y < 0.9; y += 0.04)"
-            "for (let x = 0.2; x < 0.8; x += 0.04) { const {innerWidth: w, innerHeight: h} = frame.contentWindow;"
-            "const ray = frame.contentWindow.eval(`viewerPointer.ray(${x * w}, ${y * h})`);"
-            "const found = await ask('POST', 'api/pick', ray, {quiet: true});"
-            "if (found?.body) return done([x * w, y * h, found.body.id]); } done(null); })"
-        )
-        assert point, "nothing is in the picture"
-        one.driver.execute_script(
-            "const [x, y] = arguments[0]; const {contentWindow: view} = document.querySelector('#view iframe');"
-            "for (const type of ['pointerdown', 'pointerup']) view.document.body.dispatchEvent(new view.PointerEvent("
-            "type, {clientX: x, clientY: y, button: 0, pointerId: 1, bubbles: true, cancelable: true}))",
-            point,
-        )
-        one.until(f"+document.querySelector('#body').value === {point[2]}")
-        one.until("document.querySelector('#body-facts').textContent.includes('kg')")
-        (before,) = wait.until(lambda _: [picture()], "no picture")
-        page.slide(1.2)
-        wait.until(lambda _: differ(before, picture()) > 0.005, "the arm never moved")
+        one.click("#fit")
+        if page.look("document.querySelector('#driver').dataset.who === 'me'"):
+            page.click("#drive")
+        one.until("document.querySelector('#driver').dataset.who === 'free'")
+        yield view
+
+
+def test_the_3d_view_shows_the_robot_and_follows_it(solid: View) -> None:
+    solid.page.slide(0.0)
+    solid.page.until(solid.page.elbow_is(0.0))
+    before = solid.picture()
+    solid.page.slide(1.2)
+    solid.until_it_differs(before, "the arm never moved", least=0.005)
+
+
+def test_frames_and_contacts_are_drawn_in_the_3d_view(solid: View) -> None:
+    solid.page.click("#stop")
+    solid.page.until(f"!({RUNNING})")
+    plain = solid.picture()
+    for overlay in ("#show-frames", "#show-contacts"):
+        solid.page.click(overlay)
+        solid.until_it_differs(plain, f"{overlay} showed nothing", least=0.0005)
+        solid.page.click(overlay)
+        solid.until_it_is(plain, f"{overlay} stayed")
+    solid.page.click("#play")
+    solid.page.until(RUNNING)
+
+
+def test_a_body_in_the_3d_view_is_selected_and_pushed_with_the_mouse(solid: View) -> None:
+    page = solid.page
+    page.choose("#mode", "direct")
+    page.until("!document.querySelector('#step').disabled")
+    if not page.look(RUNNING):
+        page.click("#play")
+    page.until(RUNNING)
+    x, y, body = solid.select("quadruped")
+    height = page.ask(f"api/bodies/{body}")["position"][2]
+    page.click("#push")
+    solid.pointer("pointerdown", x, y)
+    solid.pointer("pointermove", x, y - 150)
+    page.asked(f"api/bodies/{body}", lambda one: one["position"][2] > height + 0.1)
+    solid.pointer("pointerup", x, y - 150)
+    page.asked(f"api/bodies/{body}", lambda one: one["position"][2] < height + 0.05)
+    page.choose("#mode", "live")
+    page.until(RUNNING)
 
 
 def test_a_killed_server_shows_as_such_and_comes_back(
