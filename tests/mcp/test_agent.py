@@ -182,6 +182,7 @@ async def test_arguments_in_the_form_of_text_are_understood(direct: Desk) -> Non
     await direct.call("set_actuators", robot="arm", set_points='{"elbow": 0.25}')
     assert (await direct.call("state", robot="arm"))["set_points"]["elbow"] == 0.25
     assert (await direct.call("run", steps="20"))["step"] == 20
+    assert (await direct.call("run", seconds="1e-5"))["step"] == 21, "no call that lets time pass does nothing"
 
 
 async def test_a_diverged_simulation_is_said(direct: Desk) -> None:
@@ -315,9 +316,12 @@ async def test_a_scene_is_edited_by_names(tmp_path: Path) -> None:
                 "</worldbody></mujoco>".replace(' size=".1" type', " type")
             )
             assert "box" in (await one.call("look"))["models"]
+            await one.call("run", steps=2)
             await one.call("import_model", model="box")
             placed = await one.call("spawn", blueprint="box", actor_id="b1", position=[1, 0, 2], yaw=90)
             assert placed["robots"] == ["arm", "box"]
+            assert "it is the robot 'box'" in placed["done"]
+            assert (placed["sim_time"], placed["step"]) == (0, 0), "the simulation has begun anew"
             again = await one.refused("spawn", blueprint="box", actor_id="b1", position=[0, 0, 2])
             assert "move moves it" in again
             await one.call("move", actor="b1", position=[1, 1, 3])
@@ -325,7 +329,8 @@ async def test_a_scene_is_edited_by_names(tmp_path: Path) -> None:
             assert pose["position"] == [1, 1, 3]
             assert (await one.call("remove", actor="box"))["robots"] == ["arm"]
             await one.call("play", action="stop")
-            assert "play with action='start'" in await one.refused("state", robot="arm")
+            for tool, arguments in (("state", {"robot": "arm"}), ("run", {"steps": 1}), ("contacts", {})):
+                assert "play with action='start'" in await one.refused(tool, **arguments)
             await one.call("play", action="start")
             await one.call("state", robot="arm")
 

@@ -600,6 +600,26 @@ def test_the_controls_are_lost_by_not_using_them() -> None:
     assert lease.holder is bob
 
 
+def test_agents_give_way_to_people_and_not_to_each_other() -> None:
+    now = 0.0
+    lease = DrivingLease(10.0, clock=lambda: now)
+    ann = Viewer("a", "Ann")
+    one, two = (Viewer(name, name, yields=True, keeps=60.0) for name in ("agent 1", "agent 2"))
+    lease.use(one)
+    now = 59.0
+    with pytest.raises(NotDriving, match="agent 1"):
+        lease.use(two)
+    lease.interrupt(two)
+    assert lease.holder is one
+    lease.interrupt(ann)
+    assert lease.holder is ann
+    with pytest.raises(NotDriving, match="Ann"):
+        lease.use(one)
+    now = 69.5
+    lease.use(two)
+    assert lease.holder is two
+
+
 def test_a_paused_beta_is_seen_and_driven() -> None:
     with (
         SimulatedServer("arm", play=True, camera_size=(64, 48), dialect="beta") as beta,

@@ -52,6 +52,7 @@ _METHODS = {
     "runtime.set_paused(False)": "play with action='resume'",
     "sim.start()": "play with action='start'",
     "set_ctrl() or ctrl_array before step()": "set_actuators before run",
+    "run_for: ": "run: ",
     "step() was not called": "run was not called",
     "waiting for step()": "waiting for run",
     "Call reset()": "Call reset",
@@ -101,7 +102,7 @@ class Agent:
             instructions=_INSTRUCTIONS.format(
                 sim=limits.sim_seconds,
                 wall=limits.wall_seconds,
-                missing=f" Not allowed: {missing}." if missing else "",
+                missing=f" Not allowed, unless a person starts `urlab mcp` with: {missing}." if missing else "",
             ),
             on_list_tools=self._list_tools,
             on_call_tool=self._call_tool,

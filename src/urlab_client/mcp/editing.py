@@ -60,7 +60,10 @@ async def spawn(call: Call, blueprint: str, actor_id: NewId, position: Position,
         await call.client.scene.spawn_actor(
             known[blueprint], actor_id, location=position, rotation_euler=(0.0, 0.0, yaw)
         )
-    return await _anew(call, f"{actor_id} is placed.")
+    placed = await _anew(call, f"{actor_id} is placed.")
+    if (robot := call.client.articulations.get(actor_id)) is not None:
+        placed.done = f"{actor_id} is placed: it is the robot {robot.name!r}."
+    return placed
 
 
 @tool(Needs.EDIT, play=False, idempotent=True)
