@@ -10,6 +10,7 @@ from collections.abc import AsyncGenerator, Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 from PIL import Image
@@ -22,7 +23,7 @@ from urlab_client.aio import URLabClient
 from urlab_client.integrations.record import read_run
 from urlab_client.protocol.registry import OPS
 from urlab_client.server import SimulatedServer
-from urlab_client.web import Access, app
+from urlab_client.web import Access, app, mujoco_viewer
 from urlab_client.web.driving_lease import DrivingLease, NotDriving, Viewer
 
 
@@ -459,6 +460,11 @@ def test_pictures_come_as_files_too_while_running_paused_and_stepped(http: TestC
         http.post("/api/ops/set_mode", json={"mode": "live"})
     for kind in ("jpg", "png"):
         assert http.get(f"/api/cameras/arm/nothing.{kind}").status_code == 404
+
+
+def test_a_mujoco_without_its_viewer_is_named(http: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mujoco_viewer, "files", lambda: None)
+    assert f"MuJoCo {mujoco.__version__} has no web viewer" in http.get("/api/world").json()["no_view"]
 
 
 def test_the_viewer_gets_the_model_and_the_state_that_is_shown(http: TestClient) -> None:
