@@ -20,7 +20,7 @@ import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, ChunkIndex, Metadata, MetadataIndex, Schema
+from mcap.records import Channel, Chunk, Metadata, MetadataIndex, Schema
 from mcap.stream_reader import get_chunk_data_stream
 from numpy.typing import NDArray
 from zstandard import ZstdError
@@ -39,6 +39,8 @@ _MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<BQHIQQ")  # with the head of its record
 _CHUNK = struct.Struct("<Q")  # its earliest time
+_CHUNK_INDEX = struct.Struct("<QQQQI")
+_LISTED = struct.Struct("<HQ")
 _INDEX = struct.Struct("<HI")
 _FOOTER = struct.Struct("<BQQQI")
 _NO_CHANNELS: frozenset[int] = frozenset()
@@ -317,18 +319,9 @@ class RecordingIndex:
             at += _RECORD.size + length
             match kind:
                 case Opcode.CHUNK_INDEX:
-                    chunk = ChunkIndex.read(_stream(body))
-                    there = frozenset(chunk.message_index_offsets)
-                    self._blocks.append(
-                        _Block(
-                            chunk.chunk_start_offset,
-                            chunk.chunk_length,
-                            chunked=True,
-                            first_ns=chunk.message_start_time,
-                            index_size=chunk.message_index_length,
-                            channels=same.setdefault(there, there),
-                        )
-                    )
+                    block = _block_of(body)
+                    block.channels = same.setdefault(block.channels, block.channels)
+                    self._blocks.append(block)
                 case Opcode.STATISTICS:
                     messages = int.from_bytes(body[:8], "little")
                 case Opcode.METADATA_INDEX:
@@ -421,6 +414,15 @@ class RecordingIndex:
 
 def _stream(data: bytes) -> ReadDataStream:
     return ReadDataStream(io.BytesIO(data))
+
+
+def _block_of(body: bytes) -> _Block:
+    """Return what a chunk index says. A long recording has one for each second, too many for the library's reader."""
+    first_ns, _, start, size, listed = _CHUNK_INDEX.unpack_from(body)
+    end = _CHUNK_INDEX.size + listed
+    channels = frozenset(channel for channel, _ in _LISTED.iter_unpack(body[_CHUNK_INDEX.size : end]))
+    index_size = int.from_bytes(body[end : end + 8], "little")
+    return _Block(start, size, chunked=True, first_ns=first_ns, index_size=index_size, channels=channels)
 
 
 def _heads(file: BinaryIO, size: int) -> Iterator[tuple[int, bytes]]:

@@ -136,6 +136,11 @@ class JointStatesRun(Run):
             entities={},
         )
 
+    def positions(self) -> dict[str, list[str]]:
+        """Return the names of the values of `qpos`, which are those of compiled joints."""
+        column = self.whole.columns.get(f"{OWNER}/qpos")
+        return {} if column is None else {OWNER: column.names}
+
     def cameras(self) -> list[str]:
         """Return nothing: the file holds no pictures."""
         return []

@@ -227,6 +227,22 @@ class Run:
             },
         )
 
+    def positions(self) -> dict[str, list[str]]:
+        """Return the name of each value of `qpos` by articulation, as it was when that was first recorded.
+
+        Raises:
+            RecordingError: The file is not a recording.
+        """
+        index = self._index()
+        found: dict[str, list[str]] = {}
+        for channel in index.having(_STATES):
+            first = index.first(channel.id)
+            if first is not None:
+                count, names = len(_state(first.data).qpos), channel.layout.qpos
+                names = names if len(names) == count else [str(i) for i in range(count)]
+                found.setdefault(channel.topic.removeprefix(_ARTICULATION), names)
+        return found
+
     def cameras(self) -> list[str]:
         """Return the names of the cameras that have pictures here."""
         index = self._index()

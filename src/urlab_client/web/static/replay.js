@@ -13,7 +13,7 @@ const play = h("button", { id: "replay-play", onclick: toggleReplay }, "▶");
 const pace = h("select", { "aria-label": "Pace of the replay", onchange: () => ask("POST", "api/replay", { rate: +pace.value }) },
   PACES.map((rate) => h("option", { value: rate }, `${rate}×`)));
 const placing = h("button", { class: "quiet", id: "placing", title: "Place the robots of the simulation, too: its cameras follow, its mode is puppet meanwhile",
-  onclick: () => ask("POST", "api/replay", { name: replay.name, placing: !replay.placing }) }, "Move the simulation, too");
+  onclick: () => ask("POST", "api/replay", { ...replay, placing: !replay.placing }) }, "Move the simulation, too");
 let replay = null;
 let wanted = null;
 let seeking = false;
@@ -46,7 +46,6 @@ export function makeReplay() {
     replay = status.replay;
     $("replay").hidden = replay === null;
     document.body.classList.toggle("replaying", replay !== null);
-    document.body.classList.toggle("cameras-live", replay !== null && !replay.placing);
     if (!replay) return;
     text(name, replay.name.replace(/\.mcap$/, ""));
     text(play, replay.playing ? "❚❚" : "▶");
