@@ -68,6 +68,10 @@ class Publisher(Protocol):
         """Show pictures of another source, the recording's or the simulation's."""
         ...
 
+    def watched_cameras(self) -> list[str]:
+        """Return the cameras that somebody watches, by the names that `step` takes."""
+        ...
+
     def note(self, kind: str, who: str, what: str, text: str, ms: float | None = None) -> None:
         """Add a line to the log."""
         ...
@@ -292,7 +296,8 @@ class Replay:
             if values is not None and len(values.qpos) == len(layout.qpos_adr):
                 data.qpos[layout.qpos_adr] = values.qpos
         data.qvel[:] = 0.0
-        await self._client.step(0)
+        # In mode puppet pictures come with replies alone.
+        await self._client.step(0, include_cameras=dict.fromkeys(self._console.watched_cameras(), "latest") or False)
 
 
 async def _read(job: Callable[[], _T]) -> _T:
