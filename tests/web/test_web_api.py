@@ -481,8 +481,9 @@ def test_pictures_come_as_files_too_while_running_paused_and_stepped(http: TestC
         assert http.get(f"/api/cameras/arm/nothing.{kind}").status_code == 404
 
 
-def test_a_mujoco_without_its_viewer_is_named(http: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mujoco_without_its_viewer_is_named(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mujoco_viewer, "files", lambda: None)
+    http: TestClient = request.getfixturevalue("http")  # describes the world when it has connected
     assert f"MuJoCo {mujoco.__version__} has no web viewer" in http.get("/api/world").json()["no_view"]
 
 
