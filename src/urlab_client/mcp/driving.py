@@ -58,7 +58,7 @@ class Driving:
     """
 
     def __init__(self, console: ConsoleSession, limits: Limits) -> None:
-        self.viewer = Viewer(f"agent:{secrets.token_urlsafe(16)}", "the agent", yields=True)
+        self.viewer: Viewer = Viewer(f"agent:{secrets.token_urlsafe(16)}", "the agent", yields=True)
         self._console = console
         self._limits = limits
         self._one = anyio.Lock()

@@ -11,7 +11,7 @@ from urlab_client.protocol.errors import URLabConnectionError
 from urlab_client.web.console_session import ConsoleSession
 
 if TYPE_CHECKING:
-    from urlab_client.aio import URLabArticulation
+    from urlab_client.aio import URLabArticulation, URLabClient
 
 __all__ = ["TAKEN_OVER", "Toolset"]
 
@@ -30,9 +30,9 @@ class Toolset:
 
     def __init__(self, console: ConsoleSession, limits: Limits) -> None:
         self.console = console
-        self.client = console.client
+        self.client: URLabClient = console.client
         self.limits = limits
-        self.driving = Driving(console, limits)
+        self.driving: Driving = Driving(console, limits)
         self._known = ""
 
     async def connected(self) -> None:
