@@ -65,6 +65,18 @@ async def test_another_client_that_takes_over_meanwhile_is_an_end(server: Simula
             await going
 
 
+async def test_what_a_server_simulated_before_does_not_count(server: SimulatedServer) -> None:
+    async with URLabClient(**server.client_options(), step_mode="direct") as before:
+        await before.discover()
+        await before.step(200)
+    passed: list[float] = []
+    async with URLabClient(**server.client_options(), step_mode="live") as client:
+        await client.discover()
+        await go_on(client, 0.2, over=lambda: False, progress=passed.append)
+        assert client.sim_time >= 0.4 + 0.2 - 1e-9
+    assert passed[0] < 0.2 <= passed[-1] + 1e-9
+
+
 async def test_live_mode_ends_when_play_does(server: SimulatedServer) -> None:
     async with URLabClient(**server.client_options(), step_mode="live") as client:
         await client.discover()

@@ -10,6 +10,7 @@ from collections.abc import AsyncGenerator, Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 from PIL import Image
@@ -22,7 +23,7 @@ from urlab_client.aio import URLabClient
 from urlab_client.integrations.record import read_run
 from urlab_client.protocol.registry import OPS
 from urlab_client.server import SimulatedServer
-from urlab_client.web import Access, app
+from urlab_client.web import Access, app, mujoco_viewer
 from urlab_client.web.driving_lease import DrivingLease, NotDriving, Viewer
 
 
@@ -461,6 +462,11 @@ def test_pictures_come_as_files_too_while_running_paused_and_stepped(http: TestC
         assert http.get(f"/api/cameras/arm/nothing.{kind}").status_code == 404
 
 
+def test_a_mujoco_without_its_viewer_is_named(http: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mujoco_viewer, "files", lambda: None)
+    assert f"MuJoCo {mujoco.__version__} has no web viewer" in http.get("/api/world").json()["no_view"]
+
+
 def test_the_viewer_gets_the_model_and_the_state_that_is_shown(http: TestClient) -> None:
     import mujoco
     from mujoco.studio.web import state_payload
@@ -598,6 +604,26 @@ def test_the_controls_are_lost_by_not_using_them() -> None:
     assert lease.holder is None
     lease.use(bob)
     assert lease.holder is bob
+
+
+def test_agents_give_way_to_people_and_not_to_each_other() -> None:
+    now = 0.0
+    lease = DrivingLease(10.0, clock=lambda: now)
+    ann = Viewer("a", "Ann")
+    one, two = (Viewer(name, name, yields=True, keeps=60.0) for name in ("agent 1", "agent 2"))
+    lease.use(one)
+    now = 59.0
+    with pytest.raises(NotDriving, match="agent 1"):
+        lease.use(two)
+    lease.interrupt(two)
+    assert lease.holder is one
+    lease.interrupt(ann)
+    assert lease.holder is ann
+    with pytest.raises(NotDriving, match="Ann"):
+        lease.use(one)
+    now = 69.5
+    lease.use(two)
+    assert lease.holder is two
 
 
 def test_a_paused_beta_is_seen_and_driven() -> None:

@@ -157,10 +157,18 @@ async def _connect(host: str, port: int) -> str | None:
     except TimeoutError:
         return f"no answer within {_CONNECT_S:g} s; is a firewall in between?"
     except OSError as error:
-        reason = os.strerror(error.errno) if error.errno else str(error)
-        return f"{reason}; is the server running, and on this port?"
+        return f"{_reason(error)}; is the server running, and on this port?"
     writer.close()
     return None
+
+
+def _reason(error: OSError) -> str:
+    if isinstance(error, ConnectionRefusedError):
+        return "Connection refused"
+    # The Proactor loop's errors have numbers of Windows' own; `errno` is then EINVAL, and only the text is right.
+    if getattr(error, "winerror", None) is not None:
+        return error.strerror or str(error)
+    return os.strerror(error.errno) if error.errno else str(error)
 
 
 def _versions(state: SimState) -> Finding:

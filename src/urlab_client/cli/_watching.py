@@ -55,13 +55,13 @@ async def go_on(
         URLabError: The server refused, or does not answer.
     """
     direct = client.step_mode is StepMode.DIRECT
-    start = client.sim_time
+    clock = _Clock(client, known=direct)
     async with client.events() as events:
         watch = _Watch(events)
         if not direct:
             await client.runtime.set_paused(False)
         while not over():
-            done = client.sim_time - start
+            done = clock.passed()
             progress(done)
             if seconds is not None and done >= seconds - 1e-9:
                 return
@@ -79,6 +79,25 @@ async def _step(client: URLabClient) -> None:
         found = await client.resync()
         if not (found.session_held and found.playing):
             raise CommandError("the server restarted, or another client took the session over") from None
+
+
+class _Clock:
+    """How much simulation time has passed, from the first state on where the client knows no time yet."""
+
+    def __init__(self, client: URLabClient, *, known: bool) -> None:
+        self._client = client
+        self._before = client.recv_wall_time_ns
+        self._start = client.sim_time if known else None
+
+    def passed(self) -> float:
+        """Return the seconds that have passed."""
+        now = self._client.sim_time
+        if self._start is None:
+            if self._client.recv_wall_time_ns == self._before:
+                return 0.0
+            self._start = now
+        self._start = min(self._start, now)  # a reset puts the clock back
+        return now - self._start
 
 
 class _Watch:

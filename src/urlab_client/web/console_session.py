@@ -58,6 +58,7 @@ _PULSE_S = 0.5
 _CONNECT_S = 3.0
 _KEPT = 300
 _DIGITS = 5
+_AGENT_NAME = 40
 _MOVING_S = 0.4  # a paused server repeats its state ten times a second
 
 
@@ -112,6 +113,7 @@ class ConsoleSession:
         self._adopted = b""
         self._bells: set[asyncio.Event] = set()
         self._n = 0
+        self._agents = 0
         self._want: str | None = "discover"
         self._wake = asyncio.Event()
         self._ready = asyncio.Event()
@@ -235,6 +237,11 @@ class ConsoleSession:
             self.hands.command(viewer, order)
         else:
             self.controls.set_points(viewer, order.values)
+
+    def new_agent_name(self, program: str) -> str:
+        """Return what an agent is called that has not called before: people and other agents see it."""
+        self._agents += 1
+        return f"agent {self._agents}" + (f" ({program[:_AGENT_NAME]})" if program else "")
 
     def take_back(self) -> None:
         """Open a session again, after another program took the server over."""

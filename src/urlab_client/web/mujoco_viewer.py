@@ -129,7 +129,9 @@ class MujocoViewer:
     def missing(self) -> str:
         """Why there is no view; empty when there is one."""
         if files() is None:
-            return "This MuJoCo has no web viewer. MuJoCo 4.0 and later have one."
+            import mujoco  # noqa: PLC0415
+
+            return f"MuJoCo {mujoco.__version__} has no web viewer here. Wheels for Linux and macOS have one since 4.0."
         if self._client.model is not None:
             return ""
         if not self._client.manager_present:

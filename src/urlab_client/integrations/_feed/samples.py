@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +11,7 @@ from urlab_client.integrations._feed.scene_messages import CameraLayout, SceneMe
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraFrame, StateReply
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.protocol.picture_files import pillow_image
+from urlab_client.protocol.picture_files import encoded, pillow_image
 from urlab_client.protocol.pixels import Pixels, decode_camera
 
 __all__ = ["CameraPicture", "EpisodeMark", "SampleClock", "Schedule", "State", "compressed", "picture_message"]
@@ -121,13 +120,10 @@ class SampleClock:
 
 def compressed(pixels: Pixels, mode: str, jpeg_quality: int | None) -> bytes:
     """Return a picture of bytes as JPEG, or as PNG without a quality."""
-    target = io.BytesIO()
     image = pillow_image(pixels, mode, alpha=mode != CameraMode.REAL)
     if jpeg_quality is not None:
-        image.save(target, "JPEG", quality=jpeg_quality)
-    else:
-        image.save(target, "PNG", compress_level=1)
-    return target.getvalue()
+        return encoded(image, "JPEG", quality=jpeg_quality)
+    return encoded(image, "PNG", compress_level=1)
 
 
 def picture_message(picture: CameraPicture, stamp: Time, jpeg_quality: int | None) -> CompressedImage | RawImage:
