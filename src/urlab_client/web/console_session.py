@@ -358,6 +358,7 @@ class ConsoleSession:
             speed=self.controls.speed,
             source=self.controls.source,
             recording=self.recordings.running,
+            conversions=self.recordings.conversions,
             replay=self.replay.view,
             twists=self.controls.twists,
             viewers=len(self.audience),
@@ -402,13 +403,18 @@ class ConsoleSession:
         """Return the cameras that somebody watches, by the names that `step` takes."""
         return [path.removeprefix("-/") for path, feed in self._feeds.items() if feed.watched]
 
+    async def renew_pictures(self) -> None:
+        """Show pictures of another source, a recording's or the simulation's."""
+        for feed in [*self._feeds.values()]:
+            await feed.renew()
+
     def feed(self, path: str) -> Feed | None:
         """Return the pictures of the camera `ARTICULATION/CAMERA` (`-` for those of the scene), None without it."""
         view = self.camera(path)
         if view is None:
             return None
         if path not in self._feeds or self._feeds[path].view is not view:
-            self._feeds[path] = Feed(self.client, view)
+            self._feeds[path] = Feed(self.client, view, path, self.replay)
         return self._feeds[path]
 
     def camera(self, path: str) -> URLabCameraView | None:
