@@ -24,6 +24,7 @@ from urlab_client.protocol import shm
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.fence import processor_fence
 from urlab_client.protocol.messages.session import CameraInfo, HelloOk
+from urlab_client.protocol.picture_memory import PictureMemory
 
 STATE = b"state/full"
 WIDTH, HEIGHT = 32, 24
@@ -37,6 +38,7 @@ def snapshot(time: float) -> bytes:
 
 class Camera:
     name = "eye"
+    memory = PictureMemory()
     mode: CameraMode | str = CameraMode.REAL
     info = CameraInfo(
         mode="real",

@@ -45,6 +45,7 @@ from urlab_client.protocol.messages.streams import (
     ServerReconnected,
     StateSnapshot,
 )
+from urlab_client.protocol.picture_memory import PictureMemory
 from urlab_client.protocol.rows import BaseStateRow, JointRow, SensorRow
 from urlab_client.protocol.topics import TopicKind
 
@@ -118,6 +119,7 @@ class Camera:
     """A camera as the client knows it."""
 
     name = "wrist"
+    memory = PictureMemory()
 
     def __init__(self, endpoint: str, mode: str = "real", topic: str = "arm0/camera/wrist") -> None:
         self.info = CameraInfo(mode=mode, resolution=(2, 2), fovy=45.0, zmq_endpoint=endpoint, zmq_topic=topic)

@@ -8,14 +8,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path, PurePath
 
 import msgspec
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from urlab_client.protocol import shm
 from urlab_client.protocol.errors import ProtocolError
-from urlab_client.protocol.pixels import decode_camera
 from urlab_client.protocol.shm import Region, no_fence
 
 STRIDE = 24
@@ -248,17 +246,6 @@ class TestTornReads:
         struct.pack_into("<I", buffer, 64 + STRIDE, 0)
         repairs[:] = [lambda: shm.attach(buffer, fence=no_fence).publish(b"b"), lambda: None, lambda: None]
         assert reader.read_latest() == shm.Publication(2, b"b")
-
-    def test_pixels_straight_into_the_callers_array(self) -> None:
-        buffer, region = new_region(stride=shm.camera_stride(2, 2))
-        pixels = np.arange(16, dtype=np.uint8).reshape(2, 2, 4)
-        region.publish(memoryview(pixels).cast("B"))
-        out = np.empty((2, 2, 4), np.uint8)
-        reader = shm.attach(buffer, fence=no_fence)
-        publication = reader.read_latest(take=lambda live: decode_camera(live, "semantic", 2, 2, out=out))
-        assert publication is not None
-        assert publication.payload.pixels is out
-        np.testing.assert_array_equal(out, pixels)
 
 
 class TestCreateAndAttach:

@@ -14,6 +14,7 @@ from urlab_client.protocol.descriptions import CameraDescription
 from urlab_client.protocol.enums import CameraMode, known
 from urlab_client.protocol.messages.session import CameraInfo
 from urlab_client.protocol.messages.streams import CameraSample, StreamPolicy
+from urlab_client.protocol.picture_memory import PictureMemory
 from urlab_client.protocol.pixels import Pixels
 
 __all__ = ["SharedFrame", "URLabCameraView"]
@@ -34,7 +35,8 @@ class URLabCameraView:
         self.info = info
         self.delivered = True
         self._publishers = publishers
-        # Fed by the client. Not declared above, so that the façade has none.
+        # For the client. Not declared above, so that the façade has none.
+        self.memory: PictureMemory = PictureMemory()
         self.pictures: LatestPicture = LatestPicture(publishers.camera(self, asked=False))
 
     @property

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.layouts import BytesLike, damaged
+from urlab_client.protocol.picture_memory import PictureMemory
 from urlab_client.protocol.serializable import Serializable
 
 __all__ = [
@@ -31,8 +32,8 @@ Pixels: TypeAlias = NDArray[np.uint8] | NDArray[np.float32]
 
 _FRAME_MAGIC = 0x314D4355
 _FRAME_HEADERS = {1: Layout("<IIQdII"), 2: Layout("<IIQdIId")}
-_OPAQUE = np.uint32(0xFF000000)
 _MAX_SIDE = 16_384  # what graphics cards render at most
+_CACHED = 65_536  # pixels that are still in a core's cache when they are looked at for the second time
 _CENTIMETRES = np.float32(100)
 
 
@@ -83,7 +84,7 @@ def decode_camera(
     width: int,
     height: int,
     *,
-    out: Pixels | None = None,
+    memory: PictureMemory | None = None,
     where: object = "",
 ) -> CameraImage:
     """Read a picture: a camera message, a slot of a camera region or the `data` of a step reply's camera block.
@@ -96,12 +97,11 @@ def decode_camera(
         mode: Mode of the camera; decides what the pixels mean.
         width: Columns, as the handshake or the camera block says.
         height: Rows.
-        out: C-contiguous array of the result's shape and type to fill and return instead of a new one.
+        memory: Where the array comes from; None for memory fresh from the system.
         where: Names the camera in errors.
 
     Raises:
         ProtocolError: If the payload does not have the size of such a picture, or there is no picture of this size.
-        ValueError: If `out` does not fit.
     """
     try:
         check_picture_size(width, height)
@@ -113,11 +113,10 @@ def decode_camera(
         problem = f"{len(payload)} bytes, expected {size} ({width}x{height} pixels of 4 bytes)"
         raise damaged("camera frame", where, problem, payload)
     start = header.size if header else 0
-    if out is None and mode == CameraMode.REAL:
-        pixels: Pixels = _rgba(np.frombuffer(payload, np.uint8, size, start), width, height)
-    else:
-        pixels = _target(mode, width, height, out)
-        _convert(np.frombuffer(payload, np.uint8, size, start), mode, pixels)
+    count = width * height
+    words = np.empty(count + 1, "<u4") if memory is None else memory.words(count + 1)
+    pixels = _pixels(np.frombuffer(payload, ">u4", count, start), words, mode)
+    pixels = pixels.reshape((height, width) if mode == CameraMode.DEPTH else (height, width, 4))
     if header is None:
         return CameraImage(pixels)
     _, _, frame_id, sim_time, _, _, *capture_time = header.unpack_from(payload)
@@ -147,17 +146,6 @@ def picture_stamp(payload: BytesLike, width: int, height: int, *, where: object 
     return PictureStamp(frame_id, sim_time, header.size)
 
 
-def _target(mode: CameraMode | str, width: int, height: int, out: Pixels | None) -> Pixels:
-    depth = mode == CameraMode.DEPTH
-    if out is None:
-        return np.empty((height, width), np.float32) if depth else np.empty((height, width, 4), np.uint8)
-    shape = (height, width) if depth else (height, width, 4)
-    dtype = np.dtype(np.float32 if depth else np.uint8)
-    if out.shape != shape or out.dtype != dtype or not out.flags.c_contiguous:
-        raise ValueError(f"out is {out.dtype} {out.shape}, expected C-contiguous {dtype} {shape}")
-    return out
-
-
 def camera_header(frame_id: int, sim_time: float, width: int, height: int, captured: float) -> bytes:
     """Return what newer servers put before the pixels of a streamed picture.
 
@@ -185,28 +173,23 @@ def _frame_header(payload: BytesLike, width: int, height: int, where: object) ->
     return None
 
 
-def _rgba(source: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
-    # BGRA read big-endian is ARGB written little-endian; beginning one byte later, RGB and the next pixel's alpha. At
-    # the speed of two copies, against four for shifting each pixel into its place.
-    words = np.empty(width * height + 1, "<u4")
-    words[:-1] = source.view(">u4")
-    words |= np.uint32(0xFF)
-    return words.view(np.uint8)[1:-3].reshape(height, width, 4)
-
-
-def _convert(source: NDArray[np.uint8], mode: CameraMode | str, out: Pixels) -> None:
-    flat = out.reshape(-1)
+def _pixels(source: NDArray[np.uint32], words: NDArray[np.uint32], mode: CameraMode | str) -> Pixels:
+    """Fill `words`, which has one to spare; return the pixels in it, flat."""
     if mode == CameraMode.DEPTH:
+        metres = words[:-1].view("<f4")
         with np.errstate(invalid="ignore"):
-            np.divide(source.view("<f4"), _CENTIMETRES, out=flat)
-    elif mode == CameraMode.REAL:
-        # BGRA read big-endian and shifted by one byte is RGB0 written little-endian: five times faster than by channel.
-        words = flat.view("<u4")
-        words[:] = source.view(">u4")
-        words >>= np.uint32(8)
-        words |= _OPAQUE
-    else:
-        flat[:] = source
+            return np.divide(source.view("<f4"), _CENTIMETRES, out=metres)
+    if mode != CameraMode.REAL:
+        words[:-1] = source.view("<u4")
+        return words[:-1].view(np.uint8)
+    # BGRA read big-endian is ARGB written little-endian; beginning one byte later, RGB and the next pixel's alpha. At
+    # the speed of one and a half copies, against four for shifting each pixel into its place.
+    for start in range(0, source.size, _CACHED):
+        piece = words[start : min(start + _CACHED, source.size)]
+        piece[:] = source[start : start + _CACHED]
+        piece |= np.uint32(0xFF)
+    words[-1] = 0xFF
+    return words.view(np.uint8)[1:-3]
 
 
 def without_alpha(pixels: Pixels) -> NDArray[np.uint8]:

@@ -16,6 +16,7 @@ from urlab_client.protocol.messages.session import CameraInfo
 from urlab_client.protocol.messages.streams import (
     CameraSample,
 )
+from urlab_client.protocol.picture_memory import PictureMemory
 from urlab_client.protocol.pixels import decode_camera
 from urlab_client.protocol.shm import camera_file
 from urlab_client.protocol.topics import camera_filter, resolve_endpoint
@@ -27,7 +28,13 @@ FIRST_PICTURE_S = 30.0
 
 
 class HasCamera(Protocol):
-    """A camera as the client knows it; what it says may change with each handshake."""
+    """A camera as the client knows it; what it says may change with each handshake.
+
+    Attributes:
+        memory: Where its pictures go.
+    """
+
+    memory: PictureMemory
 
     @property
     def name(self) -> str:
@@ -150,7 +157,9 @@ class CameraSource(PublishedSource):
     def _sample(self, topic: bytes, payload: BytesLike) -> CameraSample:
         view = self.view
         width, height = view.info.resolution
-        frame = decode_camera(payload, view.mode, width, height, where=topic.decode(errors="replace"))
+        frame = decode_camera(
+            payload, view.mode, width, height, memory=view.memory, where=topic.decode(errors="replace")
+        )
         return CameraSample(
             camera=view.name,
             mode=view.mode,

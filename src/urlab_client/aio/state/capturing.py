@@ -219,7 +219,7 @@ class _Taking:
         frame_id: int | None = None,
         sim_time: float | None = None,
     ) -> None:
-        image = decode_camera(payload, view.mode, *size, where=view.name)
+        image = decode_camera(payload, view.mode, *size, memory=view.memory, where=view.name)
         self._found[id(view)] = CameraSample(
             camera=view.name,
             mode=view.mode,

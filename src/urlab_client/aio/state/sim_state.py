@@ -418,4 +418,5 @@ def _pixels(view: URLabCameraView, frame: CameraFrame) -> Pixels:
     mode = view.mode
     if isinstance(mode, CameraMode) and frame.dtype != ("float32" if mode is CameraMode.DEPTH else "bgra8"):
         raise ProtocolError(f"step: a frame of {mode} camera {view.name!r} has dtype {frame.dtype!r}.", op="step")
-    return decode_camera(frame.data, view.mode, frame.width, frame.height, where=view.name).pixels
+    size = frame.width, frame.height
+    return decode_camera(frame.data, view.mode, *size, memory=view.memory, where=view.name).pixels
