@@ -13,8 +13,9 @@ from PIL import Image
 from selenium.common.exceptions import TimeoutException
 from selenium.webdriver.support.ui import WebDriverWait
 
-__all__ = ["View"]
+__all__ = ["INTO_VIEW", "View"]
 
+INTO_VIEW = "document.querySelector('.stage').scrollIntoView({block: 'center', behavior: 'instant'})"
 Picture = NDArray[np.float64]
 
 
@@ -27,6 +28,7 @@ class View:
         self._wait = WebDriverWait(page.driver, 1.5 * PATIENCE_S, 0.3, ignored_exceptions=[TimeoutException])
 
     def picture(self) -> Picture:
+        self.page.driver.execute_script(INTO_VIEW)
         (taken,) = self._wait.until(lambda _: [self.page.find(".stage").screenshot_as_png], "no picture")
         return np.asarray(Image.open(io.BytesIO(taken)).convert("RGB"), dtype=np.float64)
 
@@ -35,13 +37,13 @@ class View:
 
     def until_the_arm_is_seen(self) -> None:
         # Blue, as parts of the arm are, and nothing else.
-        self.until_picture(lambda seen: ((seen @ [-1.0, -0.5, 1.0]) > 60).mean() > 0.003, "the arm never appeared")
+        self.until_picture(lambda seen: ((seen @ [-1.0, -0.5, 1.0]) > 60).mean() > 0.001, "the arm never appeared")
 
     def until_it_differs(self, before: Picture, problem: str, least: float) -> None:
         self.until_picture(lambda seen: _share_that_differs(seen, before) > least, problem)
 
     def until_it_is(self, before: Picture, problem: str) -> None:
-        self.until_picture(lambda seen: _share_that_differs(seen, before) < 0.0005, problem)
+        self.until_picture(lambda seen: _share_that_differs(seen, before) < 0.0001, problem)
 
     def place_of(self, robot: str) -> tuple[float, float, int]:
         """Return where a body of a robot is in the picture, in pixels, and its number."""

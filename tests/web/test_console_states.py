@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import json
 import signal
 import subprocess
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 import pytest
-from console_page import PATIENCE_S, PHONE, RUNNING, SLIDER, SOLID, Page, command, link_in, opened
-from PIL import Image
-from selenium.common.exceptions import TimeoutException
+from console_page import PHONE, RUNNING, SLIDER, SOLID, Page, command, link_in, opened
+from console_view import View
 from selenium.webdriver.common.action_chains import ActionChains
-from selenium.webdriver.support.ui import WebDriverWait
 
 pytestmark = pytest.mark.browser
 
 COVER = "document.querySelector('#view .cover')"
 MODEL = "document.querySelector('.stage iframe')?.contentWindow.eval('currentModelCrc')"
 PRESS = "document.querySelector(arguments[0]).click()"
-INTO_VIEW = "document.querySelector('.stage').scrollIntoView({block: 'center', behavior: 'instant'})"
 UNFADED = """for (const [name, value] of [["transition", "none"], ["opacity", "1"], ["filter", "none"]])
   document.querySelector("main").style.setProperty(name, value, "important")"""
 
@@ -46,21 +41,11 @@ def page(console: tuple[subprocess.Popen[str], Page]) -> Page:
     return console[1]
 
 
-def picture(page: Page) -> np.ndarray[Any, Any]:
-    """Return the 3-D view as it is seen; a screenshot may take longer than it is given where others work, too."""
-    page.driver.execute_script(INTO_VIEW)
-    wait = WebDriverWait(page.driver, PATIENCE_S, 0.2, ignored_exceptions=[TimeoutException])
-    (taken,) = wait.until(lambda _: [page.find(".stage").screenshot_as_png], "no picture")
-    return np.asarray(Image.open(io.BytesIO(taken)).convert("RGB"), dtype=np.float64)
-
-
-def shows_the_arm(page: Page) -> bool:
-    return bool(((picture(page) @ [-1.0, -0.5, 1.0]) > 60).mean() > 0.003)  # blue, as nothing else is
-
-
-def drawn(page: Page) -> None:
+def drawn(page: Page) -> View:
     page.until(f"{COVER}?.hidden === true")
-    WebDriverWait(page.driver, PATIENCE_S, 0.2).until(lambda _: shows_the_arm(page), "the arm never appeared")
+    view = View(page)
+    view.until_the_arm_is_seen()
+    return view
 
 
 def begin_play(page: Page) -> None:
@@ -170,11 +155,11 @@ def test_a_console_that_stands_still_or_ends_shows_as_such_and_only_once(
     finally:
         process.send_signal(signal.SIGCONT)
     page.until("document.querySelector('#link').textContent === 'Connected' && !document.querySelector('main').inert")
-    drawn(page)
-    before = picture(page)
+    view = drawn(page)
+    before = view.picture()
     process.kill()
     page.until(gone)
     page.until("document.querySelector('#banner').innerText.includes('console does not answer for 3 s')")
     # The viewer would now cover the picture with a message of its own, as if there were two things wrong.
     page.driver.execute_script(UNFADED)
-    assert (np.abs(picture(page) - before).max(axis=2) > 30).mean() < 0.01
+    assert (np.abs(view.picture() - before).max(axis=2) > 30).mean() < 0.01

@@ -399,8 +399,7 @@ def solid(page: Page, tmp_path: Path) -> Iterator[View]:
     """The 3-D view of a browser that can draw it; all robots are seen, and nobody drives."""
     page.until("document.querySelector('#view').innerText.includes('no WebGL')")
     page.until("document.querySelector('#driver').dataset.who !== 'other'")  # who drove has closed their browser
-    with opened(tmp_path, page.invitation(), (*SOLID, "--window-size=1000,700")) as one:
-        one.driver.execute_script("window.scrollTo(0, 0)")
+    with opened(tmp_path, page.invitation(), (*SOLID, "--window-size=1000,1000")) as one:
         view = View(one)
         view.until_the_arm_is_seen()
         one.until("document.querySelector('#body').options.length > 3")
@@ -416,7 +415,7 @@ def test_the_3d_view_shows_the_robot_and_follows_it(solid: View) -> None:
     solid.page.until(solid.page.elbow_is(0.0))
     before = solid.picture()
     solid.page.slide(1.2)
-    solid.until_it_differs(before, "the arm never moved", least=0.005)
+    solid.until_it_differs(before, "the arm never moved", least=0.0005)
 
 
 def test_frames_and_contacts_are_drawn_in_the_3d_view(solid: View) -> None:
@@ -425,7 +424,7 @@ def test_frames_and_contacts_are_drawn_in_the_3d_view(solid: View) -> None:
     plain = solid.picture()
     for overlay in ("#show-frames", "#show-contacts"):
         solid.page.click(overlay)
-        solid.until_it_differs(plain, f"{overlay} showed nothing", least=0.0005)
+        solid.until_it_differs(plain, f"{overlay} showed nothing", least=0.0003)
         solid.page.click(overlay)
         solid.until_it_is(plain, f"{overlay} stayed")
     solid.page.click("#play")
