@@ -18,10 +18,13 @@ from typing import Self
 import msgspec
 import zmq
 
-__all__ = ["LAST_STEP", "Publisher", "Requester", "publisher", "server"]
+__all__ = ["LAST_STEP", "PROCESSOR_S", "Publisher", "Requester", "publisher", "server"]
 
 LAST_STEP = b"\x81\xa2op\xa4last"
 """Request that is answered with the last `step` request, byte for byte."""
+
+PROCESSOR_S = b"\x81\xa2op\xa9processor"
+"""Request that is answered with the processor time of the server so far, seconds, as a float64 of msgpack."""
 
 
 class Requester:
@@ -134,7 +137,10 @@ def _answer(answers: dict[str, bytes]) -> None:
         name = request[5 : 5 + (request[4] & 31)]  # a map whose first entry is `op` and a short string
         if name == b"step":
             last = request
-        socket.send(last if request == LAST_STEP else by_name[name])
+        if name == b"processor":
+            socket.send(msgspec.msgpack.encode(time.process_time()))
+        else:
+            socket.send(last if request == LAST_STEP else by_name[name])
 
 
 def _publish(messages: list[list[tuple[bytes, bytes]]]) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 import msgspec
 import mujoco
 
-from benchmarks.canned import Requester, server
+from benchmarks.canned import PROCESSOR_S, Requester, server
 from benchmarks.conditions import warm
 from benchmarks.harness import Burst, Figure, Pair, Row
 from benchmarks.robots import dialect, humanoid, recorded_of, robot_mjcf
@@ -98,12 +98,20 @@ def _processor_s(process: int) -> float | None:
     return sum(int(text.split()[0]) for text in stats) / 1e9 if stats else None
 
 
-def _processor_figures(simulated: _Simulated) -> list[Figure]:
-    """Return what a step takes the server's process beyond `mj_step`, all its threads and ZeroMQ's counted."""
+def _processor_figures(simulated: _Simulated, floor: Requester, ask: Callable[[], bytes]) -> list[Figure]:
+    """Return what a step takes the server's process beyond `mj_step`, all its threads and ZeroMQ's counted.
+
+    And what an answer takes a server that does nothing else: sockets and ZeroMQ's threads.
+    """
     step, reset = simulated.stepping(1), simulated.resetting()
     data = mujoco.MjData(simulated.model)
     spent: list[float] = []
+    answering: list[float] = []
     for _ in range(_ROUNDS):
+        idle = _told_processor_s(floor)
+        for _ in range(_STEPS):
+            ask()
+        answering.append((_told_processor_s(floor) - idle) / _STEPS)
         reset()
         mujoco.mj_resetData(simulated.model, data)
         before = _processor_s(simulated.process)
@@ -117,8 +125,13 @@ def _processor_figures(simulated: _Simulated) -> list[Figure]:
             mujoco.mj_step(simulated.model, data)
         spent.append((after - before - (time.thread_time() - physics)) / _STEPS)
     return [
-        Figure(name="processor time of a step beyond mj_step, µs", value=1e6 * statistics.median(spent), at_most=20)
+        Figure(name="processor time of a step beyond mj_step, µs", value=1e6 * statistics.median(spent), at_most=20),
+        Figure(name="of an answer of the floor's server, µs", value=1e6 * statistics.median(answering)),
     ]
+
+
+def _told_processor_s(server: Requester) -> float:
+    return msgspec.msgpack.decode(server.ask(PROCESSOR_S), type=float)
 
 
 def _from_start(reset: Callable[[], object], step: Callable[[], object]) -> Burst:
@@ -153,7 +166,7 @@ def _single(robot: AbstractContextManager[Path]) -> Iterator[Pair]:
         yield Pair(
             ours=_from_start(ours.resetting(), ours.stepping(1)),
             floor=_from_start(lambda: mujoco.mj_resetData(ours.model, data), physics_and_round_trip),
-            figures=lambda: _processor_figures(ours),
+            figures=lambda: _processor_figures(ours, floor, ask),
         )
 
 

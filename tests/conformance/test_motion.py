@@ -218,6 +218,7 @@ async def test_joints_that_do_not_arrive_are_named(connect: Any, server: Any) ->
     with pytest.raises(NotSettled, match=r"'knee' is .* rad away") as caught:
         await art.move_to({"knee": 1.0}, timeout=0.02)
     assert caught.value.remaining == {"knee": pytest.approx(1.0 - art.joints["knee"].position)}
+    assert "Still on the way: 'knee'" in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -225,6 +226,7 @@ async def test_joints_that_do_not_arrive_are_named(connect: Any, server: Any) ->
     [
         ({"knee": 0.2, "slider": float("nan")}, ValueError, "'slider' of 'kinds' takes a finite number, got nan"),
         ({"knee": 0.2, "hip": 0.1}, KeyError, "hip"),
+        ({"knee": 0.2, "push": 0.1}, KeyError, "'push' is an actuator, which moves the joint"),
         ({"slider": 0.1, "knee": 1.2}, ValueError, "'knee' of 'kinds' takes -1.0472 to 1.0472 rad, got 1.2"),
         ({"knee": 0.2, "shoulder": 0.1}, ValueError, "'shoulder' of 'kinds' is a ball joint"),
     ],

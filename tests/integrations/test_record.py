@@ -393,6 +393,9 @@ def test_a_cut_file_is_read_up_to_the_cut(client: urlab_client.URLabClient, tmp_
         assert run.damage
         steps.append(len(part))
         assert part.step.tolist() == table.step[: len(part)].tolist()
+        end = run.state_at(1e9)
+        assert (0 if end is None else end.step) in {0, *table.step[: len(part) + 1].tolist()}
+        assert run.summary().topics.keys() <= {"/state/arm", "/state/quadruped"}
     assert steps == sorted(steps)
     assert steps[-1] == 50
     for size in (0, 7):
@@ -402,6 +405,36 @@ def test_a_cut_file_is_read_up_to_the_cut(client: urlab_client.URLabClient, tmp_
     cut.write_bytes(b"PK" + whole)
     with pytest.raises(RecordingError, match="neither an MCAP file"):
         read_run(cut)
+
+
+def test_damage_costs_what_is_damaged_and_no_more(
+    client: urlab_client.URLabClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writing, "_CHUNK_BYTES", 20_000)
+    path = tmp_path / "run.mcap"
+    with record(client, path, pose_hz=0):
+        for _ in range(100):
+            client.step()
+    table = read_run(path).table()
+    with path.open("rb") as file:
+        chunks = make_reader(file).get_summary().chunk_indexes
+    assert len(chunks) > 4
+    hurt = chunks[len(chunks) // 2]
+    with path.open("r+b") as file:
+        file.seek(hurt.chunk_start_offset + hurt.chunk_length // 2)
+        file.write(b"\0" * 16)
+    run = read_run(path)
+    first, last = run.state_at(table.time[0]), run.state_at(table.time[-1])  # what is there does not depend on the rest
+    assert first is not None
+    assert last is not None
+    assert (first.step, last.step) == (table.step[0], table.step[-1])
+    with pytest.raises(RecordingError, match=f"damaged at byte {hurt.chunk_start_offset}"):
+        run.state_at(hurt.message_start_time / 1e9)
+    assert run.summary().complete, "the index says nothing of it"
+    checked = run.summary(verify=True)
+    assert not checked.complete
+    assert checked.damage
+    assert 0 < len(run.table()) < len(table)
 
 
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")

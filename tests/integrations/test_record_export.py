@@ -6,6 +6,7 @@ import csv
 import json
 import os
 import sys
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +86,29 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Run:
                 else:
                     client.step(n_steps=2)
     return read_run(folder / "run.mcap")
+
+
+def test_a_moment_is_what_the_table_and_the_frames_hold(recorded: Run) -> None:
+    table, frames = recorded.table(), list(recorded.frames("eye/up"))
+    assert recorded.time_range() == (table.time[0], table.time[-1])
+    assert recorded.state_at(table.time[0] - 1e-6) is None
+    assert recorded.picture_at("eye/up", frames[0].time - 1e-6) is None
+    for wanted in (0, 1, 58, 59, 60, 61, len(table) - 1):
+        row = int(np.flatnonzero(table.time == table.time[wanted])[-1])  # of several at one time the last
+        state = recorded.state_at(table.time[row] + 1e-6)
+        assert state is not None
+        assert (state.time, state.step, state.episode) == (table.time[row], table.step[row], table.episode[row])
+        for key, robot in state.articulations.items():
+            for name in ("qpos", "qvel", "set_points", "ctrl"):
+                assert getattr(robot, name).tolist() == table.columns[f"{key}/{name}"].values[row].tolist()
+    for before, picture in pairwise(frames):
+        found = recorded.picture_at("eye/up", picture.time - 1e-6)
+        assert found is not None
+        assert found.time == before.time
+        assert np.array_equal(found.pixels, before.pixels)
+    assert [*recorded.table(fields=["qpos"]).columns] == ["arm/qpos", "eye/qpos"]
+    with pytest.raises(KeyError, match="arm/nose"):
+        recorded.picture_at("arm/nose", 0.0)
 
 
 def test_csv_and_parquet_hold_every_value_to_the_bit(recorded: Run, tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from mcp.shared.exceptions import MCPError
 from PIL import Image
 from waiting import until
 
+from mcp import Client
 from urlab_client.aio import URLabClient
 from urlab_client.integrations.record import read_run
 from urlab_client.mcp import Agent, Limits
@@ -181,6 +182,7 @@ async def test_arguments_in_the_form_of_text_are_understood(direct: Desk) -> Non
     await direct.call("set_actuators", robot="arm", set_points='{"elbow": 0.25}')
     assert (await direct.call("state", robot="arm"))["set_points"]["elbow"] == 0.25
     assert (await direct.call("run", steps="20"))["step"] == 20
+    assert (await direct.call("run", seconds="1e-5"))["step"] == 21, "no call that lets time pass does nothing"
 
 
 async def test_a_diverged_simulation_is_said(direct: Desk) -> None:
@@ -201,7 +203,7 @@ async def test_progress_is_told_and_a_cancelled_run_leaves_the_robot_at_rest(dir
         await direct.client.runtime.set_sim_options(timestep=1e-5)
         await direct.mcp.call_tool("run", {"seconds": 10}, progress_callback=progress)
     assert 0 <= told[0][0] < 10 == told[0][1]
-    await until(lambda: direct.agent.idle)
+    await until(lambda: not direct.console.lease.held)
     await direct.client.runtime.set_sim_options(timestep=0.002)
     at = (await direct.call("state", robot="arm"))["step"]
     assert (await direct.call("run", steps=5))["step"] == at + 5
@@ -216,7 +218,7 @@ async def test_a_cancelled_call_pauses_what_runs_by_itself() -> None:
                     scope.cancel()
 
                 await one.mcp.call_tool("run", {"seconds": 10}, progress_callback=progress)
-            await until(lambda: one.agent.idle)
+            await until(lambda: not one.console.lease.held)
             assert any("paused" in finding["text"] for finding in (await one.call("explain"))["findings"])
 
 
@@ -242,7 +244,7 @@ async def test_a_person_takes_over_and_the_agent_waits(direct: Desk) -> None:
     lease = direct.console.lease
     await direct.client.runtime.set_sim_options(timestep=1e-5)
     running = asyncio.create_task(direct.refused("run", seconds=10))
-    await until(lambda: not direct.agent.idle)
+    await until(lambda: direct.console.lease.held)
     await direct.console.controls.run(PERSON, running=False)
     assert "Ann took the controls" in await running
     assert lease.holder is PERSON
@@ -252,7 +254,45 @@ async def test_a_person_takes_over_and_the_agent_waits(direct: Desk) -> None:
     await direct.client.runtime.set_sim_options(timestep=0.002)
     await direct.call("reset")
     entries = (await direct.call("log", since=0))["entries"]
-    assert {("Ann", "stop"), ("the agent", "reset")} <= {(entry["who"], entry["what"]) for entry in entries}
+    assert {("Ann", "stop"), ("agent 1 (mcp)", "reset")} <= {(entry["who"], entry["what"]) for entry in entries}
+
+
+async def test_one_agent_drives_at_a_time_and_a_person_takes_over_from_each(direct: Desk) -> None:
+    lease = direct.console.lease
+    other = Agent(direct.console, ALL)
+    async with Client(other.server, read_timeout_seconds=60) as mcp:
+        second = Desk(direct.client, direct.console, other, mcp)
+        await direct.call("set_actuators", robot="arm", set_points={"elbow": 0.5})
+        for tool, arguments in (
+            ("set_actuators", {"robot": "arm", "set_points": {"elbow": -0.5}}),
+            ("run", {"steps": 1}),
+            ("remove", {"actor": "arm"}),
+        ):
+            said = await second.refused(tool, **arguments)
+            assert "agent 1 (mcp) has the controls" in said
+            assert "Nothing was done. Call again later" in said
+        assert (await second.call("look"))["driver"] == "agent 1 (mcp)"
+        assert (await direct.call("look"))["driver"] == "you"
+        after = await second.call("state", robot="arm")
+        assert (after["set_points"]["elbow"], after["step"]) == (0.5, 0)
+        # Each keeps its own place in the log.
+        await direct.call("log")
+        assert "run" in {entry["what"] for entry in (await second.call("log"))["entries"]}
+
+        await direct.client.runtime.set_sim_options(timestep=1e-5)
+        running = asyncio.create_task(direct.refused("run", seconds=10))
+        await until(lambda: lease.held)
+        assert "agent 1 (mcp) has the controls" in await second.refused("reset")
+        lease.use(PERSON)
+        assert "Ann took the controls" in await running
+        lease.release(PERSON)
+        await direct.client.runtime.set_sim_options(timestep=0.002)
+        await second.call("run", steps=1)
+        assert "agent 2 (mcp) has the controls" in await direct.refused("run", steps=1)
+        lease.use(PERSON)
+        assert "Ann has the controls" in await second.refused("run", steps=1)
+        lease.release(PERSON)
+        await direct.call("set_actuators", robot="arm", set_points={"elbow": 0.0})
 
 
 async def test_the_log_goes_on_from_the_last_call(direct: Desk) -> None:
@@ -260,10 +300,10 @@ async def test_the_log_goes_on_from_the_last_call(direct: Desk) -> None:
     await direct.call("run", steps=1)
     news = await direct.call("log")
     assert all(entry["n"] > first["next"] for entry in news["entries"])
-    assert [entry["what"] for entry in news["entries"] if entry["who"] == "the agent"] == ["run"]
+    assert [entry["what"] for entry in news["entries"] if entry["who"].startswith("agent 1")] == ["run"]
     assert abs(news["entries"][-1]["at"] - time.time()) < 3600, "times keep their seconds"
     last = await direct.call("log")
-    assert not [entry for entry in last["entries"] if entry["who"] == "the agent"]
+    assert not [entry for entry in last["entries"] if entry["who"].startswith("agent 1")]
     assert news["next"] > first["next"]
 
 
@@ -276,9 +316,12 @@ async def test_a_scene_is_edited_by_names(tmp_path: Path) -> None:
                 "</worldbody></mujoco>".replace(' size=".1" type', " type")
             )
             assert "box" in (await one.call("look"))["models"]
+            await one.call("run", steps=2)
             await one.call("import_model", model="box")
             placed = await one.call("spawn", blueprint="box", actor_id="b1", position=[1, 0, 2], yaw=90)
             assert placed["robots"] == ["arm", "box"]
+            assert "it is the robot 'box'" in placed["done"]
+            assert (placed["sim_time"], placed["step"]) == (0, 0), "the simulation has begun anew"
             again = await one.refused("spawn", blueprint="box", actor_id="b1", position=[0, 0, 2])
             assert "move moves it" in again
             await one.call("move", actor="b1", position=[1, 1, 3])
@@ -286,7 +329,8 @@ async def test_a_scene_is_edited_by_names(tmp_path: Path) -> None:
             assert pose["position"] == [1, 1, 3]
             assert (await one.call("remove", actor="box"))["robots"] == ["arm"]
             await one.call("play", action="stop")
-            assert "play with action='start'" in await one.refused("state", robot="arm")
+            for tool, arguments in (("state", {"robot": "arm"}), ("run", {"steps": 1}), ("contacts", {})):
+                assert "play with action='start'" in await one.refused(tool, **arguments)
             await one.call("play", action="start")
             await one.call("state", robot="arm")
 

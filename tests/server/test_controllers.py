@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import mujoco
@@ -87,6 +88,20 @@ def test_a_raw_set_point_reaches_ctrl_rounded_to_single_precision() -> None:
     rig = Rig(BOT)
     rig.points.stage([0.7])
     assert rig.ctrl() == [0.699999988079071]
+
+
+def test_set_points_reach_controls_that_do_not_follow_each_other() -> None:
+    motors = "".join(f'<motor name="m{i}" joint="j"/>' for i in range(3))
+    body = '<body><joint name="j"/><geom size="0.1"/></body>'
+    scene = make_scene(bot=f"<mujoco><worldbody>{body}</worldbody><actuator>{motors}</actuator></mujoco>")
+    whole, ctrl = scene.articulations[0], scene.data.ctrl
+    outer = replace(
+        whole, actuators=whole.actuators[::2], actuator_names=whole.actuator_names[::2], ctrl_adr=whole.ctrl_adr[::2]
+    )
+    control = ArticulationControl(scene.model, outer, ctrl.copy())
+    control.set_points.stage([1.0, 2.0])
+    control.apply(scene.data.qpos, scene.data.qvel, ctrl)
+    assert ctrl.tolist() == [1.0, 0.0, 2.0]
 
 
 def test_set_points_are_not_clamped_to_ctrlrange() -> None:

@@ -327,6 +327,14 @@ def test_direct_mode_steps_and_shows_what_cameras_see(http: TestClient) -> None:
     assert "direct" in refused.json()["error"]["message"]
 
 
+def picture_in(socket: Any) -> tuple[dict[str, Any], bytes]:
+    """Return the next picture of a camera: its head, and the JPEG."""
+    data = socket.receive_bytes()
+    socket.send_text("shown")
+    size = int.from_bytes(data[:4], "little")
+    return json.loads(data[4 : 4 + size]), data[4 + size :]
+
+
 def test_a_recording_is_made_converted_replayed_in_seconds_and_removed(
     server: SimulatedServer, http: TestClient, tmp_path: Path
 ) -> None:
@@ -375,6 +383,17 @@ def test_a_recording_is_made_converted_replayed_in_seconds_and_removed(
             assert elbow(state) == pytest.approx(recorded[row], abs=1e-4)
             assert state["time"] == pytest.approx(table.time[row] - table.time[0])
         assert abs(recorded[0] - live) > 0.03
+        pictures = list(read_run(file).frames(camera))
+        with http.websocket_connect(f"ws://localhost/api/cameras/{camera}/live") as watching:
+            for wanted in (pictures[4], pictures[0], pictures[-1]):
+                http.post("/api/replay", json={"time": wanted.time - table.time[0]})
+                head, shown = picture_in(watching)
+                while head["sim_time"] != pytest.approx(wanted.time - table.time[0]):
+                    head, shown = picture_in(watching)
+                assert head["recorded"]
+                assert np.array_equal(np.asarray(Image.open(io.BytesIO(shown))), wanted.pixels)
+        refused = http.delete(f"/api/recordings/{name}")
+        assert "go back to live" in refused.json()["error"]["message"]
         http.post("/api/replay", json={"time": 0.0, "playing": True, "rate": 4})
         with http.websocket_connect("ws://localhost/api/live") as viewer:
             heard(viewer, "status", lambda status: status["replay"]["playing"] and status["rate"] == 4)
@@ -463,10 +482,11 @@ def test_pictures_come_as_files_too_while_running_paused_and_stepped(http: TestC
 
 
 def test_a_mujoco_without_its_viewer_is_named_and_bodies_do_not_need_it(
-    http: TestClient, monkeypatch: pytest.MonkeyPatch
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(mujoco_viewer, "files", lambda: None)
     monkeypatch.setattr(mujoco_viewer, "_payload", lambda: None)
+    http: TestClient = request.getfixturevalue("http")  # describes the world when it has connected
     assert f"MuJoCo {mujoco.__version__} has no web viewer" in http.get("/api/world").json()["no_view"]
     with http.websocket_connect("ws://localhost/api/live") as live:
         heard(live, "state")
@@ -610,6 +630,26 @@ def test_the_controls_are_lost_by_not_using_them() -> None:
     assert lease.holder is None
     lease.use(bob)
     assert lease.holder is bob
+
+
+def test_agents_give_way_to_people_and_not_to_each_other() -> None:
+    now = 0.0
+    lease = DrivingLease(10.0, clock=lambda: now)
+    ann = Viewer("a", "Ann")
+    one, two = (Viewer(name, name, yields=True, keeps=60.0) for name in ("agent 1", "agent 2"))
+    lease.use(one)
+    now = 59.0
+    with pytest.raises(NotDriving, match="agent 1"):
+        lease.use(two)
+    lease.interrupt(two)
+    assert lease.holder is one
+    lease.interrupt(ann)
+    assert lease.holder is ann
+    with pytest.raises(NotDriving, match="Ann"):
+        lease.use(one)
+    now = 69.5
+    lease.use(two)
+    assert lease.holder is two
 
 
 def test_a_paused_beta_is_seen_and_driven() -> None:

@@ -243,7 +243,8 @@ def test_a_recording_is_made_offered_for_download_and_replayed_in_seconds(page: 
     page.click("[data-recording] .replay")
     page.until("!document.querySelector('#replay').hidden && +document.querySelector('#timeline').value > 0.1")
     page.until("document.querySelector('#time').textContent !== '0.00 s'")
-    assert "live, not the replay" in page.look("document.querySelector('#cameras').innerText")
+    page.until("document.querySelector('[data-camera=\"arm/overview\"] .origin').textContent === 'recorded'")
+    assert page.look("document.querySelector('#robots').inert"), "what drives would do so unseen"
     seconds = page.look("+document.querySelector('#timeline').max")
     page.click("#stop")  # whatever moves, physics as well
     page.until("document.querySelector('#replay-play').textContent === '▶'")
@@ -255,6 +256,8 @@ def test_a_recording_is_made_offered_for_download_and_replayed_in_seconds(page: 
         page.driver.execute_script(go, share)
         page.until(page.elbow_is(elbow))
         page.until(f"Math.abs(parseFloat(document.querySelector('#time').textContent) - {share * seconds}) < 0.1")
+        pictured = "document.querySelector('[data-camera=\"arm/overview\"] .num').textContent.slice(3)"
+        page.until(f"Math.abs(parseFloat({pictured}) - {share * seconds}) < 1.5")
     page.find("body").send_keys(" ")
     page.until("document.querySelector('#replay-play').textContent === '❚❚'")
     page.click("#replay-end")

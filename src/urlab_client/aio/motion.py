@@ -7,7 +7,7 @@ time, so that they mean the same on a slow machine; that time itself passes is w
 from __future__ import annotations
 
 import inspect
-from collections.abc import AsyncGenerator, Callable, Mapping
+from collections.abc import AsyncGenerator, Callable, Iterable, Mapping
 from contextlib import aclosing
 from typing import TYPE_CHECKING, Protocol
 
@@ -30,6 +30,7 @@ __all__ = ["Motion"]
 
 _LOOK_S = 0.01  # simulation time between two looks at a predicate
 _SLICE_S = 0.1  # simulation time per request where nobody looks: what a slow scene still does within its deadline
+_MOVING = 0.01  # rad/s or m/s: slower than this a joint hangs rather than moves
 _AT_REST_S = 0.1  # a joint has settled if it would stay within the tolerance for so long
 
 
@@ -128,7 +129,7 @@ class Motion:
                 f"move_to: {articulation.name!r} has not settled within {limit:g} s of simulation time: "
                 f"{', '.join(texts)}.",
                 remaining=left,
-                hint=await self._findings(),
+                hint=await self._findings() or self._still_moving(joints[name] for name in left),
             )
         return passed
 
@@ -190,6 +191,11 @@ class Motion:
                         hint=await self._findings(),
                     )
 
+    @staticmethod
+    def _still_moving(joints: Iterable[Joint]) -> str | None:
+        moving = [repr(joint.name) for joint in joints if abs(float(joint.velocity)) > _MOVING]
+        return f"Still on the way: {', '.join(moving)}. Allow a longer timeout." if moving else None
+
     async def _findings(self) -> str | None:
         """Return what keeps robots from moving, as far as that can be found out."""
         found = (await self._simulation.explain()).findings
@@ -200,6 +206,9 @@ class _Aim:
     """One joint on its way."""
 
     def __init__(self, articulation: Movable, name: str, target: float) -> None:
+        driven = None if name in articulation.joints else articulation.actuators.get(name)
+        if driven is not None and driven.joint is not None:
+            raise KeyError(f"move_to takes joints: {name!r} is an actuator, which moves the joint {driven.joint!r}.")
         self.joint = articulation.joints[name]
         what = f"move_to: joint {self.joint.name!r} of {articulation.name!r}"
         self.target = finite(what, target)

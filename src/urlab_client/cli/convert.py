@@ -123,7 +123,7 @@ def run(arguments: ConvertArguments) -> int:
         raise CommandError(str(error.args[0])) from None
     print(f"{arguments.output}  {written} {what}")
     if recording.damage:
-        print(f"{arguments.recording} was not finished: it holds what was written before ({recording.damage})")
+        print(f"{arguments.recording} was not finished, or is damaged: what comes before is in it ({recording.damage})")
     return 0
 
 

@@ -26,6 +26,7 @@ class InfoArguments(argparse.Namespace):
 
     recording: Path
     json: bool
+    verify: bool
 
 
 def add_parser(commands: Commands) -> None:
@@ -34,10 +35,11 @@ def add_parser(commands: Commands) -> None:
         "info",
         help="show what is in a recording",
         description="Show duration, topics, rates and gaps of a recording. Exit code 0, or 1 when the file was not "
-        "finished or states were dropped. Needs the extra 'urlab-client[mcap]'.",
+        "finished, is damaged, or states were dropped. Needs the extra 'urlab-client[mcap]'.",
         examples=(
             ("urlab info run.mcap", "duration, topics, rates and gaps"),
             ("urlab info run.mcap --json", "the same for programs"),
+            ("urlab info run.mcap --verify", "look for damage, too"),
         ),
     )
     parser.add_argument(
@@ -47,6 +49,9 @@ def add_parser(commands: Commands) -> None:
         help="a .mcap file, or a .json file of the server",
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument(
+        "--verify", action="store_true", help="read the whole file and compare checksums, not its index alone"
+    )
     parser.set_defaults(run=run)
 
 
@@ -60,7 +65,7 @@ def run(arguments: InfoArguments) -> int:
 
     recording = read_run(arguments.recording)
     with progress_bar(arguments.recording.name, recording.path.stat().st_size) as progress:
-        summary = recording.summary(progress)
+        summary = recording.summary(progress, verify=arguments.verify)
     if arguments.json:
         sys.stdout.write(f"{msgspec.json.encode(summary, enc_hook=str).decode()}\n")
     else:
@@ -80,7 +85,7 @@ def _print(summary: Summary) -> None:
     )
     print(f"{summary.duration_s:.3f} s simulated in {summary.wall_s:.3f} s, {counted(summary.episodes, 'episode')}")
     if not summary.complete:
-        print(f"not finished: {summary.damage or 'the end of the file is missing'}")
+        print(f"not finished, or damaged: {summary.damage}")
     if summary.dropped_states or summary.dropped_frames:
         print(
             f"dropped: {counted(summary.dropped_states, 'state')}, {counted(summary.dropped_frames, 'picture')}, "

@@ -10,7 +10,7 @@ import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from urlab_client.cli._arguments import Commands, add_address, add_keys, add_ports, make_client, one_of, seconds
+from urlab_client.cli._arguments import Commands, add_address, add_keys, add_ports, count, make_client, one_of, seconds
 from urlab_client.cli._failure import CommandError
 from urlab_client.cli._mujoco import import_mujoco
 from urlab_client.cli._page_options import PageArguments, add_page, check_page, host_names, page_url
@@ -39,6 +39,7 @@ class McpArguments(PageArguments):
     max_wall: float
     models: Path | None
     http: bool
+    agents: int
     console: bool
 
 
@@ -95,8 +96,16 @@ def add_parser(commands: Commands) -> None:
     parser.add_argument(
         "--http",
         action="store_true",
-        help="serve streamable HTTP at /mcp, for whoever brings the printed token, or that of "
-        f"${_TOKEN}; without it the console's port is any free one unless you name one",
+        help="serve streamable HTTP at /mcp, for whoever brings the printed token, or one of "
+        f"those in ${_TOKEN}, separated by spaces; without it the console's port is any free one unless you name one",
+    )
+    parser.add_argument(
+        "--agents",
+        type=count,
+        default=1,
+        metavar="N",
+        help=f"with --http: print so many tokens, one for each agent, unless ${_TOKEN} has them; one agent drives at a "
+        "time (default: %(default)s)",
     )
     parser.add_argument("--no-console", dest="console", action="store_false", help="do not show the console")
     parser.set_defaults(run=run)
@@ -125,7 +134,9 @@ def run(arguments: McpArguments) -> int:
 
 
 def _check_leave(arguments: McpArguments) -> None:
-    """Refuse to end another client's session for an agent that only looks, unless that is wanted."""
+    """Refuse options that contradict each other, and to end another client's session just for looking."""
+    if arguments.agents > 1 and not arguments.http:
+        raise CommandError("--agents is for --http: on standard input and output there is one agent")
     takes = arguments.allow_drive or arguments.allow_edit or arguments.take_over
     if arguments.handshake is not None and takes:
         raise CommandError("--handshake is for an agent that only looks on: leave out --allow-… and --take-over")
@@ -171,7 +182,7 @@ async def _serve(arguments: McpArguments) -> None:
 
 async def _serve_stdio(arguments: McpArguments, agent: Agent, console: Starlette, access: Access) -> None:
     from urlab_client.cli._pages import bound, serve  # noqa: PLC0415
-    from urlab_client.mcp.doors import serve_stdio  # noqa: PLC0415
+    from urlab_client.mcp.transports import serve_stdio  # noqa: PLC0415
 
     if not arguments.console:
         await serve_stdio(agent)
@@ -194,21 +205,22 @@ async def _serve_stdio(arguments: McpArguments, agent: Agent, console: Starlette
 
 async def _serve_http(arguments: McpArguments, agent: Agent, console: Starlette, access: Access) -> None:
     from urlab_client.cli._pages import bound, serve  # noqa: PLC0415
-    from urlab_client.mcp.doors import http_application  # noqa: PLC0415
+    from urlab_client.mcp.transports import http_application  # noqa: PLC0415
     from urlab_client.web import Access  # noqa: PLC0415
 
-    given = os.environ.get(_TOKEN, "")
-    token = given or secrets.token_urlsafe(32)
+    given = os.environ.get(_TOKEN, "").split()
+    tokens = given or [secrets.token_urlsafe(32) for _ in range(arguments.agents)]
     with bound(arguments.host, arguments.port) as listener:
         url = page_url(arguments, listener.getsockname()[1])
 
         def started() -> None:
-            shown = f"the token in ${_TOKEN}" if given else f"Authorization: Bearer {token}"
-            print(f"Agents: {url}/mcp with {shown}", file=sys.stderr, flush=True)
+            shown = [f"a token of ${_TOKEN}"] if given else [f"Authorization: Bearer {token}" for token in tokens]
+            for one in shown:
+                print(f"Agent: {url}/mcp with {one}", file=sys.stderr, flush=True)
             if arguments.console:
                 _tell(arguments, url, access)
 
-        own = Access(hosts=access.hosts, keys=[token])
+        own = Access(hosts=access.hosts, keys=tokens)
         await serve(http_application(agent, console if arguments.console else None, own), listener, started)
 
 

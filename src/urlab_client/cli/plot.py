@@ -81,7 +81,7 @@ def run(arguments: PlotArguments) -> int:
     check_ending(target, ".png", ".pdf", ".svg")
     recording = read_run(arguments.recording)
     with progress_bar(arguments.recording.name, recording.path.stat().st_size) as progress:
-        table = recording.table(progress)
+        table = recording.table(progress, fields=[arguments.field])
     quantities: list[Quantity] = []
     curves: list[np.ndarray[tuple[int], np.dtype[np.float64]]] = []
     for key, names in _chosen(table, arguments).items():

@@ -8,6 +8,6 @@ from urlab_client._extras import need
 need("mcp", "mcap", "PIL", "starlette", "uvicorn", extra="mcp")
 
 from urlab_client.mcp.agent import Agent  # noqa: E402 - its libraries may be missing
-from urlab_client.mcp.driving import Limits  # noqa: E402
+from urlab_client.mcp.call import Limits  # noqa: E402
 
 __all__ = ["Agent", "Limits"]

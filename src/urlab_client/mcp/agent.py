@@ -7,6 +7,7 @@ import json
 import math
 import time
 from collections.abc import Mapping
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -15,26 +16,13 @@ import msgspec
 from mcp.server import Server
 from mcp.server.context import ServerRequestContext
 from mcp.shared.exceptions import MCPError
-from mcp.types import (
-    INVALID_PARAMS,
-    CallToolRequestParams,
-    CallToolResult,
-    ImageContent,
-    ListResourcesResult,
-    ListToolsResult,
-    PaginatedRequestParams,
-    ReadResourceRequestParams,
-    ReadResourceResult,
-    Resource,
-    TextContent,
-    TextResourceContents,
-)
 from msgspec import Struct
 
-from urlab_client.mcp.declaration import Declared, Moment, Needs, declared
-from urlab_client.mcp.driving import Limits, Stopped
-from urlab_client.mcp.editing import Tools
-from urlab_client.mcp.toolset import TAKEN_OVER
+from mcp import types
+from urlab_client.mcp import editing, looking, moving
+from urlab_client.mcp.call import TAKEN_OVER, Call, Caller, Limits, Stopped
+from urlab_client.mcp.declaration import Declared, Needs, declared
+from urlab_client.mcp.results import Moment
 from urlab_client.protocol.errors import SessionTakenOver, URLabError
 from urlab_client.web.console_session import ConsoleSession
 from urlab_client.web.driving_lease import NotDriving
@@ -49,18 +37,22 @@ _INSTRUCTIONS = """\
 Tools to look at and drive robots in a MuJoCo simulation. Call look first: it lists robots, joints, actuators, cameras,
 units and limits. Angles are in radians, lengths in metres, the z axis points up. In mode direct time passes only while
 run or move_to work; in mode live it passes by itself unless it is paused. When something does not move, call explain.
-A person may watch and take the controls at any time; then wait. One call may take {sim:g} s of simulation time and
-{wall:g} s on the wall.{missing}"""
+One drives at a time: a person may take the controls at any time, and another agent may have them; then wait. One call
+may take {sim:g} s of simulation time and {wall:g} s on the wall.{missing}"""
 _RESOURCES = {
     "urlab://model": "Robots, joints, actuators, sensors, cameras, units and limits, as they are now.",
     "urlab://log": "Calls, errors and events, of people, too; the newest last.",
 }
+_TOOLS = declared(looking, moving, editing)
 _LARGE = 1e3
 _FAILURES = (URLabError, NotDriving, Stopped, ValueError, TypeError, LookupError, OSError)
-_TOOLS = {
+_NO_PLAY = "No play session runs, so there are no robots. Call play with action='start'."
+_METHODS = {
+    "client.sim.start()": "play with action='start'",
     "runtime.set_paused(False)": "play with action='resume'",
     "sim.start()": "play with action='start'",
     "set_ctrl() or ctrl_array before step()": "set_actuators before run",
+    "run_for: ": "run: ",
     "step() was not called": "run was not called",
     "waiting for step()": "waiting for run",
     "Call reset()": "Call reset",
@@ -95,10 +87,13 @@ class Agent:
         looks_on = session.client.config.read_only
         if looks_on and (limits.drive or limits.edit):
             raise ValueError("an agent drives or edits through a client that has the session, not a read-only one")
-        self._tools = Tools(session, limits, models or {})
-        self._declared = declared(Tools)
+        self._console = session
+        self._limits = limits
+        self._models = models or {}
         given = {Needs.NOTHING: True, Needs.SESSION: not looks_on, Needs.DRIVE: limits.drive, Needs.EDIT: limits.edit}
-        self._offered = {name: one for name, one in self._declared.items() if given[one.needs]}
+        self._offered = {name: one for name, one in _TOOLS.items() if given[one.needs]}
+        self._callers: dict[tuple[str, ...], Caller] = {}
+        self._synchronised = ""
         missing = ", ".join(need.value for need, has in given.items() if not has)
         self.server: Server[Any] = Server(
             "urlab",
@@ -107,7 +102,7 @@ class Agent:
             instructions=_INSTRUCTIONS.format(
                 sim=limits.sim_seconds,
                 wall=limits.wall_seconds,
-                missing=f" Not allowed: {missing}." if missing else "",
+                missing=f" Not allowed, unless a person starts `urlab mcp` with: {missing}." if missing else "",
             ),
             on_list_tools=self._list_tools,
             on_call_tool=self._call_tool,
@@ -115,79 +110,98 @@ class Agent:
             on_read_resource=self._read_resource,
         )
 
-    @property
-    def idle(self) -> bool:
-        """Whether no call drives at the moment."""
-        return self._tools.driving.idle
-
     async def _list_tools(
-        self, context: ServerRequestContext[Any], params: PaginatedRequestParams | None
-    ) -> ListToolsResult:
-        return ListToolsResult(tools=[one.described() for one in self._offered.values()])
+        self, context: ServerRequestContext[Any], params: types.PaginatedRequestParams | None
+    ) -> types.ListToolsResult:
+        return types.ListToolsResult(tools=[one.described() for one in self._offered.values()])
 
-    async def _call_tool(self, context: ServerRequestContext[Any], params: CallToolRequestParams) -> CallToolResult:
-        console, viewer = self._tools.console, self._tools.driving.viewer
+    async def _call_tool(
+        self, context: ServerRequestContext[Any], params: types.CallToolRequestParams
+    ) -> types.CallToolResult:
+        console, caller = self._console, self._caller(context)
+        call = Call(console, caller, self._limits, self._models, context.session.report_progress)
         began = time.perf_counter()
         try:
             found = self._tool(params.name)
             arguments = found.parse(params.arguments or {})
-            await self._tools.connected()
-            if found.takes_progress:
-                arguments["progress"] = context.session.report_progress
-            answer = self._answer(await getattr(self._tools, found.name)(**arguments))
+            await call.connected()
+            if self._synchronised != call.client.session_id:
+                await call.client.resync()  # where a simulation stands that ran before
+                self._synchronised = call.client.session_id
+            if found.play and not call.client.manager_present:
+                raise LookupError(_NO_PLAY)
+            work = partial(found.function, call, **arguments)
+            answer = self._answer(await (call.drive(work) if found.drives else work()))
         except _FAILURES as error:
             text = _in_tools(str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error))
             if isinstance(error, SessionTakenOver):
                 text = TAKEN_OVER
-            console.note("error", viewer.name, params.name, text)
-            return CallToolResult(content=[TextContent(text=text)], is_error=True)
-        if found.needs in {Needs.DRIVE, Needs.EDIT}:
+            console.note("error", caller.name, params.name, text)
+            return types.CallToolResult(content=[types.TextContent(text=text)], is_error=True)
+        if found.drives:
             milliseconds = 1e3 * (time.perf_counter() - began)
-            console.note("call", viewer.name, params.name, json.dumps(params.arguments or {}), milliseconds)
+            console.note("call", caller.name, params.name, json.dumps(params.arguments or {}), milliseconds)
         return answer
+
+    def _caller(self, context: ServerRequestContext[Any]) -> Caller:
+        """Return who calls: whoever brought this token, within it this session if there are any, of this program.
+
+        Present clients open no session, so two alike that share a token are one.
+        """
+        client = context.session.client_params
+        request = context.request
+        name = "" if client is None else client.client_info.name
+        token = "" if request is None else str(request.scope.get("urlab_key"))
+        session = "" if request is None else request.headers.get("mcp-session-id", "")
+        known = self._callers.get(who := (name, token, session))
+        if known is None:
+            known = self._callers[who] = Caller(self._console.new_agent_name(name))
+        return known
 
     def _tool(self, name: str) -> Declared:
         if name in self._offered:
             return self._offered[name]
-        if name in self._declared:
-            option = self._declared[name].needs.value
+        if name in _TOOLS:
+            option = _TOOLS[name].needs.value
             raise LookupError(f"{name} is not allowed here. Ask whoever started `urlab mcp` to start it with {option}.")
         raise LookupError(f"No tool is called {name!r}. There are: {', '.join(self._offered)}.")
 
-    def _answer(self, result: Struct | tuple[Struct, bytes]) -> CallToolResult:
+    def _answer(self, result: Struct | tuple[Struct, bytes]) -> types.CallToolResult:
         """Return a result with its structure, its text, and its picture if there is one.
 
         Raises:
             ValueError: A number in it is not finite.
         """
         shown, jpeg = result if isinstance(result, tuple) else (result, None)
-        client = self._tools.client
+        client = self._console.client
         when = Moment(client.sim_time, client.step_count, str(client.step_mode))
         structure = _short(msgspec.to_builtins(shown) | msgspec.to_builtins(when))
-        content: list[TextContent | ImageContent] = [TextContent(text=json.dumps(structure))]
+        content: list[types.TextContent | types.ImageContent] = [types.TextContent(text=json.dumps(structure))]
         if jpeg is not None:
-            content.append(ImageContent(data=base64.b64encode(jpeg).decode(), mime_type="image/jpeg"))
-        return CallToolResult(content=list(content), structured_content=structure)
+            content.append(types.ImageContent(data=base64.b64encode(jpeg).decode(), mime_type="image/jpeg"))
+        return types.CallToolResult(content=list(content), structured_content=structure)
 
     async def _list_resources(
-        self, context: ServerRequestContext[Any], params: PaginatedRequestParams | None
-    ) -> ListResourcesResult:
-        return ListResourcesResult(
+        self, context: ServerRequestContext[Any], params: types.PaginatedRequestParams | None
+    ) -> types.ListResourcesResult:
+        return types.ListResourcesResult(
             resources=[
-                Resource(uri=uri, name=uri.partition("//")[2], description=text, mime_type="application/json")
+                types.Resource(uri=uri, name=uri.partition("//")[2], description=text, mime_type="application/json")
                 for uri, text in _RESOURCES.items()
             ]
         )
 
     async def _read_resource(
-        self, context: ServerRequestContext[Any], params: ReadResourceRequestParams
-    ) -> ReadResourceResult:
+        self, context: ServerRequestContext[Any], params: types.ReadResourceRequestParams
+    ) -> types.ReadResourceResult:
         uri = str(params.uri)
         if uri not in _RESOURCES:
-            raise MCPError(INVALID_PARAMS, f"No resource has the address {uri!r}, only {' and '.join(_RESOURCES)}.")
-        shown = self._tools.client.describe() if uri == "urlab://model" else list(self._tools.console.entries)
-        contents = TextResourceContents(uri=uri, text=encode(shown).decode(), mime_type="application/json")
-        return ReadResourceResult(contents=[contents])
+            raise MCPError(
+                types.INVALID_PARAMS, f"No resource has the address {uri!r}, only {' and '.join(_RESOURCES)}."
+            )
+        shown = self._console.client.describe() if uri == "urlab://model" else list(self._console.entries)
+        contents = types.TextResourceContents(uri=uri, text=encode(shown).decode(), mime_type="application/json")
+        return types.ReadResourceResult(contents=[contents])
 
 
 def _short(value: Any) -> Any:
@@ -208,6 +222,6 @@ def _short(value: Any) -> Any:
 
 
 def _in_tools(text: str) -> str:
-    for method, named in _TOOLS.items():
+    for method, named in _METHODS.items():
         text = text.replace(method, named)
     return text

@@ -1,4 +1,4 @@
-"""Declaring a tool: a method, whose signature becomes the input schema, whose docstring what agents read of it."""
+"""Declaring a tool: a function, whose signature becomes the input schema, whose docstring what agents read of it."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ import inspect
 import json
 from collections.abc import Awaitable, Callable
 from enum import Enum
-from typing import Any, TypeVar, get_type_hints
+from types import ModuleType
+from typing import Any, get_type_hints
 
 import msgspec
 from mcp.types import Tool, ToolAnnotations
 from msgspec import Struct
 
-from urlab_client.protocol.schemas import schemas
+from urlab_client.mcp.results import Moment
+from urlab_client.protocol.schemas import prose, schemas
 
-__all__ = ["Declared", "Moment", "Needs", "declared", "tool"]
+__all__ = ["Declared", "Needs", "declared", "tool"]
 
-F = TypeVar("F", bound=Callable[..., Awaitable[Any]])
-
-_MARK = "_urlab_tool"
+_Function = Callable[..., Awaitable[Any]]
 
 
 class Needs(Enum):
@@ -30,63 +30,52 @@ class Needs(Enum):
     EDIT = "--allow-edit"
 
 
-class Moment(Struct):
-    """When a result was made; every result has these fields, too.
-
-    Attributes:
-        sim_time: Simulation time, seconds.
-        step: Physics steps since the session began or the last reset; not counted in mode `live`.
-        mode: `direct`: time passes only while a tool lets it; `live`: time passes by itself unless paused.
-    """
-
-    sim_time: float
-    step: int
-    mode: str
-
-
 class Declared:
     """One tool.
 
     Args:
-        method: What it does. A parameter `progress` is not the agent's to give.
+        function: What it does, given a `Call` and what the agent passes.
         needs: What an agent must be given.
+        play: Whether a play session must run.
         hints: What hosts get to know of it.
 
     Attributes:
         name: Its name.
-        takes_progress: Whether it reports progress.
+        drives: Whether it changes something, and so takes the controls.
     """
 
-    def __init__(self, method: Callable[..., Awaitable[Any]], needs: Needs, hints: ToolAnnotations) -> None:
-        self.name: str = method.__name__
+    def __init__(self, function: _Function, needs: Needs, hints: ToolAnnotations, *, play: bool) -> None:
+        self.name: str = function.__name__
+        self.function = function
         self.needs = needs
-        self._method = method
+        self.play = play
+        self.drives: bool = needs in {Needs.DRIVE, Needs.EDIT}
         self._hints = hints
-        parameters = inspect.signature(method).parameters
-        self.takes_progress: bool = "progress" in parameters
-        self._given = {name: one.default for name, one in parameters.items() if name not in {"self", "progress"}}
+        self._parameters = list(inspect.signature(function).parameters.values())[1:]
 
     def _arguments(self) -> type[Struct]:
-        """Return the method's parameters as a struct."""
-        types = get_type_hints(self._method, include_extras=True)
-        required = inspect.Parameter.empty
+        """Return the function's parameters as a struct."""
+        types = get_type_hints(self.function, include_extras=True)
         fields = [
-            (name, types[name]) if default is required else (name, types[name], default)
-            for name, default in self._given.items()
+            (one.name, types[one.name]) if one.default is one.empty else (one.name, types[one.name], one.default)
+            for one in self._parameters
         ]
-        return msgspec.defstruct(self.name, fields, forbid_unknown_fields=True, kw_only=True)
+        doc = (self.function.__doc__ or "").replace("\n    Args:\n", "\n    Attributes:\n")
+        return msgspec.defstruct(
+            self.name, fields, namespace={"__doc__": doc}, forbid_unknown_fields=True, kw_only=True
+        )
 
     def described(self) -> Tool:
         """Return what an agent gets to know."""
-        result = get_type_hints(self._method)["return"]
+        arguments, result = self._arguments(), get_type_hints(self.function)["return"]
         output, when = _schema(result.__args__[0] if hasattr(result, "__args__") else result), _schema(Moment)
         output["properties"] |= when["properties"]
         output["required"] = [*output.get("required", ()), *when["required"]]
         return Tool(
             name=self.name,
             title=self.name.replace("_", " ").capitalize(),
-            description=inspect.cleandoc(self._method.__doc__ or ""),
-            input_schema=_schema(self._arguments()),
+            description=prose(arguments),
+            input_schema={key: part for key, part in _schema(arguments).items() if key != "description"},
             output_schema=output,
             annotations=self._hints,
         )
@@ -101,37 +90,38 @@ class Declared:
         try:
             made = msgspec.convert(plain, self._arguments(), strict=False)
         except msgspec.ValidationError as error:
-            raise ValueError(f"{self.name}: {error}. It takes: {', '.join(self._given) or 'no arguments'}.") from None
-        return {name: getattr(made, name) for name in self._given}
+            taken = ", ".join(one.name for one in self._parameters)
+            raise ValueError(f"{self.name}: {error}. It takes: {taken or 'no arguments'}.") from None
+        return {one.name: getattr(made, one.name) for one in self._parameters}
 
 
-def tool(needs: Needs, *, destructive: bool = False, idempotent: bool = False) -> Callable[[F], F]:
-    """Declare a method as a tool.
+def tool(
+    needs: Needs, *, play: bool = True, destructive: bool = False, idempotent: bool = False
+) -> Callable[[_Function], Declared]:
+    """Declare a function as a tool.
 
     Args:
         needs: What an agent must be given.
+        play: Whether a play session must run.
         destructive: Whether it may undo what was there.
         idempotent: Whether a second call with the same arguments changes nothing more.
     """
 
-    def mark(method: F) -> F:
+    def declare(function: _Function) -> Declared:
         hints = ToolAnnotations(
             read_only_hint=needs in {Needs.NOTHING, Needs.SESSION},
             destructive_hint=destructive,
             idempotent_hint=idempotent,
             open_world_hint=False,
         )
-        setattr(method, _MARK, Declared(method, needs, hints))
-        return method
+        return Declared(function, needs, hints, play=play)
 
-    return mark
+    return declare
 
 
-def declared(owner: type) -> dict[str, Declared]:
-    """Return the tools of a class by name, in their order."""
-    members = [member for base in reversed(owner.__mro__) for member in vars(base).values()]
-    marks = [getattr(member, _MARK, None) for member in members]
-    return {mark.name: mark for mark in marks if isinstance(mark, Declared)}
+def declared(*modules: ModuleType) -> dict[str, Declared]:
+    """Return the tools of modules by name, in their order."""
+    return {one.name: one for module in modules for one in vars(module).values() if isinstance(one, Declared)}
 
 
 def _schema(struct: type[Struct]) -> dict[str, Any]:

@@ -1,152 +1,134 @@
-"""Tools that move robots, through the console's lease and within limits."""
+"""Tools that move robots."""
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
 
+from urlab_client.mcp.call import Call
 from urlab_client.mcp.declaration import Needs, tool
-from urlab_client.mcp.driving import Progress
-from urlab_client.mcp.looking import Looking, Robot
+from urlab_client.mcp.looking import Robot
 from urlab_client.mcp.results import Done, Recorded
 from urlab_client.protocol.enums import StepMode
 
-__all__ = ["Moving"]
+__all__: list[str] = []
 
-Seconds = Annotated[float, Meta(description="Simulation time, seconds.", gt=0)]
-Targets = Annotated[dict[str, float], Meta(description="Joint name to position: rad or m.", min_length=1)]
+Positive = Annotated[float, Meta(gt=0)]
+Targets = Annotated[dict[str, float], Meta(min_length=1)]
 
 _RECORDED_S = 0.02
 
 
-class Moving(Looking):
-    """Tools that move robots."""
+@tool(Needs.DRIVE)
+async def run(call: Call, seconds: Positive | None = None, steps: Annotated[int, Meta(ge=1)] | None = None) -> Done:
+    """Let simulation time pass: step in mode `direct`, watch in mode `live`. Give `seconds` or `steps`.
 
-    @tool(Needs.DRIVE)
-    async def run(
-        self,
-        progress: Progress,
-        seconds: Seconds | None = None,
-        steps: Annotated[int, Meta(description="Physics steps, instead of `seconds`.", ge=1)] | None = None,
-    ) -> Done:
-        """Let simulation time pass: step in mode `direct`, watch in mode `live`. Give `seconds` or `steps`."""
-        if (seconds is None) == (steps is None):
-            raise ValueError("run takes either `seconds` or `steps`.")
-        model = self.client.model
-        if steps is not None:
-            if self.client.step_mode is StepMode.LIVE or model is None:
-                raise ValueError("In this mode time passes by itself: give `seconds` instead of `steps`.")
-            seconds = steps * float(model.opt.timestep)
-        limit = self.driving.seconds(seconds or 0.0)
+    Args:
+        seconds: Simulation time, seconds; one physics step at least.
+        steps: Physics steps, instead of `seconds`; in mode `direct` only.
+    """
+    model, live = call.client.model, call.client.step_mode is StepMode.LIVE
+    timestep = 0.0 if live or model is None else float(model.opt.timestep)
+    if (seconds is None) == (steps is None):
+        raise ValueError("run takes either `seconds` or `steps`.")
+    if steps is not None and not timestep:
+        raise ValueError("In this mode time passes by itself: give `seconds` instead of `steps`.")
+    left = call.within(max(timestep, seconds or 0.0) if steps is None else steps * timestep)
+    # A recording has a state for each reply.
+    piece = left if call.console.recordings.running is None else max(_RECORDED_S, timestep)
+    passed = 0.0
+    while left - passed > max(timestep / 2, 1e-9):
+        passed += await call.client.run_for(min(piece, left - passed))
+    return Done(done="Time passed.", passed=passed)
 
-        async def work() -> float:
-            passed = 0.0
-            # A recording has a state for each reply.
-            piece = _RECORDED_S if self.console.recordings.running is not None else limit
-            while limit - passed > _RECORDED_S / 100:
-                passed += await self.client.run_for(min(piece, limit - passed))
-            return passed
 
-        passed = await self.driving.drive(work, progress, limit)
-        return Done(done="Time passed.", passed=passed)
+@tool(Needs.DRIVE, idempotent=True)
+async def move_to(
+    call: Call, robot: Robot, joints: Targets, tolerance: Positive = 0.01, timeout: Positive = 5.0
+) -> Done:
+    """Move joints to positions and wait until they have settled there.
 
-    @tool(Needs.DRIVE, idempotent=True)
-    async def move_to(
-        self,
-        progress: Progress,
-        robot: Robot,
-        joints: Targets,
-        tolerance: Annotated[float, Meta(description="How near is near enough: rad or m.", gt=0)] = 0.01,
-        timeout: Seconds = 5.0,
-    ) -> Done:
-        """Move joints to positions and wait until they have settled there.
+    For joints with a position servo: `look` lists an actuator for it that takes `position`. Others are moved with
+    `set_actuators` and `run`. Refuses positions beyond a joint's limits. Fails with the reason when a joint has not
+    settled in time; it goes on towards its target when more time passes.
 
-        For joints with a position servo; others are moved with `set_actuators` and `run`. Refuses positions beyond a
-        joint's limits. Fails with the reason when a joint has not settled in time.
-        """
-        found, limit = self.robot(robot), self.driving.seconds(timeout)
-        passed = await self.driving.drive(
-            lambda: found.move_to(joints, tolerance=tolerance, timeout=limit), progress, limit
-        )
-        reached = ", ".join(f"{name} {float(found.joints[name].position):.4g}" for name in joints)
-        return Done(done=f"{found.name} has settled: {reached}.", passed=passed)
+    Args:
+        joints: Joint name to position: rad or m.
+        tolerance: How near is near enough: rad or m.
+        timeout: Simulation time that it may take, seconds.
+    """
+    found = call.robot(robot)
+    passed = await found.move_to(joints, tolerance=tolerance, timeout=call.within(timeout))
+    reached = ", ".join(f"{name} {float(found.joints[name].position):.4g}" for name in joints)
+    return Done(done=f"{found.name} has settled: {reached}.", passed=passed)
 
-    @tool(Needs.DRIVE, idempotent=True)
-    async def set_actuators(
-        self,
-        progress: Progress,
-        robot: Robot,
-        set_points: Annotated[
-            dict[str, float],
-            Meta(description="Actuator name to value, in the unit that `look` shows.", min_length=1),
-        ],
-    ) -> Done:
-        """Tell actuators what to do; the others keep what they were told. Acts as time passes: call `run` then."""
-        found = self.robot(robot)
 
-        async def work() -> None:
-            found.set_ctrl(set_points, out_of_range="error")
-            if self.client.step_mode is StepMode.LIVE:
-                await self.client.step()  # hands them over
+@tool(Needs.DRIVE, idempotent=True)
+async def set_actuators(call: Call, robot: Robot, set_points: Targets) -> Done:
+    """Tell actuators what to do; the others keep what they were told. Acts as time passes: call `run` then.
 
-        await self.driving.drive(work, progress)
-        return Done(done=f"{found.name}: {len(set_points)} set-points are set.")
+    Args:
+        set_points: Actuator name to value, in the unit and within the limits that `look` shows.
+    """
+    found = call.robot(robot)
+    found.set_ctrl(set_points, out_of_range="error")
+    if call.client.step_mode is StepMode.LIVE:
+        await call.client.step()  # hands them over
+    return Done(done=f"{found.name} has new set-points: {', '.join(set_points)}.")
 
-    @tool(Needs.DRIVE, destructive=True, idempotent=True)
-    async def reset(
-        self,
-        progress: Progress,
-        keyframe: Annotated[str | None, Meta(description="Keyframe to start from; default: the initial state.")] = None,
-        joints: Annotated[
-            dict[str, dict[str, float]] | None, Meta(description="Robot to joint to position, to start from: rad or m.")
-        ] = None,
-    ) -> Done:
-        """Put the simulation back to its beginning. Set-points stay. Use it also when a simulation has diverged."""
-        for name, positions in (joints or {}).items():
-            for joint, position in positions.items():
-                low, high = self.robot(name).joints[joint].limits or (position, position)
-                if not low <= position <= high:
-                    raise ValueError(f"joint {joint!r} of {name!r} takes {low:g} to {high:g}, got {position:g}.")
-        await self.driving.drive(lambda: self.client.reset(keyframe, per_articulation_qpos=joints), progress)
-        return Done(done="The simulation is at its beginning.")
 
-    @tool(Needs.DRIVE, destructive=True, idempotent=True)
-    async def play(
-        self,
-        progress: Progress,
-        action: Annotated[
-            Literal["start", "stop", "pause", "resume"],
-            Meta(description="start, stop: the play session; pause, resume: time, in mode `live`."),
-        ],
-    ) -> Done:
-        """Start or stop the play session, without which there are no robots; pause or resume time in mode `live`."""
-        if action in {"pause", "resume"} and self.client.step_mode is not StepMode.LIVE:
-            raise ValueError(f"In mode {self.client.step_mode} time passes only while a tool lets it: call run.")
+@tool(Needs.DRIVE, destructive=True, idempotent=True)
+async def reset(call: Call, keyframe: str | None = None, joints: dict[str, dict[str, float]] | None = None) -> Done:
+    """Put the simulation back to its beginning. Set-points stay. Use it also when a simulation has diverged.
 
-        async def work() -> None:
-            match action:
-                case "start":
-                    await self.client.sim.start()
-                case "stop":
-                    await self.client.sim.stop()
-                case _:
-                    await self.client.runtime.set_paused(action == "pause")
+    Args:
+        keyframe: Keyframe to start from; default: the initial state.
+        joints: Robot to joint to position, to start from: rad or m.
+    """
+    for name, positions in (joints or {}).items():
+        for joint, position in positions.items():
+            found = call.robot(name).joints[joint]
+            low, high = found.limits or (-math.inf, math.inf)
+            if not low <= position <= high:
+                takes = f"{low:g} to {high:g} {found.unit}"
+                raise ValueError(f"joint {joint!r} of {name!r} takes {takes}, got {position:g}. Nothing was reset.")
+    await call.client.reset(keyframe, per_articulation_qpos=joints)
+    return Done(done="The simulation is at its beginning.")
 
-        await self.driving.drive(work, progress)
-        return Done(done=f"{action}: done.")
 
-    @tool(Needs.DRIVE)
-    async def record(
-        self,
-        progress: Progress,
-        action: Literal["start", "stop"],
-        cameras: Annotated[bool, Meta(description="Whether to record pictures of all cameras, too.")] = False,
-    ) -> Recorded:
-        """Record an episode: `start`, then move the robot, then `stop`. Writes an MCAP file with all states."""
-        recordings = self.console.recordings
-        if action == "start":
-            file = await self.driving.drive(lambda: recordings.start(cameras=cameras), progress)
-            return Recorded(file, running=True)
-        return msgspec.convert(await recordings.stop(), Recorded)
+@tool(Needs.DRIVE, play=False, destructive=True, idempotent=True)
+async def play(call: Call, action: Literal["start", "stop", "pause", "resume"]) -> Done:
+    """Start or stop the play session, without which there are no robots; pause or resume time in mode `live`.
+
+    Args:
+        action: start, stop: the play session; pause, resume: time, in mode `live`.
+    """
+    match action:
+        case "start":
+            await call.client.sim.start()
+            await call.client.resync()
+            return Done(done="Play has started.")
+        case "stop":
+            await call.client.sim.stop()
+            return Done(done="Play has ended. There are no robots until it starts again.")
+        case _ if call.client.step_mode is not StepMode.LIVE:
+            raise ValueError(f"In mode {call.client.step_mode} time passes only while a tool lets it: call run.")
+        case _:
+            await call.client.runtime.set_paused(action == "pause")
+            return Done(done="Time stands still." if action == "pause" else "Time passes.")
+
+
+@tool(Needs.DRIVE)
+async def record(call: Call, action: Literal["start", "stop"], cameras: bool = False) -> Recorded:
+    """Record an episode: `start`, then move the robot, then `stop`. Writes an MCAP file with all states.
+
+    Args:
+        action: What to do.
+        cameras: Whether to record pictures of all cameras, too.
+    """
+    if action == "start":
+        return Recorded(await call.console.recordings.start(cameras=cameras), running=True)
+    return msgspec.convert(await call.console.recordings.stop(), Recorded)

@@ -1,4 +1,4 @@
-"""What the tools return, where the client has no type for it. Every result also says when it was made; see `agent`."""
+"""What the tools return, where the client has no type for it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,21 @@ from urlab_client.protocol.descriptions import Pose, SceneDescription
 from urlab_client.protocol.types import Contact
 from urlab_client.web.messages import LogEntry
 
-__all__ = ["Contacts", "Done", "Edited", "Log", "Picture", "Recorded", "RobotState", "World"]
+__all__ = ["Contacts", "Done", "Edited", "Log", "Moment", "Picture", "Recorded", "RobotState", "World"]
+
+
+class Moment(Struct):
+    """When a result was made; every result has these fields, too.
+
+    Attributes:
+        sim_time: Simulation time, seconds.
+        step: Physics steps since the session began or the last reset; not counted in mode `live`.
+        mode: `direct`: time passes only while a tool lets it; `live`: time passes by itself unless paused.
+    """
+
+    sim_time: float
+    step: int
+    mode: str
 
 
 class World(Struct):
@@ -18,12 +32,14 @@ class World(Struct):
         scene: Robots with joints, actuators, sensors and cameras, and other bodies.
         blueprints: What `spawn` can place.
         models: What `import_model` can turn into a blueprint.
-        driver: Who has the controls, or None.
+        keyframes: What `reset` can start from.
+        driver: Who has the controls: `you`, the name of somebody else, or None.
     """
 
     scene: SceneDescription
     blueprints: list[str]
     models: list[str]
+    keyframes: list[str]
     driver: str | None
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
-from typing import TYPE_CHECKING, Any, Final
+import os
+import sys
+from typing import IO, TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +17,7 @@ from urlab_client.protocol.pixels import Pixels, grey
 if TYPE_CHECKING:
     from PIL import Image
 
-__all__ = ["JPEG_QUALITY", "jpeg", "pillow_image", "png"]
+__all__ = ["JPEG_QUALITY", "encoded", "jpeg", "pillow_image", "png"]
 
 JPEG_QUALITY: Final = 85
 """Default quality of a JPEG, of 100."""
@@ -37,11 +39,11 @@ def png(pixels: Pixels, mode: CameraMode | str) -> bytes:
         MissingExtra: Pillow is not installed.
     """
     if mode != CameraMode.DEPTH:
-        return _encoded(pillow_image(pixels, mode), "PNG")
+        return encoded(pillow_image(pixels, mode), "PNG")
     with np.errstate(invalid="ignore"):
         depth = np.rint(np.asarray(pixels, np.float64) * _MILLIMETRES)
         within = (depth >= 0) & (depth < _DEEPEST)
-    return _encoded(_image(np.where(within, depth, 0).astype(np.uint16)), "PNG")
+    return encoded(_image(np.where(within, depth, 0).astype(np.uint16)), "PNG")
 
 
 def jpeg(pixels: Pixels, mode: CameraMode | str, quality: int = JPEG_QUALITY, *, max_size: int | None = None) -> bytes:
@@ -64,7 +66,7 @@ def jpeg(pixels: Pixels, mode: CameraMode | str, quality: int = JPEG_QUALITY, *,
     image = _image(grey(pixels)) if mode == CameraMode.DEPTH else pillow_image(pixels, mode)
     if max_size is not None:
         image.thumbnail((max_size, max_size))
-    return _encoded(image, "JPEG", quality=quality)
+    return encoded(image, "JPEG", quality=quality)
 
 
 def pillow_image(pixels: Pixels, mode: CameraMode | str, *, alpha: bool = False) -> Image.Image:
@@ -96,7 +98,22 @@ def _image(array: NDArray[Any]) -> Image.Image:
     return Image.fromarray(array)
 
 
-def _encoded(image: Image.Image, kind: str, **options: Any) -> bytes:
-    buffer = io.BytesIO()
-    image.save(buffer, kind, **options)
-    return buffer.getvalue()
+def encoded(image: Image.Image, kind: str, **options: Any) -> bytes:
+    """Return a picture of Pillow's as a file.
+
+    Args:
+        image: The picture.
+        kind: Pillow's name of the format.
+        options: Its options.
+    """
+    with _target() as target:
+        image.save(target, kind, **options)
+        target.seek(0)
+        return target.read()
+
+
+def _target() -> IO[bytes]:
+    # Pillow lets other threads run while it encodes a JPEG into a file of the system's, and only then.
+    if sys.platform == "linux":
+        return os.fdopen(os.memfd_create("urlab-picture"), "w+b")
+    return io.BytesIO()

@@ -58,6 +58,7 @@ _PULSE_S = 0.5
 _CONNECT_S = 3.0
 _KEPT = 300
 _DIGITS = 5
+_AGENT_NAME = 40
 _MOVING_S = 0.4  # a paused server repeats its state ten times a second
 
 
@@ -112,6 +113,7 @@ class ConsoleSession:
         self._adopted = b""
         self._bells: set[asyncio.Event] = set()
         self._n = 0
+        self._agents = 0
         self._want: str | None = "discover"
         self._wake = asyncio.Event()
         self._ready = asyncio.Event()
@@ -236,6 +238,11 @@ class ConsoleSession:
         else:
             self.controls.set_points(viewer, order.values)
 
+    def new_agent_name(self, program: str) -> str:
+        """Return what an agent is called that has not called before: people and other agents see it."""
+        self._agents += 1
+        return f"agent {self._agents}" + (f" ({program[:_AGENT_NAME]})" if program else "")
+
     def take_back(self) -> None:
         """Open a session again, after another program took the server over."""
         self._want = "discover"
@@ -351,6 +358,7 @@ class ConsoleSession:
             speed=self.controls.speed,
             source=self.controls.source,
             recording=self.recordings.running,
+            conversions=self.recordings.conversions,
             replay=self.replay.view,
             twists=self.controls.twists,
             viewers=len(self.audience),
@@ -395,13 +403,18 @@ class ConsoleSession:
         """Return the cameras that somebody watches, by the names that `step` takes."""
         return [path.removeprefix("-/") for path, feed in self._feeds.items() if feed.watched]
 
+    async def renew_pictures(self) -> None:
+        """Show pictures of another source, a recording's or the simulation's."""
+        for feed in [*self._feeds.values()]:
+            await feed.renew()
+
     def feed(self, path: str) -> Feed | None:
         """Return the pictures of the camera `ARTICULATION/CAMERA` (`-` for those of the scene), None without it."""
         view = self.camera(path)
         if view is None:
             return None
         if path not in self._feeds or self._feeds[path].view is not view:
-            self._feeds[path] = Feed(self.client, view)
+            self._feeds[path] = Feed(self.client, view, path, self.replay)
         return self._feeds[path]
 
     def camera(self, path: str) -> URLabCameraView | None:

@@ -8,7 +8,7 @@ from msgspec import Meta, Struct
 
 from urlab_client.protocol.enums import StepMode
 from urlab_client.web.description import WorldDescription
-from urlab_client.web.recordings import RunningRecording
+from urlab_client.web.recordings import Conversion, RunningRecording
 from urlab_client.web.replay import ReplayView
 
 __all__ = [
@@ -113,6 +113,7 @@ class Status(Struct, tag_field="type", tag="status"):
     speed: float | None
     source: str | None
     recording: RunningRecording | None
+    conversions: list[Conversion]
     replay: ReplayView | None
     twists: dict[str, tuple[float, float, float]]
     viewers: int
@@ -182,9 +183,13 @@ FromViewer: TypeAlias = Ack | Ping | Name | Ctrl | Hand
 
 
 class PictureHead(Struct):
-    """What comes before a picture: `received` is Unix time in ms, `sim_time` seconds."""
+    """What comes before a picture: `received` is Unix time in ms, `sim_time` seconds.
+
+    With `recorded` it belongs to the recording that is replayed, and `sim_time` to that one's clock.
+    """
 
     seq: int
     received: float
     sim_time: float | None
     mode: str
+    recorded: bool = False

@@ -35,8 +35,8 @@ class ModelRoutes(RouteGroup):
 
     async def _take(self, request: Request) -> Response:
         viewer, name = self._viewer(request), request.path_params["name"]
-        self._console.lease.use(viewer)
-        made = await take_model(self._console.client, name, request.stream())
+        async with self._console.lease.hold(viewer):  # large models take longer than the controls are kept
+            made = await take_model(self._console.client, name, request.stream())
         self._console.note("call", viewer.name, "import model", name)
         return Response(encode({"blueprint": made.class_path, "name": made.short_name}), media_type="application/json")
 

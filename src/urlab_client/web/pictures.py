@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import time
 from collections.abc import AsyncGenerator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import anyio
 import anyio.to_thread
@@ -20,8 +20,9 @@ from urlab_client.web.messages import PictureHead
 
 if TYPE_CHECKING:
     from urlab_client.aio import Stream, URLabCameraView, URLabClient
+    from urlab_client.integrations.record.reader import RecordedPicture
 
-__all__ = ["EncodedPicture", "Feed"]
+__all__ = ["EncodedPicture", "Feed", "PictureRecording"]
 
 _FASTEST_S = 1 / 30
 _LOOK_S = 0.5
@@ -39,15 +40,34 @@ class EncodedPicture:
         head: What the browser is told about it.
     """
 
-    def __init__(self, seq: int, received_ns: int, sim_time: float | None, mode: str, encoded: bytes) -> None:
+    def __init__(
+        self, seq: int, received_ns: int, sim_time: float | None, mode: str, encoded: bytes, *, recorded: bool
+    ) -> None:
         self.seq = seq
         self.received_ns = received_ns
         self.jpeg = encoded
-        self.head: bytes = msgspec.json.encode(PictureHead(seq, received_ns / 1e6, sim_time, mode))
+        self.head: bytes = msgspec.json.encode(PictureHead(seq, received_ns / 1e6, sim_time, mode, recorded))
 
     def frame(self) -> bytes:
         """Return length of the head (4 bytes, little-endian), head, and JPEG."""
         return len(self.head).to_bytes(4, "little") + self.head + self.jpeg
+
+
+class PictureRecording(Protocol):
+    """What a camera's pictures come from while a recording of them is replayed."""
+
+    @property
+    def at(self) -> float:
+        """Where it is, seconds."""
+        ...
+
+    def has_pictures(self, camera: str) -> bool:
+        """Return whether it has pictures of a camera, and is shown."""
+        ...
+
+    async def picture(self, camera: str) -> tuple[float, RecordedPicture] | None:
+        """Return the present picture of a camera and its time."""
+        ...
 
 
 class Feed:
@@ -56,16 +76,20 @@ class Feed:
     Args:
         client: The client.
         view: The camera.
+        path: Its name, as `ARTICULATION/CAMERA`.
+        recording: What is replayed, if anything is.
 
     Attributes:
         newest: The newest picture, or None.
         view: The camera.
     """
 
-    def __init__(self, client: URLabClient, view: URLabCameraView) -> None:
+    def __init__(self, client: URLabClient, view: URLabCameraView, path: str, recording: PictureRecording) -> None:
         self.newest: EncodedPicture | None = None
         self._client = client
         self.view = view
+        self._path = path
+        self._recording = recording
         self._watchers = 0
         self._changed = asyncio.Condition()
         self._task: asyncio.Task[None] | None = None
@@ -96,6 +120,13 @@ class Feed:
             task.cancel()
             await asyncio.wait((task,))
 
+    async def renew(self) -> None:
+        """Begin anew: pictures come from a recording now, or no longer."""
+        await self._stop()
+        self.newest = self._last = None
+        if self._watchers and self._task is None:
+            self._task = asyncio.create_task(self._run(), name="urlab-web-camera")
+
     async def after(self, seq: int) -> EncodedPicture:
         """Return the newest picture once it is newer than number `seq`."""
         async with self._changed:
@@ -106,16 +137,34 @@ class Feed:
     async def _run(self) -> None:
         while True:
             try:
-                async with self.view.frames("latest") as frames:
-                    while True:
-                        began = time.monotonic()
-                        if self._client.step_mode is StepMode.LIVE:
-                            await self._take_from(frames)
-                        else:
-                            await self._take_from_replies()
-                        await anyio.sleep(max(0.0, began + _FASTEST_S - time.monotonic()))
-            except URLabError:
-                await anyio.sleep(_LOOK_S)  # the connection is being restored; the log says so
+                if self._recording.has_pictures(self._path):
+                    await self._follow_recording()
+                else:
+                    await self._follow_simulation()
+            except (URLabError, OSError):
+                await anyio.sleep(_LOOK_S)  # the connection is being restored, or the file is damaged; the log says so
+
+    async def _follow_simulation(self) -> None:
+        async with self.view.frames("latest") as frames:
+            while True:
+                began = time.monotonic()
+                if self._client.step_mode is StepMode.LIVE:
+                    await self._take_from(frames)
+                else:
+                    await self._take_from_replies()
+                await anyio.sleep(max(0.0, began + _FASTEST_S - time.monotonic()))
+
+    async def _follow_recording(self) -> None:
+        at = shown = -1.0
+        while self._recording.has_pictures(self._path):
+            if at != self._recording.at:
+                at = self._recording.at
+                found = await self._recording.picture(self._path)
+                if found is not None and found[0] != shown:
+                    shown = found[0]
+                    encoded = await anyio.to_thread.run_sync(_jpeg_of, found[1], abandon_on_cancel=True)
+                    await self._show(encoded, time.time_ns(), shown, found[1].mode, recorded=True)
+            await anyio.sleep(_FASTEST_S)
 
     async def _take_from(self, frames: Stream[CameraSample]) -> None:
         with contextlib.suppress(URLabTimeoutError):
@@ -138,7 +187,18 @@ class Feed:
     async def _publish(self, pixels: Any, received_ns: int, sim_time: float | None) -> None:
         mode = str(self.view.mode)
         encoded = await anyio.to_thread.run_sync(jpeg, pixels, mode, _QUALITY, abandon_on_cancel=True)
+        await self._show(encoded, received_ns, sim_time, mode, recorded=False)
+
+    async def _show(
+        self, encoded: bytes, received_ns: int, sim_time: float | None, mode: str, *, recorded: bool
+    ) -> None:
         self._seq += 1
         async with self._changed:
-            self.newest = EncodedPicture(self._seq, received_ns, sim_time, mode, encoded)
+            self.newest = EncodedPicture(self._seq, received_ns, sim_time, mode, encoded, recorded=recorded)
             self._changed.notify_all()
+
+
+def _jpeg_of(picture: RecordedPicture) -> bytes:
+    """Return a recorded picture as a browser shows it; one that is a JPEG already as it is."""
+    format_ = getattr(picture.message, "format", "")
+    return picture.message.data if format_ == "jpeg" else jpeg(picture.pixels(), picture.mode, _QUALITY)

@@ -49,7 +49,9 @@ class ReadingRoutes(RouteGroup):
         feed = self._console.feed(request.path_params["path"])
         if feed is None:
             return _no_camera(request)
-        if self._console.moving and self._console.client.step_mode is StepMode.LIVE:
+        console = self._console
+        replayed = console.replay.has_pictures(request.path_params["path"])
+        if console.moving and console.client.step_mode is StepMode.LIVE and not replayed:
             async with feed.watch():
                 with anyio.move_on_after(_FLOWING_S):
                     return Response((await feed.after(0)).jpeg, media_type="image/jpeg")

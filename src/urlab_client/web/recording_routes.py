@@ -74,6 +74,9 @@ class RecordingRoutes(RouteGroup):
             viewer = self._viewer(request)
             self._console.lease.use(viewer)
             if request.method == "DELETE":
+                replayed = self._console.replay.view
+                if replayed is not None and replayed.name == name:
+                    raise ValueError(f"{name} is being replayed: go back to live first")
                 recordings.remove(name)
                 self._console.note("call", viewer.name, "delete recording", name)
                 return _json({})

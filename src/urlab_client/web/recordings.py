@@ -7,7 +7,7 @@ import contextlib
 import re
 import tempfile
 import time
-from collections.abc import AsyncGenerator, AsyncIterator
+from collections.abc import AsyncGenerator, AsyncIterator, Callable
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import anyio.to_thread
 from msgspec import Struct
 
+from urlab_client._extras import MissingExtra, need
 from urlab_client.protocol.errors import URLabError
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from urlab_client.integrations.record.reader import Run
     from urlab_client.integrations.record.recorder import AsyncRecorder
 
-__all__ = ["KINDS", "RecordingView", "Recordings", "RunningRecording"]
+__all__ = ["KINDS", "Conversion", "RecordingView", "Recordings", "RunningRecording"]
 
 KINDS = ("csv", "mp4", "npz")
 """What a recording is converted to for download, besides what it is."""
@@ -55,6 +56,15 @@ class RecordingView(Struct):
     at: float
 
 
+class Conversion(Struct):
+    """A recording that is being converted for download, and how much of it has been read, 0 to 1."""
+
+    name: str
+    kind: str
+    camera: str
+    share: float = 0.0
+
+
 class Recordings:
     """The recordings of one console.
 
@@ -65,6 +75,7 @@ class Recordings:
 
     def __init__(self, client: URLabClient, folder: Path) -> None:
         self.folder = folder
+        self.conversions: list[Conversion] = []
         self._client = client
         self._recorder: AsyncRecorder | None = None
         self._began = 0.0
@@ -191,6 +202,8 @@ class Recordings:
     async def describe(self, name: str) -> dict[str, Any]:
         """Return name, size, length in seconds, robots, cameras, and why the file is not whole, if so.
 
+        `unavailable` has the kinds that it cannot be converted to here, each with what is missing.
+
         Raises:
             KeyError: There is none of that name.
             URLabError: The file is not a recording.
@@ -215,7 +228,16 @@ class Recordings:
             raise ValueError(f"a recording is converted to {', '.join(KINDS)}, not {kind!r}")
         with tempfile.TemporaryDirectory(prefix="urlab-", ignore_cleanup_errors=True) as folder:
             target = Path(folder) / f"{file.stem}.{kind}"
-            await anyio.to_thread.run_sync(_convert, file, target, kind, camera)
+            size, conversion = max(1, file.stat().st_size), Conversion(name, kind, camera)
+
+            def progress(count: int) -> None:
+                conversion.share = round(count / size, 2)
+
+            self.conversions.append(conversion)
+            try:
+                await anyio.to_thread.run_sync(_convert, file, target, kind, camera, progress)
+            finally:
+                self.conversions.remove(conversion)
             yield target
 
     async def take_in(self, name: str, chunks: AsyncIterator[bytes]) -> dict[str, Any]:
@@ -278,21 +300,29 @@ def _described(file: Path) -> dict[str, Any]:
         "cameras": [name for name in cameras if not name.endswith("/calibration")],
         "damage": summary.damage,
         "lost": summary.dropped_states + summary.dropped_frames,
+        "unavailable": _unavailable(),
     }
 
 
-def _convert(file: Path, target: Path, kind: str, camera: str) -> None:
-    from urlab_client._extras import MissingExtra  # noqa: PLC0415
+def _unavailable() -> dict[str, str]:
+    try:
+        need("av", extra="video")
+    except MissingExtra as error:
+        return {"mp4": str(error)}
+    return {}
+
+
+def _convert(file: Path, target: Path, kind: str, camera: str, progress: Callable[[int], None]) -> None:
     from urlab_client.integrations.record import export  # noqa: PLC0415
 
     run = open_run(file)
     try:
         match kind:
             case "csv":
-                export.write_csv(run, target)
+                export.write_csv(run, target, progress)
             case "npz":
-                export.write_npz(run, target)
+                export.write_npz(run, target, progress=progress)
             case _:
-                export.write_mp4(run, target, camera)
+                export.write_mp4(run, target, camera, progress)
     except MissingExtra as error:
         raise URLabError(str(error)) from None

@@ -1,16 +1,18 @@
 """A recording played back for all viewers: states of its file in place of the server's, at the pace of its clock.
 
 The server is not asked for anything, so that a replay works with any server and any recording, stands at any place at
-once, and says where it is in seconds. If wanted, it also places the robots of the simulation, in mode puppet.
+once, and says where it is in seconds. Only the present moment is in memory, however long the recording is. If wanted,
+it also places the robots of the simulation, in mode puppet.
 """
 
 from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar, cast
 
 import anyio
 import anyio.to_thread
@@ -18,7 +20,6 @@ import numpy as np
 from msgspec import Struct
 
 from urlab_client.aio.model.layout import articulation_layouts
-from urlab_client.protocol.base import Floats
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import ArticulationState, Clock, EntityState
@@ -27,17 +28,23 @@ from urlab_client.web.recordings import open_run
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabArticulation, URLabClient
-    from urlab_client.integrations.record.reader import Column, Table
+    from urlab_client.integrations.record.contents import RecordedArticulation, RecordedState
+    from urlab_client.integrations.record.reader import RecordedPicture, Run
+
+_T = TypeVar("_T")
 
 __all__ = ["Replay", "ReplayView"]
 
 _PERIOD_S = 1 / 60
 _PLACED_S = 1 / 25
-_FIELDS = ("qpos", "qvel", "ctrl", "set_points")
+_OF_SCENE = "-/"
 
 
 class ReplayView(Struct):
-    """Where a replay is: seconds of the recording's clock. `placing`: whether the simulation's robots follow."""
+    """Where a replay is: seconds of the recording's clock. `placing`: whether the simulation's robots follow.
+
+    `cameras` are those whose recorded pictures are shown, as `ARTICULATION/CAMERA` or `-/CAMERA`.
+    """
 
     name: str
     time: float
@@ -45,6 +52,7 @@ class ReplayView(Struct):
     playing: bool
     rate: float
     placing: bool
+    cameras: list[str]
 
 
 class Publisher(Protocol):
@@ -54,6 +62,14 @@ class Publisher(Protocol):
 
     def show(self, snapshot: StateSnapshot, targets: Mapping[str, list[float]]) -> None:
         """Show a state to everybody in place of the server's."""
+        ...
+
+    async def renew_pictures(self) -> None:
+        """Show pictures of another source, the recording's or the simulation's."""
+        ...
+
+    def watched_cameras(self) -> list[str]:
+        """Return the cameras that somebody watches, by the names that `step` takes."""
         ...
 
     def note(self, kind: str, who: str, what: str, text: str, ms: float | None = None) -> None:
@@ -73,6 +89,14 @@ class _Before(Struct):
     qvel: Any
 
 
+class _Robot(Struct):
+    """Where a robot's joint positions are: in an articulation of the recording, of which they may be a part."""
+
+    source: str
+    size: int
+    places: list[int] | None = None
+
+
 class Replay:
     """The replay of one console, at most one at a time.
 
@@ -83,31 +107,38 @@ class Replay:
     def __init__(self, console: Publisher) -> None:
         self._console = console
         self._client = console.client
-        self._name = ""
-        self._table: Table | None = None
-        self._rows: dict[str, dict[str, Floats]] = {}
-        self._times: Floats = np.zeros(1)
+        self._run: Run | None = None
+        self._robots: dict[str, _Robot] = {}
+        self._cameras: frozenset[str] = frozenset()
+        self._start = self._seconds = 0.0
         self._at = 0.0
         self._playing = False
         self._rate = 1.0
         self._before: _Before | None = None
         self._placed_at = 0.0
-        self._shown = -1.0
+        self._state: RecordedState | None = None
         self._wake = asyncio.Event()
+        self._showing = asyncio.Lock()
 
     @property
     def view(self) -> ReplayView | None:
         """Where it is, or None when nothing is replayed."""
-        if self._table is None:
+        if self._run is None:
             return None
         return ReplayView(
-            self._name, round(self._at, 3), self._seconds, self._playing, self._rate, self._before is not None
+            self._run.path.name,
+            round(self._at, 3),
+            round(self._seconds, 6),
+            self._playing,
+            self._rate,
+            self._before is not None,
+            [] if self._before is not None else sorted(self._cameras),
         )
 
     @property
     def open(self) -> bool:
         """Whether what is seen comes from a recording."""
-        return self._table is not None
+        return self._run is not None
 
     @property
     def rate(self) -> float:
@@ -115,8 +146,26 @@ class Replay:
         return self._rate if self._playing else 0.0
 
     @property
-    def _seconds(self) -> float:
-        return float(self._times[-1])
+    def at(self) -> float:
+        """Where it is, seconds from the recording's start."""
+        return self._at
+
+    def has_pictures(self, camera: str) -> bool:
+        """Return whether the pictures of a camera, `ARTICULATION/CAMERA` or `-/CAMERA`, come from the recording."""
+        return self._run is not None and self._before is None and camera in self._cameras
+
+    async def picture(self, camera: str) -> tuple[float, RecordedPicture] | None:
+        """Return a camera's picture where the replay is, and its time in seconds from the recording's start.
+
+        Raises:
+            URLabError: The file is damaged there.
+            OSError: It cannot be read.
+        """
+        run, at = self._run, self._start + self._at
+        if run is None or not self.has_pictures(camera):
+            return None
+        found = await _read(lambda: run.encoded_picture_at(camera.removeprefix(_OF_SCENE), at))
+        return found.time - self._start, found
 
     async def begin(self, file: Path, *, placing: bool = False) -> None:
         """Show a recording from its start.
@@ -128,20 +177,21 @@ class Replay:
         Raises:
             URLabError: The file is not a recording, or not of the robots that there are; or as the client raises.
         """
-        table = await anyio.to_thread.run_sync(lambda: open_run(file).table())
-        if not len(table):
-            raise URLabError(f"{file.name} holds no states.")
-        rows = {key: found for key, art in self._client.articulations.items() if (found := _rows(table, key, art))}
-        if not rows:
+        run, (start, end), names, cameras = await _read(lambda: _opened(file))
+        if not names:
+            raise URLabError(f"{file.name} holds no states of robots.")
+        robots = {key: found for key, art in self._client.articulations.items() if (found := _robot(names, key, art))}
+        if not robots:
             there = ", ".join(self._client.articulations) or "none"
             raise URLabError(f"{file.name} is a recording of other robots than there are ({there}).")
         await self.end()
-        self._name, self._table, self._rows = file.name, table, rows
-        self._times = table.time - table.time[0]
-        self._at, self._rate, self._shown = 0.0, 1.0, -1.0
+        self._run, self._robots, self._cameras = run, robots, cameras
+        self._start, self._seconds = start, end - start
+        self._at, self._rate, self._state = 0.0, 1.0, None
         if placing:
             await self._take_over()
         self._playing = True
+        await self._console.renew_pictures()
         self._wake.set()
         self._console.tell()
 
@@ -153,7 +203,7 @@ class Replay:
         Raises:
             ValueError: Nothing is replayed, or a number makes no sense.
         """
-        if self._table is None:
+        if self._run is None:
             raise ValueError("no recording is replayed")
         if rate is not None:
             if not 0.05 <= rate <= 20:
@@ -165,7 +215,7 @@ class Replay:
             if playing and at is None and self._at >= self._seconds:
                 self._at = 0.0
             self._playing = playing
-        self._show()
+        await self._show()
         await self._place()
         self._wake.set()
         self._console.tell()
@@ -173,11 +223,12 @@ class Replay:
 
     async def end(self) -> None:
         """Go back to what the server sends, and put the simulation back to where it was."""
-        if self._table is None:
+        if self._run is None:
             return
-        self._table, self._playing = None, False
-        self._console.tell()
+        self._run, self._playing = None, False
         before, self._before = self._before, None
+        await self._console.renew_pictures()
+        self._console.tell()
         data = self._client.data
         if before is not None and data is not None and data.qpos.shape == before.qpos.shape:
             data.qpos[:], data.qvel[:] = before.qpos, before.qvel
@@ -197,24 +248,30 @@ class Replay:
                 continue
             self._at = min(self._at + self._rate * (time.monotonic() - began), self._seconds)
             self._playing = self._at < self._seconds
-            self._show()
+            try:
+                await self._show()
+            except (URLabError, OSError) as error:
+                self._playing = False
+                self._console.note("error", "console", "replay", str(error))
             try:
                 await self._place()
             except URLabError as error:
                 self._before = None
+                await self._console.renew_pictures()
                 self._console.note("error", "console", "replay", str(error))
 
-    def _show(self) -> None:
-        if self._table is not None:
-            row = self._row
-            targets = {
-                key: fields["set_points"][row].tolist() for key, fields in self._rows.items() if "set_points" in fields
-            }
-            self._console.show(_snapshot(self._table, self._rows, row, float(self._times[row])), targets)
-
-    @property
-    def _row(self) -> int:
-        return max(0, int(np.searchsorted(self._times, self._at, side="right")) - 1)
+    async def _show(self) -> None:
+        async with self._showing:  # one at a time, each of the present moment: none comes after a later one
+            run, at = self._run, self._start + self._at
+            if run is None:
+                return
+            state = await _read(lambda: run.state_at(at))
+            if state is None or self._run is not run:
+                return
+            self._state = state
+            robots = {key: found for key, robot in self._robots.items() if (found := _values(state, robot))}
+            targets = {key: values.set_points.tolist() for key, values in robots.items() if len(values.set_points)}
+            self._console.show(_snapshot(state, robots, state.time - self._start), targets)
 
     # The simulation
 
@@ -234,67 +291,73 @@ class Replay:
         self._placed_at = time.monotonic()
         prefixes = {key: art.compiled_prefix for key, art in self._client.articulations.items()}
         for key, layout in articulation_layouts(model, prefixes).items():
-            fields = self._rows.get(key)
-            if fields is not None and len(fields["qpos"][self._row]) == len(layout.qpos_adr):
-                data.qpos[layout.qpos_adr] = fields["qpos"][self._row]
+            robot = self._robots.get(key)
+            values = None if robot is None or self._state is None else _values(self._state, robot)
+            if values is not None and len(values.qpos) == len(layout.qpos_adr):
+                data.qpos[layout.qpos_adr] = values.qpos
         data.qvel[:] = 0.0
-        await self._client.step(0)
+        # In mode puppet pictures come with replies alone.
+        await self._client.step(0, include_cameras=dict.fromkeys(self._console.watched_cameras(), "latest") or False)
 
 
-def _rows(table: Table, key: str, art: URLabArticulation) -> dict[str, Floats]:
-    """Return the values of an articulation by field, one row per state; empty if the recording has none of them."""
-    found = {field: table.columns[f"{key}/{field}"].values for field in _FIELDS if f"{key}/{field}" in table.columns}
-    if "qpos" in found:
-        return found if found["qpos"].shape[1] == len(art.qpos_array) else {}
-    column = table.columns.get("joints/qpos")  # as a server saves it, by compiled joints
-    picked = None if column is None else _joints(column, art)
-    return {} if picked is None else {"qpos": picked}
+async def _read(job: Callable[[], _T]) -> _T:
+    return await anyio.to_thread.run_sync(job)
 
 
-def _joints(column: Column, art: URLabArticulation) -> Floats | None:
+def _opened(file: Path) -> tuple[Run, tuple[float, float], dict[str, list[str]], frozenset[str]]:
+    run = open_run(file)
+    cameras = (name if "/" in name else _OF_SCENE + name for name in run.cameras())
+    return run, run.time_range(), run.positions(), frozenset(cameras)
+
+
+def _robot(names: Mapping[str, list[str]], key: str, art: URLabArticulation) -> _Robot | None:
+    """Return where a robot is in a recording, of which the names of joint positions are given; None if it is not."""
+    size = len(art.qpos_array)
+    if key in names:
+        return _Robot(key, size) if len(names[key]) == size else None
+    together = names.get("joints")  # as a server saves them, by compiled joints
     places: list[int] = []
     for joint in sorted(art.joints.values(), key=lambda one: one.qpos_local_offset):
         name = f"{art.compiled_prefix}_{joint.name}"
-        own = [i for i, given in enumerate(column.names) if given == name or given.rpartition(".")[0] == name]
+        own = [i for i, given in enumerate(together or ()) if given == name or given.rpartition(".")[0] == name]
         if not own:
             return None
         places += own
-    return column.values[:, places] if len(places) == len(art.qpos_array) else None
+    return _Robot("joints", size, places) if len(places) == size else None
 
 
-def _snapshot(table: Table, rows: Mapping[str, Mapping[str, Floats]], row: int, at: float) -> StateSnapshot:
+def _values(state: RecordedState, robot: _Robot) -> RecordedArticulation | None:
+    """Return a robot's values, None if it is not in the scene then, or another of its name is."""
+    found = state.articulations.get(robot.source)
+    if found is not None and robot.places is not None:
+        # Of velocities it is not known where they are among those of all joints.
+        found = replace(found, qpos=found.qpos[robot.places], qvel=np.zeros(0))
+    return found if found is not None and len(found.qpos) == robot.size else None
+
+
+def _snapshot(state: RecordedState, robots: Mapping[str, RecordedArticulation], at: float) -> StateSnapshot:
     clock = Clock(sec=int(at), nsec=int(at % 1.0 * 1e9))
-    nothing = np.zeros(0)
-    entities: dict[str, EntityState] = {}
-    for key, column in table.columns.items():
-        name, _, field = key.rpartition("/")
-        if field == "pose" and np.isfinite(column.values[row]).all():
-            pose = column.values[row]
-            entities[name] = EntityState(xpos=tuple(pose[:3].tolist()), xquat=tuple(pose[3:].tolist()), qpos=pose)
     return StateSnapshot(
         time=at,
-        step=int(table.step[row]),
+        step=state.step,
         sim_time=clock,
         wall_time=Clock(sec=0, nsec=0),
         recv_wall_time_ns=time.time_ns(),
         per_articulation={
             key: ArticulationState(
-                qpos=fields["qpos"][row],
-                qvel=fields["qvel"][row] if "qvel" in fields else nothing,
-                ctrl=fields["ctrl"][row] if "ctrl" in fields else None,
-                sensors=_sensors(table.columns.get(f"{key}/sensors"), row),
+                qpos=values.qpos,
+                qvel=values.qvel,
+                ctrl=values.ctrl if len(values.ctrl) else None,
+                sensors={name: reading.tolist() for name, reading in values.sensors.items()} or None,
             )
-            for key, fields in rows.items()
+            for key, values in robots.items()
         },
-        entities=entities,
+        entities={
+            name: EntityState(
+                xpos=tuple(entity.position.tolist()),
+                xquat=tuple(entity.orientation.tolist()),
+                qpos=np.concatenate((entity.position, entity.orientation)),
+            )
+            for name, entity in state.entities.items()
+        },
     )
-
-
-def _sensors(column: Column | None, row: int) -> dict[str, list[float]] | None:
-    if column is None:
-        return None
-    found: dict[str, list[float]] = {}
-    for name, value in zip(column.names, column.values[row].tolist(), strict=True):
-        sensor, _, index = name.rpartition(".")
-        found.setdefault(sensor if index.isdecimal() and sensor else name, []).append(value)
-    return found

@@ -134,7 +134,9 @@ class Actuator:
             value = finite_array(what, v)
             inputs = where.stop - where.start
             if value.shape != (inputs,):
-                raise ValueError(f"{what} takes {inputs} numbers, got an array of shape {value.shape}. Nothing was set")
+                raise ValueError(
+                    f"{what} takes {inputs} numbers, got an array of shape {value.shape}. Nothing was set."
+                )
         else:
             value = finite(what, v)
             where = slice(where.start, where.start + 1)
@@ -143,7 +145,7 @@ class Actuator:
         low, high = (bounds[where] for bounds in self._record.ranges())
         inside = np.clip(value, low, high)
         if out_of_range is OutOfRange.ERROR and np.any(inside != value):
-            raise ValueError(f"{what} takes {_listed(low)} to {_listed(high)}, got {v}. Nothing was set")
+            raise ValueError(f"{what} takes {_listed(low)} to {_listed(high)}, got {v}. Nothing was set.")
         return where, inside
 
     def set_point_for(self, position: float) -> float:

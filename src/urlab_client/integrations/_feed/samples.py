@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,8 +12,11 @@ from urlab_client.integrations._feed.scene_messages import CameraLayout, SceneMe
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraFrame, StateReply
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.protocol.picture_files import pillow_image
+from urlab_client.protocol.picture_files import encoded, pillow_image
 from urlab_client.protocol.pixels import Pixels, decode_camera
+
+if TYPE_CHECKING:
+    from urlab_client.randomise.variation import EpisodeDraws
 
 __all__ = ["CameraPicture", "EpisodeMark", "SampleClock", "Schedule", "State", "compressed", "picture_message"]
 
@@ -25,7 +28,8 @@ class State:
     """One state on its way to whoever keeps or shows it.
 
     `waits` says that it is the reply to a step of ours, so that the next one can wait until there is room, and `seed`
-    is that of the reset which the state is the reply to.
+    is that of the reset which the state is the reply to. `draws` are those of the episode that begins, where an
+    environment varies it over the wire; what a server varies follows from `scene` and `seed`.
     """
 
     scene: SceneMessages
@@ -36,6 +40,7 @@ class State:
     wall_ns: int
     waits: bool
     seed: int | None = None
+    draws: EpisodeDraws | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,13 +126,10 @@ class SampleClock:
 
 def compressed(pixels: Pixels, mode: str, jpeg_quality: int | None) -> bytes:
     """Return a picture of bytes as JPEG, or as PNG without a quality."""
-    target = io.BytesIO()
     image = pillow_image(pixels, mode, alpha=mode != CameraMode.REAL)
     if jpeg_quality is not None:
-        image.save(target, "JPEG", quality=jpeg_quality)
-    else:
-        image.save(target, "PNG", compress_level=1)
-    return target.getvalue()
+        return encoded(image, "JPEG", quality=jpeg_quality)
+    return encoded(image, "PNG", compress_level=1)
 
 
 def picture_message(picture: CameraPicture, stamp: Time, jpeg_quality: int | None) -> CompressedImage | RawImage:

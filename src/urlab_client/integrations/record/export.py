@@ -28,6 +28,7 @@ Progress = Callable[[int], None]
 
 _TICKS = 90_000  # per second, of MP4 time stamps
 _TICK = Fraction(1, _TICKS)
+_ROWS = 10_000
 _CODECS = ("libx264", "mpeg4")
 
 
@@ -40,8 +41,10 @@ def write_csv(run: Run, path: Path, progress: Progress | None = None, *, episode
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(flat)
-        # Python floats: those of NumPy would be written with their type.
-        writer.writerows(zip(*(column.tolist() for column in flat.values()), strict=True))
+        # Python floats: those of NumPy would be written with their type. They take more room, so some at a time.
+        for start in range(0, len(flat["time"]), _ROWS):
+            rows = slice(start, start + _ROWS)
+            writer.writerows(zip(*(column[rows].tolist() for column in flat.values()), strict=True))
     return len(flat["time"])
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from datetime import UTC, datetime
+from functools import cached_property
 from pathlib import Path
 from typing import Final
 
@@ -11,7 +12,16 @@ import numpy as np
 
 from urlab_client.integrations._feed.quantities import quantities
 from urlab_client.integrations._feed.scene_messages import SceneLayout
-from urlab_client.integrations.record.reader import Camera, Column, Run, Summary, Table, describe_topic
+from urlab_client.integrations.record.contents import (
+    Camera,
+    Column,
+    RecordedArticulation,
+    RecordedState,
+    Summary,
+    Table,
+    describe_topic,
+)
+from urlab_client.integrations.record.reader import RecordedPicture, Run
 from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.server.physics.recording import Frame, decode_json
 
@@ -36,11 +46,11 @@ def is_joint_states(path: Path) -> bool:
 class JointStatesRun(Run):
     """A recording of joint states alone: no set-points, sensors or pictures."""
 
-    def summary(self, progress: Callable[[int], None] | None = None) -> Summary:
-        """Say what is in it."""
-        del progress
+    def summary(self, progress: Callable[[int], None] | None = None, *, verify: bool = False) -> Summary:
+        """Say what is in it. Reading the file verifies it."""
+        del progress, verify
         table = self.table()
-        stamps = (table.time * _NS).astype(np.int64).tolist()
+        stamps = (table.time * _NS).astype(np.int64)
         topic = f"/{OWNER}"
         made = datetime.fromtimestamp(self.path.stat().st_mtime, UTC).isoformat(timespec="seconds")
         duration = float(table.time[-1] - table.time[0]) if len(table) else 0.0
@@ -54,10 +64,10 @@ class JointStatesRun(Run):
             episodes=int(table.episode[-1]) + 1 if len(table) else 0,
             dropped_states=0,
             dropped_frames=0,
-            topics={topic: describe_topic(topic, "joint states", stamps)} if stamps else {},
+            topics={topic: describe_topic(topic, "joint states", stamps)} if len(stamps) else {},
         )
 
-    def table(self, progress: Callable[[int], None] | None = None) -> Table:
+    def table(self, progress: Callable[[int], None] | None = None, *, fields: Collection[str] | None = None) -> Table:
         """Return all states, with the columns `joints/qpos` and `joints/qvel`; values are named as compiled joints are.
 
         Raises:
@@ -79,7 +89,7 @@ class JointStatesRun(Run):
                 for name, slices in names.items()
                 for part in _parts(kinds, slices[0 if field == "qpos" else 1])
             ]
-            if labels:
+            if labels and (fields is None or field in fields):
                 values = np.full((len(frames), len(labels)), np.nan)
                 for row, frame in enumerate(frames):
                     given = _values(frame, field)
@@ -95,13 +105,60 @@ class JointStatesRun(Run):
             columns=columns,
         )
 
+    @cached_property
+    def whole(self) -> Table:
+        """All states, read once: a JSON file has no index."""
+        return self.table()
+
+    def time_range(self) -> tuple[float, float]:
+        """Return the times of the first and of the last state, seconds; 0, 0 without states."""
+        times = self.whole.time
+        return (float(times[0]), float(times[-1])) if len(times) else (0.0, 0.0)
+
+    def state_at(self, time: float) -> RecordedState | None:
+        """Return the newest state that is not after a time, None without any; all joints are one articulation."""
+        table = self.whole
+        row = int(np.searchsorted(table.time, time, side="right")) - 1
+        if row < 0:
+            return None
+        nothing = np.zeros(0)
+        values = {name.rpartition("/")[2]: column.values[row] for name, column in table.columns.items()}
+        joints = RecordedArticulation(
+            values.get("qpos", nothing), values.get("qvel", nothing), nothing, nothing, nothing, {}
+        )
+        return RecordedState(
+            time=float(table.time[row]),
+            sim_time=float(table.sim_time[row]),
+            wall_ns=int(table.wall_ns[row]),
+            step=int(table.step[row]),
+            episode=int(table.episode[row]),
+            articulations={OWNER: joints},
+            entities={},
+        )
+
+    def positions(self) -> dict[str, list[str]]:
+        """Return the names of the values of `qpos`, which are those of compiled joints."""
+        column = self.whole.columns.get(f"{OWNER}/qpos")
+        return {} if column is None else {OWNER: column.names}
+
     def cameras(self) -> list[str]:
         """Return nothing: the file holds no pictures."""
         return []
 
     def frames(self, camera: str, progress: Callable[[int], None] | None = None) -> Iterator[Camera]:
         """Raise `KeyError`: the file holds no pictures."""
-        raise KeyError(f"no pictures of {camera!r} in {self.path}: a recording of the server holds joint states alone")
+        raise self._no_pictures(camera)
+
+    def picture_at(self, camera: str, time: float) -> Camera | None:
+        """Raise `KeyError`: the file holds no pictures."""
+        raise self._no_pictures(camera)
+
+    def encoded_picture_at(self, camera: str, time: float) -> RecordedPicture:
+        """Raise `KeyError`: the file holds no pictures."""
+        raise self._no_pictures(camera)
+
+    def _no_pictures(self, camera: str) -> KeyError:
+        return KeyError(f"no pictures of {camera!r} in {self.path}: a recording of the server holds joint states alone")
 
 
 def _parts(kinds: dict[int, tuple[str, ...]], where: slice) -> tuple[str, ...]:

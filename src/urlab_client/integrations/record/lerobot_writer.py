@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from urlab_client.integrations.record.contents import Table
 from urlab_client.integrations.record.pixels import even, farthest, visible
-from urlab_client.integrations.record.reader import Run, Table
+from urlab_client.integrations.record.reader import Run
 from urlab_client.integrations.record.transitions import GOAL, Episodes, transitions_of
 from urlab_client.integrations.record.writer import RecordingError
 

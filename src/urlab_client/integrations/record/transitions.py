@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client.integrations._feed.messages import OutcomeMessage
-from urlab_client.integrations.record.reader import Column, Run, Table
+from urlab_client.integrations.record.contents import Column, Table
+from urlab_client.integrations.record.reader import Run
 
 __all__ = ["GOAL", "Episodes", "transitions", "transitions_of"]
 

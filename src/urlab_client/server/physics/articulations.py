@@ -57,6 +57,7 @@ class Articulations:
                 for name, index in _named(scene, dialect)
             }
         )
+        self._steered = [control for control in self.controls.values() if control.controller is not None]
         self._folded = _folded(self.controls, dialect)
         self._names = {control: name for name, control in self.controls.items()}
         self.names: Mapping[str, str] = {control.index.key: name for name, control in self.controls.items()}
@@ -171,7 +172,7 @@ class Articulations:
 
     def any_controlled(self, raw: Container[ArticulationControl]) -> bool:
         """Whether a controller computes the controls of any articulation, where those in `raw` bypass theirs."""
-        return any(control.controlled(raw=control in raw) for control in self.controls.values())
+        return bool(self._steered) and any(control.controlled(raw=control in raw) for control in self._steered)
 
     def apply_controls(self, raw: Container[ArticulationControl] = ()) -> None:
         """Write `mjData.ctrl` from set-points and controllers; those of the articulations in `raw` are bypassed."""

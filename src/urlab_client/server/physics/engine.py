@@ -10,7 +10,7 @@ import logging
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Collection, Generator, Mapping
 from contextlib import contextmanager
 from types import MappingProxyType, TracebackType
 from typing import Any, Final, Self, TypeVar
@@ -23,7 +23,7 @@ from urlab_client.protocol.messages.session import Step
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.physics.articulations import Articulations
-from urlab_client.server.physics.controllers import ControllerConfig
+from urlab_client.server.physics.controllers import ArticulationControl, ControllerConfig
 from urlab_client.server.physics.data_lock import DataLock, MujocoCall, Overdue, busy
 from urlab_client.server.physics.hooks import Hook, Snapshots, call_hooks
 from urlab_client.server.physics.integrator import Integrator, shutting_down
@@ -415,10 +415,13 @@ class Engine:
         if self._player is not None:
             self._play(self._player, request.n_steps)
             return
-        commands = request.per_articulation or {}
-        self.articulations.stage_positional(commands)
-        raw = self.articulations.stage_named(commands)
-        pushed = self.articulations.apply_wrenches(commands)
+        commands = request.per_articulation
+        raw: Collection[ArticulationControl] = ()
+        pushed: list[int] = []
+        if commands:
+            self.articulations.stage_positional(commands)
+            raw = self.articulations.stage_named(commands)
+            pushed = self.articulations.apply_wrenches(commands)
         n_steps = max(1, request.n_steps)
         try:
             self._integrator.advance(n_steps, raw)

@@ -21,23 +21,40 @@ from urlab_client.server.compile.scene_index import EntityIndex
 from urlab_client.server.physics.channels import SCENE, UserChannels
 from urlab_client.server.physics.controllers import ArticulationControl
 
-__all__ = ["Observer", "sim_clock", "wall_clock"]
+__all__ = ["Observer", "sim_clock", "sim_seconds", "wall_clock", "wall_seconds"]
 
 INT32_MAX = 2**31 - 1
 
 
-def sim_clock(seconds: float) -> Clock:
-    """Split a time in seconds into integers, truncating; what no 32-bit second can hold reads as the nearest one."""
+def sim_seconds(seconds: float) -> tuple[int, int]:
+    """Split a time in seconds into whole ones and nanoseconds, truncating.
+
+    What no 32-bit second can hold reads as the nearest one.
+    """
+    if -INT32_MAX <= seconds <= INT32_MAX:
+        sec = int(seconds)
+        return sec, int((seconds - sec) * 1e9)
     if not math.isfinite(seconds):
-        return Clock(sec=0, nsec=0)
-    sec = max(-INT32_MAX, min(INT32_MAX, int(seconds)))
-    return Clock(sec=sec, nsec=int((seconds - sec) * 1e9) if abs(seconds) <= INT32_MAX else 0)
+        return 0, 0
+    return (INT32_MAX if seconds > 0 else -INT32_MAX), 0
+
+
+def wall_seconds() -> tuple[int, int]:
+    """Return UTC now as whole seconds and nanoseconds, a multiple of 100."""
+    sec, nsec = divmod(time.time_ns(), 1_000_000_000)
+    return sec, nsec - nsec % 100
+
+
+def sim_clock(seconds: float) -> Clock:
+    """Return a time in seconds, split as `sim_seconds` does."""
+    sec, nsec = sim_seconds(seconds)
+    return Clock(sec=sec, nsec=nsec)
 
 
 def wall_clock() -> Clock:
     """Return UTC now; `nsec` is a multiple of 100."""
-    sec, nsec = divmod(time.time_ns(), 1_000_000_000)
-    return Clock(sec=sec, nsec=nsec - nsec % 100)
+    sec, nsec = wall_seconds()
+    return Clock(sec=sec, nsec=nsec)
 
 
 class _StateReader:

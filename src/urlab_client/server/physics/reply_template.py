@@ -24,13 +24,14 @@ from urlab_client.protocol.enums import ObservationLevel
 from urlab_client.protocol.messages.session import Clock, StepOk
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.physics.controllers import ArticulationControl, Twist
-from urlab_client.server.physics.observe import Observer, sim_clock, wall_clock
+from urlab_client.server.physics.observe import Observer, sim_seconds, wall_seconds
 
 __all__ = ["StepReplies"]
 
 Floats = NDArray[np.float64]
 
 _FLOAT64: Final = b"\xcb"
+_BIG_ENDIAN: Final = np.dtype(">f8")
 _MARK: Final = 2.0**52
 """The first mark: whole, so that it also fits where integers go, and as good as never a constant of a reply."""
 
@@ -70,8 +71,7 @@ class StepReplies:
         template = self._templates.get(level)
         if template is None:
             template = self._templates[level] = self._cut(level)
-        sim, wall = sim_clock(time), wall_clock()
-        numbers = [time, step, sim.sec, sim.nsec, wall.sec, wall.nsec, frame_id]
+        numbers = [time, step, *sim_seconds(time), *wall_seconds(), frame_id]
         for twist in self._twists:
             numbers += (twist.vx, twist.vy, twist.yaw_rate, twist.actions)
         return template.fill(numbers)
@@ -113,30 +113,27 @@ class _ReplyTemplate:
         """
         places, numbers = _find_marks(marked, scalars + sum(map(len, sources)))
         # Arrays that this reply shows nothing of are not read.
-        self._sources: list[Floats] = []
+        self._sources: list[memoryview] = []
         kept = np.arange(scalars)
         first = scalars
         for source in sources:
             indices = np.arange(first, first + len(source))
             first += len(source)
             if np.isin(indices, numbers).any():
-                self._sources.append(source)
+                self._sources.append(source.data.cast("B"))
                 kept = np.concatenate((kept, indices))
         self._places = places
         self._order = np.searchsorted(kept, numbers)
-        self._numbers = np.zeros(len(kept))
-        self._scalars = self._numbers[:scalars]
-        self._arrays = self._numbers[scalars:]
+        self._pack = struct.Struct(f"={scalars}d").pack
         self._frame = np.frombuffer(bytearray(marked), np.uint8)
-        # The eight bytes from each byte on as a number, so that one assignment writes all of them.
-        self._overlay: Floats = np.ndarray(max(0, len(marked) - 7), ">f8", self._frame, strides=(1,))
+        # The eight bytes from each byte on as a word, so that one assignment writes all of them.
+        self._overlay: NDArray[np.uint64] = np.ndarray(max(0, len(marked) - 7), np.uint64, self._frame, strides=(1,))
 
     def fill(self, scalars: Sequence[float]) -> bytes:
         """Return the bytes with the numbers of now."""
-        self._scalars[:] = scalars
-        if self._sources:
-            np.concatenate(self._sources, out=self._arrays)
-        self._overlay[self._places] = self._numbers[self._order]
+        numbers = np.frombuffer(b"".join((self._pack(*scalars), *self._sources)))
+        # Swapped before they are scattered, which takes longer for numbers of foreign byte order.
+        self._overlay[self._places] = numbers[self._order].astype(_BIG_ENDIAN).view(np.uint64)
         return self._frame.tobytes()
 
 

@@ -206,7 +206,7 @@ class Dispatcher:
         """Wait for one's turn and return the lock to release after it."""
         while True:
             lock = self._lock
-            if lock.acquire(timeout=RENEWED_S):
+            if lock.acquire(blocking=False) or lock.acquire(timeout=RENEWED_S):
                 if lock is self._lock:
                     return lock
                 lock.release()

@@ -1,7 +1,9 @@
 // Cameras: one WebSocket each while it is looked at. The console sends the next picture when the last one is shown.
+// During a replay they show the recorded pictures of its moment; what the recording lacks stays live, and says so.
 
 import { $, duration, h, text } from "./dom.js";
 import { clock, on, socketAt } from "./link.js";
+import { clockTime } from "./recording.js";
 
 const views = new Map();
 
@@ -10,10 +12,12 @@ class CameraView {
     this.camera = camera;
     this.image = h("canvas", { width: camera.width, height: camera.height });
     this.note = h("span", { class: "num" }, "waiting");
+    this.origin = h("span", { class: "origin" });
+    this.replay = null;
     this.state = h("span", { class: "waiting" }, "No picture yet. Cameras send while physics runs live.");
     this.element = h("figure", { class: "camera", "data-camera": camera.path },
       h("div", { class: "frame", onclick: () => this.element.classList.toggle("large") }, this.image, this.state),
-      h("figcaption", {}, h("b", {}, `${owner ? `${owner} / ` : ""}${camera.name}`), h("span", { class: "tag" }, camera.mode), h("span", { class: "still-live" }, "live, not the replay"),
+      h("figcaption", {}, h("b", {}, `${owner ? `${owner} / ` : ""}${camera.name}`), h("span", { class: "tag" }, camera.mode), this.origin,
         h("span", { class: "space" }), this.note));
     this.frames = [];
     this.closed = false;
@@ -34,7 +38,7 @@ class CameraView {
       }
       this.image.getContext("2d").drawImage(bitmap, 0, 0);
       bitmap.close();
-      this.state.hidden = true;
+      this.label();
       this.frames = [...this.frames.filter((at) => at > performance.now() - 1000), performance.now()];
       if (socket.readyState === WebSocket.OPEN) socket.send("shown");
     };
@@ -51,8 +55,22 @@ class CameraView {
     socket?.close();
   }
 
+  /** Say whether the picture is the recording's; one that is left from a replay that has ended is covered. */
+  label() {
+    const recorded = this.head?.recorded ?? false;
+    const live = this.replay !== null && !this.replay.placing && !recorded && !this.replay.cameras.includes(this.camera.path);
+    this.element.classList.toggle("still-live", live);
+    text(this.origin, live ? "live, not recorded" : recorded && this.replay ? "recorded" : "");
+    this.state.hidden = this.head !== undefined && (this.replay !== null || !recorded);
+  }
+
   tick() {
     if (!this.head) return;
+    if (this.head.recorded) {
+      text(this.note, this.replay ? `at ${clockTime(this.head.sim_time)}` : "waiting");
+      this.note.classList.remove("old");
+      return;
+    }
     const age = Date.now() + clock.offset - this.head.received;
     const rate = this.frames.filter((at) => at > performance.now() - 1000).length;
     text(this.note, age > 1500 ? `${duration(age)} old` : `${rate} fps · ${duration(age)}`);
@@ -87,6 +105,12 @@ export function makeCameras() {
       grid.append(view.element);
     }
     $("cameras").classList.toggle("empty", wanted.size === 0);
+  });
+  on("status", ({ replay }) => {
+    for (const view of views.values()) {
+      view.replay = replay;
+      view.label();
+    }
   });
   setInterval(() => views.forEach((view) => view.tick()), 250);
 }

@@ -102,6 +102,25 @@ export async function ask(method, path, body, { quiet = false } = {}) {
   return null;
 }
 
+/** Put a file there, and tell how much of it is on its way, 0 to 1; a failure becomes a toast and null. */
+export function upload(path, file, told) {
+  return new Promise((done) => {
+    const request = new XMLHttpRequest();
+    request.open("PUT", new URL(path, base));
+    request.setRequestHeader("x-urlab-viewer", me.viewer);
+    request.responseType = "json";
+    request.upload.onprogress = ({ loaded, total }) => told(loaded / total);
+    request.onerror = () => done(toast("The console does not answer.") ?? null);
+    request.onload = () => {
+      if (request.status < 300) return done(request.response ?? {});
+      const { error } = request.response ?? {};
+      toast([error?.message ?? request.statusText, error?.hint].filter(Boolean).join(" "));
+      done(null);
+    };
+    request.send(file);
+  });
+}
+
 export const op = (name, body = {}, options) => ask("POST", `api/ops/${name}`, body, options);
 
 const pending = new Map();

@@ -1,13 +1,16 @@
 // Recordings: making them, and the files: download in several kinds, replay, upload, removal.
 
 import { $, confirmed, h, number, text, toast } from "./dom.js";
-import { ask, on } from "./link.js";
+import { ask, on, upload } from "./link.js";
 
 const record = h("button", { id: "record", onclick: toggle }, "● Record");
 const cameras = h("input", { type: "checkbox", id: "record-cameras", checked: true });
 const progress = h("span", { class: "num", id: "record-progress" });
 const list = h("div", { class: "recordings", id: "recordings" });
-const file = h("input", { type: "file", accept: ".mcap,.json", hidden: true, onchange: upload });
+const file = h("input", { type: "file", accept: ".mcap,.json", hidden: true, onchange: open });
+const OPEN = "Open a file …";
+const opener = h("button", { class: "quiet", id: "upload", onclick: () => file.click() }, OPEN);
+const DOWNLOAD = "Download";
 let folder = "";
 
 export function bytes(count) {
@@ -16,8 +19,15 @@ export function bytes(count) {
   return `${(count / 1024 ** power).toFixed(power ? 1 : 0)} ${units[power]}`;
 }
 
-export const clockTime = (seconds) =>
-  seconds < 60 ? `${seconds.toFixed(2)} s` : `${Math.floor(seconds / 60)}:${(seconds % 60).toFixed(1).padStart(4, "0")} min`;
+/** Seconds for people: 12.34 s, 3:05.1 min, 7:59:59 h. */
+export function clockTime(seconds) {
+  if (seconds < 60) return `${seconds.toFixed(2)} s`;
+  const tenths = Math.floor(seconds * 10);
+  const minutes = Math.floor(tenths / 600);
+  if (minutes < 60) return `${minutes}:${((tenths % 600) / 10).toFixed(1).padStart(4, "0")} min`;
+  const two = (value) => String(Math.floor(value)).padStart(2, "0");
+  return `${Math.floor(minutes / 60)}:${two(minutes % 60)}:${two((tenths % 600) / 10)} h`;
+}
 
 let running = false;
 async function toggle() {
@@ -30,11 +40,15 @@ async function toggle() {
   record.disabled = false;
 }
 
-async function upload() {
+async function open() {
   const [chosen] = file.files;
   if (!chosen) return;
-  if (await ask("PUT", at(chosen.name), chosen)) toast(`${chosen.name} is here.`, "good");
+  opener.disabled = true;
+  const made = await upload(at(chosen.name), chosen, (share) => text(opener, `Opening … ${Math.floor(share * 100)} %`));
+  if (made) toast(`${chosen.name} is here.`, "good");
   file.value = "";
+  opener.disabled = false;
+  text(opener, OPEN);
   refresh();
 }
 
@@ -44,23 +58,31 @@ function row(recording) {
   const { name } = recording;
   const when = new Date(recording.at * 1000).toLocaleString([], { dateStyle: "short", timeStyle: "short" });
   const kinds = h("div", { class: "kinds" });
-  const menu = h("details", { class: "menu" }, h("summary", { "aria-label": `Download ${name}` }, "Download"), kinds);
+  const menu = h("details", { class: "menu" }, h("summary", { "aria-label": `Download ${name}` }, DOWNLOAD), kinds);
   const link = (label, query) => h("a", { href: at(name) + query, download: "", class: "kind" }, label);
   menu.addEventListener("toggle", async () => {
     if (!menu.open || kinds.childElementCount) return;
     const own = name.endsWith(".json") ? "JSON" : "MCAP";
     kinds.append(link(`${own}, as recorded`, ""), link("CSV, states as a table", "?as=csv"), link("NPZ, NumPy arrays", "?as=npz"));
     const about = await ask("GET", `${at(name)}?as=about`);
-    for (const camera of about?.cameras ?? []) {
+    const missing = about?.unavailable.mp4;
+    for (const camera of missing ? [] : about?.cameras ?? []) {
       kinds.append(link(`MP4, ${camera}`, `?as=mp4&camera=${encodeURIComponent(camera)}`));
     }
+    if (missing && about.cameras.length) kinds.append(h("p", { class: "hint" }, `MP4: ${missing}`));
   });
+  const replay = h("button", { class: "replay", "aria-label": `Replay ${name}`, onclick: async () => {
+    replay.disabled = true;
+    text(replay, "Opening …");
+    await ask("POST", "api/replay", { name });
+    text(replay, "▶ Replay");
+    replay.disabled = false;
+  } }, "▶ Replay");
   return h("div", { class: "recorded", "data-recording": name },
     h("span", { class: "name", title: name }, name.replace(/\.mcap$/, "")),
     h("span", { class: "hint" }, `${when} · ${bytes(recording.bytes)}`),
     h("span", { class: "line" },
-      h("button", { class: "replay", "aria-label": `Replay ${name}`, onclick: () => ask("POST", "api/replay", { name }) }, "▶ Replay"),
-      menu,
+      replay, menu,
       confirmed({ class: "quiet", "aria-label": `Delete ${name}` }, "Delete", "Delete?", async () => {
         if (await ask("DELETE", at(name))) refresh();
       })));
@@ -81,7 +103,7 @@ async function refresh() {
 export function makeRecording() {
   $("recording").append(h("h2", {}, "Recordings"),
     h("div", { class: "line" }, record, h("label", { class: "check" }, cameras, " with cameras"), progress,
-      h("span", { class: "space" }), h("button", { class: "quiet", id: "upload", onclick: () => file.click() }, "Open a file …"), file),
+      h("span", { class: "space" }), opener, file),
     list);
   on("open", refresh);
   on("log", ({ entries }) => entries.some((entry) => /recording|record/.test(entry.what)) && refresh());
@@ -90,6 +112,10 @@ export function makeRecording() {
     text(record, running ? "■ Stop recording" : "● Record");
     record.classList.toggle("danger", running);
     cameras.disabled = running;
+    for (const one of list.querySelectorAll("[data-recording]")) {
+      const making = status.conversions.find((conversion) => conversion.name === one.dataset.recording);
+      text(one.querySelector("summary"), making ? `Preparing ${making.kind.toUpperCase()} … ${Math.floor(making.share * 100)} %` : DOWNLOAD);
+    }
     progress.classList.toggle("old", running && status.recording.failed);
     text(progress, !running ? "" : status.recording.failed ? "cannot be written" : `${number(status.recording.seconds, 1).trim()} s · ${bytes(status.recording.bytes)}`);
   });

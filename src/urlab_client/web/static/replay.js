@@ -6,14 +6,14 @@ import { clockTime } from "./recording.js";
 
 const PACES = [0.1, 0.25, 0.5, 1, 2, 4];
 const line = h("input", { id: "timeline", type: "range", min: 0, max: 1, step: "any", value: 0, oninput: () => seek(+line.value),
-  "aria-label": "Place in the recording, seconds" });
+  onkeydown: keys, "aria-label": "Place in the recording, seconds", title: "← → by 0.1 s, with Shift by 10 s" });
 const name = h("b", { class: "name" });
 const where = h("span", { class: "num", id: "replay-time" });
 const play = h("button", { id: "replay-play", onclick: toggleReplay }, "▶");
 const pace = h("select", { "aria-label": "Pace of the replay", onchange: () => ask("POST", "api/replay", { rate: +pace.value }) },
   PACES.map((rate) => h("option", { value: rate }, `${rate}×`)));
 const placing = h("button", { class: "quiet", id: "placing", title: "Place the robots of the simulation, too: its cameras follow, its mode is puppet meanwhile",
-  onclick: () => ask("POST", "api/replay", { name: replay.name, placing: !replay.placing }) }, "Move the simulation, too");
+  onclick: () => ask("POST", "api/replay", { ...replay, placing: !replay.placing }) }, "Move the simulation, too");
 let replay = null;
 let wanted = null;
 let seeking = false;
@@ -39,6 +39,15 @@ async function seek(to) {
   seeking = false;
 }
 
+/** A browser's own step would be a hundredth of the recording, which is minutes in a long one. */
+function keys(event) {
+  const way = { ArrowLeft: -1, ArrowDown: -1, ArrowRight: 1, ArrowUp: 1 }[event.key];
+  if (way === undefined) return;
+  event.preventDefault();
+  line.value = (wanted ?? replay.time) + way * (event.shiftKey ? 10 : 0.1);
+  seek(+line.value);
+}
+
 export function makeReplay() {
   $("replay").append(h("span", { class: "tag" }, "Replay"), name, play, line, where, pace, placing,
     h("button", { id: "replay-end", class: "primary", onclick: () => ask("DELETE", "api/replay") }, "Back to live"));
@@ -46,7 +55,8 @@ export function makeReplay() {
     replay = status.replay;
     $("replay").hidden = replay === null;
     document.body.classList.toggle("replaying", replay !== null);
-    document.body.classList.toggle("cameras-live", replay !== null && !replay.placing);
+    // What drives the simulation would do so unseen.
+    for (const part of ["#robots", "#teleop", ".more"]) document.querySelector(part).inert = replay !== null;
     if (!replay) return;
     text(name, replay.name.replace(/\.mcap$/, ""));
     text(play, replay.playing ? "❚❚" : "▶");

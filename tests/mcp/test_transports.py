@@ -22,11 +22,11 @@ from urlab_client._installation import install_command
 from urlab_client.aio import URLabClient
 from urlab_client.cli import main
 from urlab_client.mcp import Agent
-from urlab_client.mcp.doors import http_application
+from urlab_client.mcp.transports import http_application
 from urlab_client.server import SimulatedServer
 from urlab_client.web import Access, app
 
-TOKEN = "what only the agent's host knows"
+TOKEN, ANOTHER = "what only the agent's host knows", "what only another agent's host knows"
 
 
 async def test_an_agent_starts_the_command_and_drives(tmp_path: Path) -> None:
@@ -86,13 +86,13 @@ async def test_over_http_a_token_is_needed_which_is_not_the_console_s() -> None:
             access = Access()
             site = app(client, access=access)
             agent = Agent(site, ALL)
-            application = http_application(agent, site, Access(keys=[TOKEN]))
+            application = http_application(agent, site, Access(keys=[TOKEN, ANOTHER]))
             async with site.router.lifespan_context(site), served(application) as http:
                 assert (await http.post("/mcp")).json()["error"]["code"] == "no_key"
                 bearer = {"authorization": f"Bearer {TOKEN}"}
                 for name, value in (("host", "evil.example"), ("origin", "http://evil.example")):
-                    refused = await http.post("/mcp", headers={**bearer, name: value})
-                    assert (refused.status_code, refused.json()["error"]["code"]) == (403, f"bad_{name}")
+                    answer = await http.post("/mcp", headers={**bearer, name: value})
+                    assert (answer.status_code, answer.json()["error"]["code"]) == (403, f"bad_{name}")
                 assert (await http.get("/api/world", headers=bearer)).status_code == 401
                 key = access.admit(access.invite())
                 assert (await http.get("/api/world", headers={"authorization": f"Bearer {key}"})).status_code == 200
@@ -113,6 +113,12 @@ async def test_over_http_a_token_is_needed_which_is_not_the_console_s() -> None:
                     ran = await mcp.call_tool("run", {"seconds": 1}, progress_callback=progress)
                     assert not ran.is_error, text_of(ran)
                     assert told == sorted(told)
+                    async with httpx2.AsyncClient(headers={"authorization": f"Bearer {ANOTHER}"}) as theirs:
+                        transport = streamable_http_client(f"{http.base_url}/mcp", http_client=theirs)
+                        async with Client(transport) as other:
+                            refused = await other.call_tool("run", {"steps": 1})
+                            assert "agent 1 (mcp) has the controls" in text_of(refused)
+                            assert not (await other.call_tool("state", {"robot": "arm"})).is_error
                     assert "urlab://log" in {str(one.uri) for one in (await mcp.list_resources()).resources}
 
 
@@ -124,6 +130,7 @@ async def test_over_http_a_token_is_needed_which_is_not_the_console_s() -> None:
         (["sim://arm", "--handshake", "file"], "not for sim://MODEL"),
         (["tcp://localhost"], "takes a server over from nobody. Pass --handshake FILE"),
         (["tcp://localhost", "--handshake", "file", "--allow-drive"], "leave out"),
+        (["sim://arm", "--agents", "2"], "is for --http"),
         (["tcp://localhost", "--handshake", "file", "--step-mode", "live"], "the driving client's to choose"),
     ],
 )

@@ -1,0 +1,64 @@
+"""The rasteriser by itself: MuJoCo draws one scene again and again, and reads the pixels, with nothing around it.
+
+Run as a script by the row that measures drawing, in a process of its own, because a context of OpenGL would change what
+other rows measure. It leaves out what the server does in the quality `fast`: shadows, reflections, smooth edges, the
+blending of mipmaps, and half the slices of round shapes.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+import time
+from typing import Any
+
+import mujoco
+import numpy as np
+
+
+def _fast(renderer: Any) -> None:
+    gl: Any = importlib.import_module("OpenGL.GL")  # after the context, whose module chooses its platform
+    for texture, kind in zip(renderer.texture, renderer.textureType, strict=True):
+        if texture:
+            flat = kind == mujoco.mjtTexture.mjTEXTURE_2D
+            target = gl.GL_TEXTURE_2D if flat else gl.GL_TEXTURE_CUBE_MAP
+            gl.glBindTexture(target, int(texture))
+            sampling = gl.GL_LINEAR_MIPMAP_NEAREST if flat else gl.GL_LINEAR
+            gl.glTexParameteri(target, gl.GL_TEXTURE_MIN_FILTER, sampling)
+
+
+def _main(backend: str, path: str, camera: str, width: int, height: int) -> None:
+    context = importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
+    context.make_current()
+    model = mujoco.MjModel.from_binary_path(path)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    quality = model.vis.quality
+    quality.offsamples = quality.shadowsize = 0
+    quality.numslices, quality.numstacks = 16, 8
+    view = mujoco.MjvCamera()
+    view.type = mujoco.mjtCamera.mjCAMERA_FIXED
+    view.fixedcamid = model.camera(camera).id
+    scene, option = mujoco.MjvScene(model, 10_000), mujoco.MjvOption()
+    mujoco.mjv_updateScene(model, data, option, None, view, mujoco.mjtCatBit.mjCAT_ALL.value, scene)
+    scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+    renderer: Any = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, renderer)
+    _fast(renderer)
+    area, pixels = mujoco.MjrRect(0, 0, width, height), np.empty((height, width, 3), np.uint8)
+    for line in sys.stdin:
+        times: list[float] = []
+        busy = time.process_time()
+        for _ in range(int(line)):
+            started = time.perf_counter()
+            mujoco.mjr_render(area, scene, renderer)
+            mujoco.mjr_readPixels(pixels, None, area, renderer)
+            times.append(time.perf_counter() - started)
+        print(json.dumps([times, time.process_time() - busy]), flush=True)
+    renderer.free()
+    context.free()
+
+
+if __name__ == "__main__":
+    _main(sys.argv[1], sys.argv[2], sys.argv[3], int(sys.argv[4]), int(sys.argv[5]))

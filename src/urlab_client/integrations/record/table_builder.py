@@ -1,0 +1,157 @@
+"""States one after the other to a table, in arrays that grow: an overnight recording holds millions."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from urlab_client.integrations._feed.quantities import component_name, quantities
+from urlab_client.integrations._feed.scene_messages import SceneLayout
+from urlab_client.integrations.record.contents import Column, Table
+from urlab_client.protocol.base import Floats
+
+__all__ = ["Number", "SampleTimes", "TableBuilder"]
+
+Number: TypeAlias = float | Literal["NaN", "Infinity", "-Infinity"]
+"""A number as it is read: what JSON lacks is text."""
+
+
+class SampleTimes(NamedTuple):
+    """When a sample was taken: see `Table`, in nanoseconds and seconds."""
+
+    log_ns: int
+    sim_time: float
+    wall_ns: int
+    step: int
+    episode: int
+
+
+class _Values:
+    """Rows of one field, of one width; those that have none are NaN."""
+
+    def __init__(self) -> None:
+        self.width = 0
+        self._numbers = array("d")
+
+    def put(self, row: int, values: Sequence[Number]) -> None:
+        if len(values) > self.width:
+            self._widen(len(values))
+        numbers = array("d", map(float, values))
+        self._fill(row * self.width)
+        self._numbers.extend(numbers)
+        self._fill((row + 1) * self.width)
+
+    def rows(self, count: int) -> Floats:
+        """Return the first rows as an array."""
+        self._fill(count * self.width)
+        return np.frombuffer(self._numbers, np.float64)[: count * self.width].reshape(count, self.width)
+
+    def _fill(self, size: int) -> None:
+        missing = size - len(self._numbers)
+        if missing > 0:
+            self._numbers.extend(array("d", [np.nan]) * missing)
+
+    def _widen(self, width: int) -> None:
+        if self._numbers:
+            rows = len(self._numbers) // self.width
+            wider = np.full((rows, width), np.nan)
+            wider[:, : self.width] = np.frombuffer(self._numbers, np.float64).reshape(rows, self.width)
+            self._numbers = array("d", wider.tobytes())
+        self.width = width
+
+
+@dataclass(slots=True)
+class _Source:
+    """Samples of one articulation or entity."""
+
+    layout: SceneLayout
+    samples: array[int] = field(default_factory=lambda: array("q"))
+    fields: dict[str, _Values] = field(default_factory=dict[str, _Values])
+    names: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
+
+
+class TableBuilder:
+    """Makes one table. Samples come in their order, each in as many parts as it has articulations and entities.
+
+    Args:
+        only: Fields to keep, such as `qpos`; None keeps all.
+    """
+
+    def __init__(self, only: Collection[str] | None = None) -> None:
+        self._only = only
+        self._samples = array("q")
+        self._times: tuple[array[float], ...] = tuple(array(kind) for kind in ("q", "d", "q", "q", "q"))
+        self._sources: dict[str, _Source] = {}
+
+    def source(self, key: str, layout: SceneLayout) -> _Source:
+        """Return the samples of an articulation or entity up to now."""
+        return self._sources.setdefault(key, _Source(layout))
+
+    def add(self, source: _Source, sample: int, times: SampleTimes, **fields: Sequence[Number]) -> None:
+        """Add a part of a sample."""
+        if not self._samples or sample != self._samples[-1]:
+            self._samples.append(sample)
+            for column, value in zip(self._times, times, strict=True):
+                column.append(value)
+        row = len(source.samples)
+        source.samples.append(sample)
+        for name, values in fields.items():
+            if values and (self._only is None or name in self._only):
+                source.fields.setdefault(name, _Values()).put(row, values)
+
+    def build(self, *, broken_off: bool) -> Table:
+        """Return the table, without the last sample if that is not whole."""
+        count = len(self._samples)
+        if broken_off and count > 1 and self._last_is_partial():
+            count -= 1
+        samples = np.frombuffer(self._samples, np.int64)[:count] if count else np.zeros(0, np.int64)
+        log_ns, sim_time, wall_ns, step, episode = (np.array(column[:count]) for column in self._times)
+        columns: dict[str, Column] = {}
+        for key, source in self._sources.items():
+            own = np.array(source.samples, dtype=np.int64)
+            kept = int((own <= samples[-1]).sum()) if count else 0
+            places = np.searchsorted(samples, own[:kept])
+            for name, values in source.fields.items():
+                columns[f"{key}/{name}"] = _column(source, name, values.rows(kept), places, count)
+        return Table(
+            time=log_ns.astype(np.int64) / 1e9,
+            sim_time=sim_time.astype(np.float64),
+            wall_ns=wall_ns.astype(np.int64),
+            step=step.astype(np.int64),
+            episode=episode.astype(np.int64),
+            columns=columns,
+        )
+
+    def _last_is_partial(self) -> bool:
+        """Return whether one that is in the sample before is not in the last."""
+        last, before = self._samples[-1], self._samples[-2]
+        went_on = [source.samples for source in self._sources.values() if before in source.samples[-2:]]
+        return any(samples[-1] != last for samples in went_on)
+
+
+def _column(source: _Source, name: str, rows: Floats, places: NDArray[np.intp], count: int) -> Column:
+    width = rows.shape[1]
+    if len(rows) == count:
+        values = rows
+    else:
+        values = np.full((count, width), np.nan)
+        values[places] = rows
+    layout = source.layout
+    known = {
+        "qpos": layout.qpos,
+        "qvel": layout.qvel,
+        "ctrl": layout.ctrl,
+        "set_points": layout.ctrl,
+        "act": layout.act,
+        **source.names,
+    }
+    names = known.get(name, [])
+    if len(names) != width:
+        names = [str(i) for i in range(width)]
+    labels = [component_name(layout, value) for value in names] if name == "sensors" else names
+    return Column(names, values, quantities(layout, name, names), labels)

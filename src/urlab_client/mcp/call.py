@@ -1,0 +1,188 @@
+"""One call of a tool: who makes it, on which session, within which limits."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import secrets
+from collections.abc import Awaitable, Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+import anyio
+from msgspec import Struct
+
+from urlab_client.protocol.enums import StepMode
+from urlab_client.protocol.errors import OutcomeUnknown, URLabConnectionError, URLabError, URLabTimeoutError
+from urlab_client.web.console_session import ConsoleSession
+from urlab_client.web.driving_lease import NotDriving, Viewer
+
+if TYPE_CHECKING:
+    from urlab_client.aio import URLabArticulation
+
+__all__ = ["TAKEN_OVER", "Call", "Caller", "Limits", "Progress", "Stopped"]
+
+T = TypeVar("T")
+Progress = Callable[[float, float], Awaitable[None]]
+"""Told how much simulation time has passed, and how much may pass."""
+
+TAKEN_OVER = "Another program has taken the server over. Ask a person to take it back in the console."
+
+_CONNECT_S = 10.0
+_REPORT_S = 0.1
+_REST_S = 5.0
+_THINKS_S = 60.0  # between two calls; people need not wait for that
+
+
+class Limits(Struct, frozen=True, kw_only=True):
+    """What an agent may do.
+
+    Attributes:
+        drive: Whether it may move robots, reset, pause and record.
+        edit: Whether it may change the scene.
+        sim_seconds: Simulation time that one call may take, seconds.
+        wall_seconds: Time on the wall that one call may take, seconds.
+    """
+
+    drive: bool = False
+    edit: bool = False
+    sim_seconds: float = 10.0
+    wall_seconds: float = 60.0
+
+
+class Stopped(Exception):
+    """A call was broken off; the text says why, and what to do."""
+
+
+class Caller(Viewer):
+    """An agent. People take the controls from it by acting; other agents wait until it leaves them alone.
+
+    Attributes:
+        told: Number of the last entry of the log that it has read.
+    """
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"agent:{secrets.token_urlsafe(16)}", name, yields=True, keeps=_THINKS_S)
+        self.told = 0
+
+
+class Call:
+    """See the module.
+
+    Args:
+        console: The session, which people may watch.
+        caller: Who calls.
+        limits: What the agent may do.
+        models: Files that can be imported, by the names that the agent sees.
+        progress: Told how far the call is.
+    """
+
+    def __init__(
+        self,
+        console: ConsoleSession,
+        caller: Caller,
+        limits: Limits,
+        models: Mapping[str, Path],
+        progress: Progress,
+    ) -> None:
+        self.console = console
+        self.client = console.client
+        self.caller = caller
+        self.limits = limits
+        self.models = models
+        self._progress = progress
+        self._seconds = 0.0
+
+    def robot(self, name: str) -> URLabArticulation:
+        """Return a robot.
+
+        Raises:
+            LookupError: There is none of that name; the text says which there are.
+        """
+        return self.client.articulations[name]
+
+    def within(self, seconds: float) -> float:
+        """Return a duration of simulation time that the call may take.
+
+        Raises:
+            ValueError: It is above the limit.
+        """
+        if seconds > self.limits.sim_seconds:
+            raise ValueError(
+                f"A call may take up to {self.limits.sim_seconds:g} s of simulation time, got {seconds:g}. "
+                "Call again to go on."
+            )
+        self._seconds = seconds
+        return seconds
+
+    async def connected(self) -> None:
+        """Wait until the console's session is open.
+
+        Raises:
+            URLabConnectionError: It is not, and why.
+        """
+        with self.console.bell() as changed, anyio.move_on_after(_CONNECT_S):
+            while self.console.link.state not in {"connected", "taken_over"}:  # which only a person ends
+                changed.clear()
+                await changed.wait()
+        link = self.console.link
+        if link.state == "taken_over":
+            raise URLabConnectionError(TAKEN_OVER)
+        if link.state != "connected":
+            raise URLabConnectionError(
+                f"There is no connection to {self.client.address}: {(link.reason or link.state).rstrip('.?')}.",
+                hint="It is tried again all the time. Call again later.",
+            )
+
+    async def drive(self, work: Callable[[], Awaitable[T]]) -> T:
+        """Do something that changes the simulation, through the console's controls.
+
+        Raises:
+            NotDriving: Somebody else has the controls; nothing was done.
+            Stopped: Somebody took the controls meanwhile, or it took too long; the simulation is at rest.
+        """
+        began = False
+        why = f"It took longer than {self.limits.wall_seconds:g} s on the wall."
+        with anyio.move_on_after(self.limits.wall_seconds):
+            try:
+                async with self.console.lease.hold(self.caller):
+                    began = True
+                    return await self._reported(work)
+            except NotDriving as refusal:
+                why = str(refusal)
+                if not began:
+                    raise NotDriving(f"{why} Nothing was done. Call again later, or ask.") from None
+        raise Stopped(f"{why} The call was broken off, and the simulation is at rest. Call state before going on.")
+
+    async def _reported(self, work: Callable[[], Awaitable[T]]) -> T:
+        """Do something, report its progress, and leave the simulation at rest if it is broken off."""
+        reporting = asyncio.create_task(self._report())
+        try:
+            if self.console.controls.running:  # stepped along with the clock, for somebody who has left
+                await self.console.controls.run(self.caller, running=False)
+            return await work()
+        except (OutcomeUnknown, URLabTimeoutError):
+            with contextlib.suppress(URLabError):
+                await self.client.resync()
+            raise
+        except asyncio.CancelledError:  # by the agent's host, too
+            with anyio.CancelScope(shield=True):
+                await self._rest()
+            raise
+        finally:
+            reporting.cancel()
+            self.console.tell()
+
+    async def _report(self) -> None:
+        start = self.client.sim_time
+        while True:
+            await asyncio.sleep(_REPORT_S)
+            if self._seconds:
+                await self._progress(min(max(self.client.sim_time - start, 0.0), self._seconds), self._seconds)
+
+    async def _rest(self) -> None:
+        """Leave the simulation at rest: nothing in doubt, and paused where time passes by itself."""
+        with anyio.move_on_after(_REST_S), contextlib.suppress(URLabError):
+            await self.client.resync()
+            if self.client.step_mode is StepMode.LIVE:
+                await self.client.runtime.set_paused(True)
