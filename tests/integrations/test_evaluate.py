@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
 from gymnasium.vector import AutoresetMode
 
 from urlab_client.cli import main
-from urlab_client.integrations.gym import Reach, URLabBatchEnv, URLabEnv
-from urlab_client.integrations.policy import bootstrap_mean, evaluate_in, wilson
+from urlab_client.integrations.gym import PushPictures, Reach, URLabBatchEnv, URLabEnv, URLabVectorEnv
+from urlab_client.integrations.policy import OnnxDictNetwork, PolicyFileError, bootstrap_mean, evaluate_in, wilson
+from urlab_client.protocol.errors import URLabError
 from urlab_client.randomise import Noise, Randomisation, Vary
 from urlab_client.server import SimulatedServer
 
@@ -79,6 +82,81 @@ def test_outcomes_are_those_of_single_episodes_whatever_the_batch() -> None:
     assert found[0].success_rate == wilson(sum(outcome.success for outcome in found[0].outcomes), 5)
 
 
+@pytest.mark.long
+def test_a_network_that_sees_pictures_is_evaluated_on_servers(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its inputs are told apart by name; what it makes of them moves the arm."""
+
+    def saved(picture: str, kind: int = onnx.TensorProto.UINT8, width: int = 96) -> Path:
+        helper, number = onnx.helper, onnx.TensorProto.FLOAT
+        graph = helper.make_graph(
+            [
+                helper.make_node("Cast", [picture], ["bytes"], to=number),
+                helper.make_node("ReduceMean", ["bytes"], ["bright"], axes=[1, 2, 3], keepdims=0),
+                helper.make_node("Unsqueeze", ["bright", "last"], ["column"]),
+                helper.make_node("Mul", ["column", "share"], ["turn"]),
+                helper.make_node("Slice", ["arm/qpos", "from", "to", "last"], ["joints"]),
+                helper.make_node("Add", ["joints", "turn"], ["arm"]),
+            ],
+            "sees",
+            [
+                helper.make_tensor_value_info(picture, kind, ["batch", 72, width, 3]),
+                helper.make_tensor_value_info("arm/qpos", number, ["batch", 8]),
+            ],
+            [helper.make_tensor_value_info("arm", number, ["batch", 7])],
+            [
+                onnx.numpy_helper.from_array(np.array(value, dtype), name)
+                for name, value, dtype in (
+                    ("share", [[0.001] * 7], np.float32),
+                    ("last", [1], np.int64),
+                    ("from", [0], np.int64),
+                    ("to", [7], np.int64),
+                )
+            ],
+        )
+        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+        path = tmp_path / f"{picture.replace('/', '_')}{width}{kind}.onnx"
+        path.write_bytes(model.SerializeToString())
+        return path
+
+    with SimulatedServer("arm", "block", "floor", play=True, camera_size=(96, 72)) as server:
+        address = f"{server.address}:{server.step_port}"
+        options: Any = {"max_episode_steps": 2, "autoreset_mode": AutoresetMode.DISABLED}
+        env = URLabVectorEnv([address], task=PushPictures(), **options)
+        space = env.single_observation_space
+        network = OnnxDictNetwork(saved("cameras/arm/overview"), space, 7)
+        assert network.inputs == ("cameras/arm/overview", "arm/qpos")
+        seen = env.reset(seed=1)[0]
+        one = {"arm": {"qpos": seen["arm"]["qpos"][0]}, "cameras": {"arm/overview": seen["cameras"]["arm/overview"][0]}}
+        bright = float(one["cameras"]["arm/overview"].mean())
+        np.testing.assert_allclose(network(one), one["arm"]["qpos"][:7] + 0.001 * bright, rtol=1e-4)
+        found = evaluate_in(env, network, episodes=2, seed=3)
+        assert [outcome.actions for outcome in found.outcomes] == [2, 2]
+        assert found.success_rate == wilson(0, 2)
+        still = evaluate_in(env, lambda _: np.zeros(7), episodes=2, seed=3)
+        assert still.mean_return != found.mean_return, "what it says moves the arm"
+        for path, size, reason in (
+            (
+                saved("arm/overview"),
+                7,
+                "its input 'arm/overview' is not an entry of the observation; there are: arm/qpos",
+            ),
+            (saved("cameras/arm/overview", width=64), 7, "must be tensor(uint8) of shape ['batch', 72, 96, 3]"),
+            (saved("cameras/arm/overview", onnx.TensorProto.FLOAT), 7, "must be tensor(uint8) of shape"),
+            (saved("cameras/arm/overview"), 6, "it needs one output, float32 of shape ['batch', 6]; it has: arm"),
+        ):
+            with pytest.raises(PolicyFileError, match=re.escape(reason)):
+                OnnxDictNetwork(path, space, size)
+        server.close()
+        with pytest.raises(Exception, match=re.escape("environment 0")) as failed:
+            evaluate_in(env, network, episodes=1)
+        assert isinstance(failed.value, (URLabError, TimeoutError))
+        env.close()
+    assert main(["evaluate", str(NETWORK), "--episodes=1", "--task", "urlab/PushPictures-v0"]) == 2
+    assert "its input 'observation' is not an entry of the observation; there are: arm/qpos" in capsys.readouterr().err
+
+
 def test_the_command_states_rates_and_every_episode(capsys: pytest.CaptureFixture[str]) -> None:
     command = ["evaluate", str(NETWORK), "--robot=quadruped", "--seconds=0.2", "--randomise", "--episodes=3", "--json"]
     assert main(command) == 0
@@ -89,7 +167,6 @@ def test_the_command_states_rates_and_every_episode(capsys: pytest.CaptureFixtur
     for arguments, reason in (
         (["--task", "urlab/Swim-v0"], "no task is called 'urlab/Swim-v0'; there are: urlab/Arm-v0"),
         (["--task", "urlab/Reach-v0"], "quadruped.onnx has 38 inputs, but urlab/Reach-v0 has 22"),
-        (["--task", "urlab/PushPictures-v0"], "urlab/PushPictures-v0 observes pictures"),
         (["--task", "urlab/Reach-v0", "--seconds", "3"], "--seconds does not go with --task"),
         (["--randomise", "nope.toml"], "--randomise: "),
         (["--confidence", "95"], "--confidence must be between 0 and 1"),

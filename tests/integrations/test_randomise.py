@@ -113,7 +113,9 @@ def test_servers_batches_and_single_environments_vary_bit_for_bit_alike(
 
 
 @pytest.mark.parametrize("dialect", ["alpha", "beta"])
-def test_a_server_that_varies_nothing_itself_varies_what_its_ops_reach(made: list[Any], dialect: Any) -> None:
+def test_a_server_that_varies_nothing_itself_varies_what_its_ops_reach(
+    made: list[Any], dialect: Any, tmp_path: Path
+) -> None:
     settable = {"gravity", "position", "base_position", "base_yaw", "kp", "kv"}
     declared = Randomisation(vary=tuple(vary for vary in EVERYTHING.vary if vary.what in settable))
     pd = {"quadruped": ControllerConfig(kp=60.0, kv=2.0)}
@@ -127,6 +129,21 @@ def test_a_server_that_varies_nothing_itself_varies_what_its_ops_reach(made: lis
             gravity = client.runtime.set_sim_options().gravity
             env = URLabEnv(client, task=FreeWalk(), **options)
             made += [copies, env]
+            drawn: list[Any] = []
+            with record(client, tmp_path / "run.mcap", pose_hz=0):
+                for seed in (3, 4):
+                    env.reset(seed=seed)
+                    env.step(np.zeros(12, dtype=np.float32))
+                    drawn.append(env.draws())
+                client.reset(seed=5)  # of somebody else: nothing is drawn for it
+            recorded = read_run(tmp_path / "run.mcap").summary()
+            assert Randomisation.from_json(recorded.about["randomise"]) == declared
+            assert [told.seed for told in recorded.varied] == [each["seed"] for each in drawn]
+            for told, expected in zip(recorded.varied, drawn, strict=True):
+                assert [quantity.what for quantity in told.varied] == [vary.what for vary in declared.vary]
+                for quantity, one in zip(told.varied, expected["varied"], strict=True):
+                    rows = {name: row if isinstance(row, list) else [row] for name, row in one["drawn"].items()}
+                    assert quantity.drawn == rows
             for seed in (3, 4):
                 ours, (theirs, infos) = env.reset(seed=seed), copies.reset(seed=seed)
                 assert ours[1]["episode_seed"] == infos["episode_seed"][0]

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import mujoco
 import numpy as np
 import pytest
+from gymnasium.vector import AutoresetMode
 
 from urlab_client.integrations.gym import (
     FixedReach,
@@ -78,9 +79,12 @@ def test_all_three_environments_agree_bit_for_bit(
     actions = [rng.uniform(-0.4, 0.4, wire.action_space.shape).astype(np.float32) for _ in range(7)]
 
     def rollout(env: Any) -> list[Any]:
-        seen: list[Any] = [env.reset(seed=6)[0]]
+        observation, told = env.reset(seed=6)
+        seen: list[Any] = [observation]
         for action in actions:
             *ours, infos = env.step(action)
+            assert infos.keys() == told.keys(), "collectors such as Minari's need the same keys at each reset and step"
+            assert infos["_success"].all()
             seen += [*ours, infos["success"], infos["sim_time"]]
         return seen
 
@@ -90,11 +94,12 @@ def test_all_three_environments_agree_bit_for_bit(
     wire.close()
     single = URLabEnv.connect(addresses[0], task=kind(), max_episode_steps=4)
     made.append(single)
-    observation, _ = single.reset(seed=6)
+    observation, told = single.reset(seed=6)
     assert single.observation_space.contains(observation)
     assert np.array_equal(observation, expected[0][0])
     for i, action in enumerate(actions[:4]):
         observation, reward, terminated, truncated, info = single.step(action[0])
+        assert info.keys() == told.keys()
         ours = [row[0] for row in expected[1 + 6 * i : 7 + 6 * i]]
         assert np.array_equal(observation, ours[0])
         assert (reward, terminated, truncated, info["success"], info["sim_time"]) == tuple(ours[1:])
@@ -136,9 +141,10 @@ def test_a_hand_at_its_target_is_a_success_and_ends_a_curriculums_episode(made: 
     task = Near()
     env = URLabBatchEnv("sim://arm", 4, task=task, max_episode_steps=2)
     made.append(env)
-    observations, _ = env.reset(seed=[0, 1, 2, 3])
+    observations, told = env.reset(seed=[0, 1, 2, 3])
     near = np.linalg.norm(observations[:, -3:], axis=1) < 0.03
     assert 0 < near.sum() < 4
+    assert told["success"].tolist() == near.tolist()
     still = np.zeros(env.action_space.shape, dtype=np.float32)
     for _ in range(2):
         _, rewards, _, truncated, infos = env.step(still)
@@ -146,6 +152,23 @@ def test_a_hand_at_its_target_is_a_success_and_ends_a_curriculums_episode(made: 
         assert (rewards > 0).tolist() == near.tolist()
     assert truncated.all()
     assert task.ends == [(bool(success), 2) for success in near]
+
+
+def test_where_some_episodes_begin_anew_infos_tell_of_all(made: list[Any]) -> None:
+    disabled, same_step = AutoresetMode.DISABLED, AutoresetMode.SAME_STEP
+    env = URLabBatchEnv(Reach.scene_address, 2, task=Reach(), max_episode_steps=2, autoreset_mode=disabled)
+    made.append(env)
+    one = {"reset_mask": np.array([True, False])}
+    assert env.reset(seed=1, options=one)[1]["_success"].tolist() == [True, False], "the other had no episode yet"
+    assert env.step(env.action_space.sample())[4]["_success"].all()
+    assert env.reset(options=one)[1]["_success"].all()
+    env = URLabBatchEnv(Reach.scene_address, 2, task=Reach(), max_episode_steps=2, autoreset_mode=same_step)
+    made.append(env)
+    _, told = env.reset(seed=1)
+    env.step(env.action_space.sample())
+    infos = env.step(env.action_space.sample())[4]
+    assert infos.keys() - {"final_obs", "_final_obs", "final_info", "_final_info"} == told.keys()
+    assert infos["final_info"].keys() == told.keys()
 
 
 def test_poses_and_contacts_are_those_of_the_state(made: list[Any]) -> None:

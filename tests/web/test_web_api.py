@@ -484,10 +484,16 @@ def test_pictures_come_as_files_too_while_running_paused_and_stepped(http: TestC
         assert http.get(f"/api/cameras/arm/nothing.{kind}").status_code == 404
 
 
-def test_a_mujoco_without_its_viewer_is_named(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mujoco_without_its_viewer_is_named_and_bodies_do_not_need_it(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(mujoco_viewer, "files", lambda: None)
-    http: TestClient = request.getfixturevalue("http")  # which describes the world as it begins
+    monkeypatch.setattr(mujoco_viewer, "_payload", lambda: None)
+    http: TestClient = request.getfixturevalue("http")  # describes the world when it has connected
     assert f"MuJoCo {mujoco.__version__} has no web viewer" in http.get("/api/world").json()["no_view"]
+    with http.websocket_connect("ws://localhost/api/live") as live:
+        heard(live, "state")
+        assert "hand" in {one["name"] for one in http.get("/api/bodies").json()["bodies"]}
 
 
 def test_the_viewer_gets_the_model_and_the_state_that_is_shown(http: TestClient) -> None:

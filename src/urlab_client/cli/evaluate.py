@@ -6,8 +6,10 @@ import argparse
 import asyncio
 import logging
 import sys
+from contextlib import closing
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 from urllib.parse import urlencode
 
 import msgspec
@@ -30,6 +32,9 @@ logger: logging.Logger = logging.getLogger("urlab_client.cli")
 
 _MODEST: Final = ""
 _MOST_COPIES: Final = 64
+_MOST_SERVERS: Final = 4
+_FIRST_PICTURE_S: Final = 60.0
+"""How long a server may take for a step: the first picture takes seconds where a busy processor draws it."""
 
 
 class EvaluateArguments(argparse.Namespace):
@@ -54,8 +59,9 @@ def add_parser(commands: Commands) -> None:
         help="measure how good a policy is, with confidence intervals",
         description="Run a policy for many episodes, each with a seed of its own, and print its success rate with "
         "Wilson's score interval, and its return with a bootstrap interval. With --task the network maps observations "
-        "of a registered task to actions, as learning libraries export it. Without, a TOML file beside it declares "
-        "what it sees, as for run-policy, and a success is an episode without a fall. Needs the extra "
+        "of a registered task to actions, as learning libraries export it; of one that observes pictures, its inputs "
+        "have the names of what is observed, such as 'arm/qpos' or 'cameras/arm/overview'. Without, a TOML file beside "
+        "it declares what it sees, as for run-policy, and a success is an episode without a fall. Needs the extra "
         "'urlab-client[onnx]', and with --task 'urlab-client[gym]'.",
         examples=(
             ("urlab evaluate reach.onnx --task urlab/Reach-v0 --episodes 100", "on a task, in a batch"),
@@ -146,35 +152,41 @@ def _in_task(
             raise CommandError(f"--{name} does not go with --task, which settles it")
     from gymnasium.vector import AutoresetMode  # noqa: PLC0415
 
-    from urlab_client.integrations.gym import TASKS, URLabBatchEnv  # noqa: PLC0415
-    from urlab_client.integrations.policy import OnnxNetwork, PolicyFileError, evaluate_in  # noqa: PLC0415
+    from urlab_client.integrations.gym import TASKS, URLabBatchEnv, URLabVectorEnv  # noqa: PLC0415
+    from urlab_client.integrations.policy import (  # noqa: PLC0415
+        OnnxDictNetwork,
+        OnnxNetwork,
+        PolicyFileError,
+        evaluate_in,
+    )
 
     if task not in TASKS:
         raise CommandError(f"--task: no task is called {task!r}; there are: {', '.join(TASKS)}")
     kind = TASKS[task]
+    evaluated = partial(
+        evaluate_in,
+        episodes=arguments.episodes,
+        seed=arguments.seed,
+        confidence=arguments.confidence,
+        on_episode=show,
+    )
+    options: dict[str, Any] = {"task": kind(), "randomise": declared, "autoreset_mode": AutoresetMode.DISABLED}
     if kind.cameras:
-        raise CommandError(f"--task: {task} observes pictures, which a batch has none of")
+        servers = min(arguments.episodes, _MOST_SERVERS)
+        env = URLabVectorEnv(kind.scene_address, servers, step_timeout=_FIRST_PICTURE_S, **options)
+        with closing(env):
+            ((_, box),) = cast("dict[str, Any]", env.single_action_space).items()
+            return evaluated(env, OnnxDictNetwork(arguments.policy, env.single_observation_space, len(box.low)))
     network = OnnxNetwork(arguments.policy)
-    copies = min(arguments.episodes, _MOST_COPIES)
-    disabled = AutoresetMode.DISABLED
-    env = URLabBatchEnv(kind.scene_address, copies, task=kind(), randomise=declared, autoreset_mode=disabled)
-    try:
+    env = URLabBatchEnv(kind.scene_address, min(arguments.episodes, _MOST_COPIES), **options)
+    with closing(env):
         wanted = {"inputs": env.single_observation_space.shape, "outputs": env.single_action_space.shape}
         for name, shape in wanted.items():
             if getattr(network, name) not in (None, (shape or (0,))[0]):
                 raise PolicyFileError(
                     f"{network.path} has {getattr(network, name)} {name}, but {task} has {(shape or (0,))[0]}."
                 )
-        return evaluate_in(
-            env,
-            network,
-            episodes=arguments.episodes,
-            seed=arguments.seed,
-            confidence=arguments.confidence,
-            on_episode=show,
-        )
-    finally:
-        env.close()
+        return evaluated(env, network)
 
 
 async def _on_robot(

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
 
 from urlab_client.aio.model.layout import ArticulationLayout
 from urlab_client.protocol.enums import ControllerKind
@@ -12,9 +14,27 @@ if TYPE_CHECKING:
     import mujoco
 
     from urlab_client.aio.client import URLabClient
-    from urlab_client.randomise.variation import Variation
+    from urlab_client.randomise.declaration import Randomisation
+    from urlab_client.randomise.variation import EpisodeDraws, Variation
 
-__all__ = ["controlled_actuators", "variation_of"]
+__all__ = ["OVER_WIRE", "VariedOverWire", "controlled_actuators", "variation_of"]
+
+
+@dataclass(eq=False)
+class VariedOverWire:
+    """What an environment varies by ops, on a server that varies nothing by itself.
+
+    Attributes:
+        declaration: What it varies.
+        draws: What was drawn for the present episode; None before the first.
+    """
+
+    declaration: Randomisation
+    draws: EpisodeDraws | None = None
+
+
+OVER_WIRE: WeakKeyDictionary[URLabClient, VariedOverWire] = WeakKeyDictionary()
+"""By client: for recordings, which follow the client and know nothing of environments."""
 
 
 def variation_of(

@@ -19,7 +19,7 @@ __all__ = ["BusyPoll"]
 
 _MISSES = 4
 _FIRST = 8  # requests of an op before sleeping is tried
-_TRIAL = 64  # one of so many does the other thing
+_OFTEN, _RARELY = 64, 1024  # one of so many does the other thing: the more often it was no better, the more rarely
 _MARGIN = 0.85  # waiting awake takes a processor: it has to be quicker by this
 _WEIGHT = 0.2
 # One that looks keeps the loop awake for all; several would only keep each other busy.
@@ -29,13 +29,20 @@ _looking = False
 class _Replies:
     """How quickly the replies to one op come, in seconds, to a loop that stays awake and to one that sleeps."""
 
-    __slots__ = ("asked", "asleep", "awake", "missed")
+    __slots__ = ("asked", "asleep", "awake", "missed", "pause", "trial")
 
     def __init__(self) -> None:
         self.asked = 0
         self.missed = 0
         self.awake = 0.0
         self.asleep = 0.0
+        self.pause = _OFTEN
+        self.trial = _OFTEN
+
+    @property
+    def awake_is_better(self) -> bool:
+        """Whether staying awake has proved quicker."""
+        return self.awake < _MARGIN * self.asleep
 
     def choose(self) -> bool:
         """Return whether to stay awake for the next one."""
@@ -44,8 +51,35 @@ class _Replies:
             return False
         if self.asleep == 0.0:
             return self.asked <= _FIRST
-        better = self.awake < _MARGIN * self.asleep
-        return better != (self.asked % _TRIAL == 0)
+        if self.asked < self.trial:
+            return self.awake_is_better
+        self.trial = self.asked + self.pause
+        return not self.awake_is_better
+
+    def longest_look(self, shortest: float, longest: float) -> float:
+        """Return how long to look for a reply, seconds: to find out whether that is better, no longer than it would."""
+        usual = min(max(2 * self.awake, shortest), longest)
+        return usual if self.awake_is_better or self.asleep == 0.0 else min(usual, self.asleep)
+
+    def note(self, seconds: float, *, awake: bool) -> None:
+        """Learn from a reply that did not take too long."""
+        self.missed = 0
+        before = self.awake if awake else self.asleep
+        if before == 0.0:
+            after = seconds
+        else:
+            if awake != self.awake_is_better:
+                if (seconds < _MARGIN * self.asleep) if awake else (_MARGIN * seconds <= self.awake):
+                    self.pause = _OFTEN  # perhaps things have changed: ask again soon
+                else:
+                    self.pause = min(2 * self.pause, _RARELY)
+                self.trial = self.asked + self.pause
+            # What took unusually long says more about the machine's other work than about the way of waiting.
+            after = before + _WEIGHT * (min(seconds, 2 * before) - before)
+        if awake:
+            self.awake = after
+        else:
+            self.asleep = after
 
 
 class BusyPoll:
@@ -75,8 +109,7 @@ class BusyPoll:
         global _looking  # noqa: PLW0603  # about all loops of the process, as they share its interpreter
         now = time.perf_counter  # the loop's clock may tick 64 times a second
         replies = self._ops.get(op)
-        usual = 0.0 if replies is None else replies.awake
-        give_up = now() + min(max(2 * usual, self._shortest), self._longest)
+        give_up = now() + (self._shortest if replies is None else replies.longest_look(self._shortest, self._longest))
         _looking = True
         try:
             while True:  # once at least: whoever is late to look first would find nobody left to wake it
@@ -97,11 +130,4 @@ class BusyPoll:
         if seconds > self._longest:
             replies.missed += 1
             return
-        replies.missed = 0
-        before = replies.awake if awake else replies.asleep
-        # What took unusually long says more about the machine's other work than about the way of waiting.
-        after = seconds if before == 0.0 else before + _WEIGHT * (min(seconds, 2 * before) - before)
-        if awake:
-            replies.awake = after
-        else:
-            replies.asleep = after
+        replies.note(seconds, awake=awake)

@@ -218,7 +218,7 @@ class VariedQuantity(Struct, frozen=True):
 
 
 class EpisodeMessage(Struct, frozen=True):
-    """What the server varies in the episode that begins, and the seed that decided on it."""
+    """What varies in the episode that begins, and the seed that decided on it."""
 
     timestamp: Time
     episode: int

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,6 +15,9 @@ from urlab_client.protocol.messages.streams import StateSnapshot
 from urlab_client.protocol.picture_files import encoded, pillow_image
 from urlab_client.protocol.pixels import Pixels, decode_camera
 
+if TYPE_CHECKING:
+    from urlab_client.randomise.variation import EpisodeDraws
+
 __all__ = ["CameraPicture", "EpisodeMark", "SampleClock", "Schedule", "State", "compressed", "picture_message"]
 
 _FALLBACK_NS = 1_000_000
@@ -24,7 +28,8 @@ class State:
     """One state on its way to whoever keeps or shows it.
 
     `waits` says that it is the reply to a step of ours, so that the next one can wait until there is room, and `seed`
-    is that of the reset which the state is the reply to.
+    is that of the reset which the state is the reply to. `draws` are those of the episode that begins, where an
+    environment varies it over the wire; what a server varies follows from `scene` and `seed`.
     """
 
     scene: SceneMessages
@@ -35,6 +40,7 @@ class State:
     wall_ns: int
     waits: bool
     seed: int | None = None
+    draws: EpisodeDraws | None = None
 
 
 @dataclass(frozen=True, slots=True)

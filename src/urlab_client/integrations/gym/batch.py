@@ -291,12 +291,9 @@ class URLabBatchEnv(Vectorized):
         observation = self.mapping.observe(read)
         if self.task is None:
             return observation
-        return add_observed(observation, self.task, self.task.observe(self._states_of(indices)))
+        return add_observed(observation, self.task, self.task.observe(self._states(indices)))
 
-    def _states(self) -> States:
-        return self._states_of(np.arange(self.num_envs))
-
-    def _states_of(self, indices: Indices) -> States:
+    def _states(self, indices: Indices) -> States:
         if self.task is None:
             raise URLabError("This environment has no task.")
         arrays = self._arrays

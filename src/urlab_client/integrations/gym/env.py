@@ -17,7 +17,7 @@ from urlab_client.integrations.gym.disturbances import Disturbances
 from urlab_client.integrations.gym.episode import EnvEpisode, client_defaults, first_camera
 from urlab_client.integrations.gym.spaces import Observation, SpaceMapping, SpaceMode
 from urlab_client.integrations.gym.starts import ResetNoise
-from urlab_client.integrations.gym.task import EpisodeSettings, Task, check_alone
+from urlab_client.integrations.gym.task import EpisodeSettings, States, Task, check_alone
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.names import NameMap
@@ -213,7 +213,10 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         episode_seed = None if disturbances is None else disturbances.begin(self.np_random)
         self._observation = portal_of(self.client).call(self._episode.reset, self.np_random, keyframe, episode_seed)
         self._elapsed = 0
-        return self._seen(), self._info()
+        info = self._info()
+        if self.task is not None:
+            self._tell_success(self.task, self._episode.states(), info)
+        return self._seen(), info
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Act for `n_substeps` physics steps.
@@ -278,12 +281,15 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
             actions = {key: np.asarray(action[key])[None] for key in action}
         reward, terminated = float(task.reward(states, actions)[0]), bool(task.terminated(states)[0])
         truncated = self._max_episode_steps is not None and self._elapsed >= self._max_episode_steps
-        success = task.success(states)
-        if success is not None:
-            info["success"] = bool(success[0])
+        self._tell_success(task, states, info)
         if terminated or truncated:
             task.ended(info.get("success", False), self._elapsed)
         return self._seen(), reward, terminated, truncated, info
+
+    def _tell_success(self, task: Task, states: States, info: dict[str, Any]) -> None:
+        success = task.success(states)
+        if success is not None:
+            info["success"] = bool(success[0])
 
     def _info(self) -> dict[str, Any]:
         client = self.client

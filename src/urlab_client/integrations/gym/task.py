@@ -141,8 +141,11 @@ class States:
         self.qpos = qpos
         self.qvel = qvel
         self.time = time
+        known = next(
+            filter(None, goals), dict[str, Floats]()
+        )  # one that has had no episode yet has no goal: it shows another's
         self.goal: dict[str, NDArray[np.float64]] = {
-            name: np.array([goal[name] for goal in goals]) for name in goals[0]
+            name: np.array([(goal or known)[name] for goal in goals]) for name in known
         }
 
     def __len__(self) -> int:

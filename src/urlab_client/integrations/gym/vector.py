@@ -329,11 +329,12 @@ class URLabVectorEnv(Vectorized):
     def _episode_seed(self, index: int) -> int | None:
         return self._disturbances[index].seed if self._disturbances else None
 
-    def _states(self) -> States:
-        for i, session in enumerate(self._sessions):
-            if session.episode is not None:
-                self._seen[i] = session.episode.states()
-        return joined([self._seen.get(i) for i in range(self.num_envs)])
+    def _states(self, indices: Indices) -> States:
+        for i in map(int, indices):
+            episode = self._sessions[i].episode
+            if episode is not None:
+                self._seen[i] = episode.states()
+        return joined([self._seen.get(i) for i in map(int, indices)])
 
     def _clocks(self) -> dict[str, NDArray[Any]]:
         for i, session in enumerate(self._sessions):

@@ -100,8 +100,8 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         """Reset some environments into `_keyframe` and step others, given the set-points of all."""
 
     @abstractmethod
-    def _states(self) -> States:
-        """Return the states of all environments as the task sees them."""
+    def _states(self, indices: Indices) -> States:
+        """Return the states of some environments as the task sees them."""
 
     @abstractmethod
     def _clocks(self) -> dict[str, NDArray[Any]]:
@@ -136,7 +136,9 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
                 self._rngs[i] = np.random.default_rng(seeds[i])
         errors = self._start(np.flatnonzero(mask))
         self._started = True
-        return self._told(), self._infos(errors)
+        infos = self._infos(errors)
+        self._tell_success(infos, np.flatnonzero(~self._ended))
+        return self._told(), infos
 
     def step(self, actions: Any) -> tuple[Observation, Floats, Bools, Bools, dict[str, Any]]:
         """Act in all environments.
@@ -213,12 +215,13 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         rewards = np.zeros(self.num_envs)
         terminated = np.zeros(self.num_envs, dtype=bool)
         after = self._copied()
-        if self.task is not None:
-            states = self._states()
+        failed = infos.get("_error", np.zeros(self.num_envs, dtype=bool))
+        if self.task is not None and not failed.all():  # else there may be no state at all
+            states = self._states(np.arange(self.num_envs))
             rewards[:], terminated[:] = self.task.reward(states, actions), self.task.terminated(states)
             success = self.task.success(states)
             if success is not None:
-                infos["success"], infos["_success"] = success & stepped, stepped.copy()
+                infos["success"], infos["_success"] = success & ~failed, ~failed
         if self.reward_fn is not None:
             rewards[:] = self.reward_fn(before, actions, after, infos)
         if self.termination_fn is not None:
@@ -233,7 +236,20 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
             final[i] = _pick(self._sensed if self._blurred else self._observations, int(i))
         errors = self._start(np.flatnonzero(ended))
         after = self._infos({**_errors_in(infos), **errors})
+        if "success" in infos:
+            after["success"], after["_success"] = infos["success"].copy(), infos["_success"].copy()
+            self._tell_success(after, np.flatnonzero(ended))
         return {**after, "final_obs": final, "_final_obs": ended, "final_info": infos, "_final_info": ended}
+
+    def _tell_success(self, infos: dict[str, Any], fresh: Indices) -> None:
+        """Add whether episodes that have just begun are a success as they stand: a reset tells what a step does."""
+        success = self.task.success(self._states(fresh)) if self.task is not None and len(fresh) else None
+        if success is None:
+            return
+        for name in ("success", "_success"):
+            infos.setdefault(name, np.zeros(self.num_envs, dtype=bool))
+        known = ~infos.get("_error", np.zeros(self.num_envs, dtype=bool))[fresh]
+        infos["success"][fresh], infos["_success"][fresh] = success & known, known
 
     def _infos(self, errors: Mapping[int, Exception]) -> dict[str, Any]:
         everywhere = np.ones(self.num_envs, dtype=bool)

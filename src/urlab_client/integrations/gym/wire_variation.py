@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from urlab_client.aio.client import URLabClient
 from urlab_client.aio.controllers import URLabPDController
 from urlab_client.aio.model.layout import ArticulationLayout
-from urlab_client.integrations._varied import controlled_actuators
+from urlab_client.integrations._varied import OVER_WIRE, VariedOverWire, controlled_actuators
 from urlab_client.protocol.base import Floats
 from urlab_client.randomise.declaration import Quantity, Randomisation, UnsupportedRandomisation, Vary
 from urlab_client.randomise.quantities import START, elements_of
@@ -69,6 +69,7 @@ class WireVariation:
         _check(client, model, declared, controlled)
         self.variation: Variation = Variation(declared, model, controlled) if earlier is None else earlier.variation
         self._client = client
+        self._told = OVER_WIRE[client] = VariedOverWire(declared)
         self._model_fields: dict[str, NDArray[Any]] = {
             name: np.array(field_of(model, name)) for name in self.variation.fields
         }
@@ -84,6 +85,7 @@ class WireVariation:
 
     async def apply(self, draws: EpisodeDraws) -> None:
         """Set what a reset leaves alone: gravity, and the gains of controllers."""
+        self._told.draws = draws
         if self._model_fields:
             self.variation.write(draws, self._model_fields.__getitem__)
             await self._set_gravity()
@@ -101,6 +103,9 @@ class WireVariation:
 
     async def undo(self) -> None:
         """Set gravity and gains as they were."""
+        self._told.draws = None
+        if OVER_WIRE.get(self._client) is self._told:
+            del OVER_WIRE[self._client]
         if self._model_fields:
             self.variation.restore(self._model_fields.__getitem__)
             await self._set_gravity()

@@ -13,7 +13,7 @@ from urlab_client.integrations.policy.evaluation import (
     wilson,
 )
 from urlab_client.integrations.policy.mapping import PolicyMapping, PolicyMismatch, RobotState
-from urlab_client.integrations.policy.network import Network, OnnxNetwork
+from urlab_client.integrations.policy.network import Network, OnnxDictNetwork, OnnxNetwork
 from urlab_client.integrations.policy.policy import Policy, load
 from urlab_client.integrations.policy.runner import PolicyRun, require, run, run_blocking
 from urlab_client.integrations.policy.spec import PolicyFileError, PolicySpec, parse_spec, read_spec
@@ -22,6 +22,7 @@ __all__ = [
     "Estimate",
     "Evaluation",
     "Network",
+    "OnnxDictNetwork",
     "OnnxNetwork",
     "Outcome",
     "Policy",

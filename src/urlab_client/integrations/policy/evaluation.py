@@ -5,20 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 from msgspec import Struct
+from numpy.typing import NDArray
 
 from urlab_client.aio.client import URLabClient
-from urlab_client.integrations.policy.network import Network
 from urlab_client.integrations.policy.policy import Policy
 from urlab_client.integrations.policy.runner import run
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.serializable import Serializable
 
 if TYPE_CHECKING:
-    from urlab_client.integrations.gym import URLabBatchEnv
+    from urlab_client.integrations.gym import URLabBatchEnv, URLabVectorEnv
 
 __all__ = ["Estimate", "Evaluation", "Outcome", "bootstrap_mean", "evaluate_in", "evaluate_on", "wilson"]
 
@@ -140,33 +140,41 @@ def episode_seeds(seed: int, episodes: int) -> list[int]:
 
 
 def evaluate_in(
-    env: URLabBatchEnv,
-    network: Network,
+    env: URLabBatchEnv | URLabVectorEnv,
+    network: Callable[[Any], Floats],
     *,
     episodes: int = 100,
     seed: int = 0,
     confidence: float = 0.95,
     on_episode: OnEpisode | None = None,
 ) -> Evaluation:
-    """Evaluate a network that maps observations to actions in a batch of environments.
+    """Evaluate a network that maps observations to actions in a batch of environments, or over servers.
 
-    Each episode has a seed of its own, so its outcome does not depend on the size of the batch.
+    Each episode has a seed of its own, so its outcome does not depend on the number of environments.
 
     Args:
-        env: The batch, with flat spaces, a limit of actions, and `autoreset_mode=AutoresetMode.DISABLED`.
-        network: Maps an observation to an action, which is clipped to the bounds of the action space.
+        env: The environments, with a limit of actions, and `autoreset_mode=AutoresetMode.DISABLED`.
+        network: Maps an observation, flat or a dictionary, to an action, shape (n,), which is clipped to the bounds of
+            the action space. With dictionaries, it is that of the only articulation that is driven.
         episodes: Number of episodes.
         seed: Seed of the evaluation.
         confidence: Coverage of the intervals, 0 to 1.
         on_episode: Called after each episode.
 
     Raises:
-        ValueError: A number is out of range, the network does not fit the spaces, or the batch is of another kind.
+        ValueError: A number is out of range, the network does not fit the spaces, the environments are of another kind,
+            or more than one articulation is driven by dictionaries.
+        URLabError: A server failed.
     """
     if env.autoreset_mode.name != "DISABLED" or env.max_episode_steps is None:
         raise ValueError("an evaluation needs a batch with autoreset_mode=AutoresetMode.DISABLED and max_episode_steps")
     seeds = episode_seeds(seed, episodes)
     space: Any = env.single_action_space
+    driven: str | None = None
+    if env.mapping.mode == "dict":
+        if len(space) != 1:
+            raise ValueError(f"an evaluation drives one articulation, not {len(space)}: {', '.join(space)}")
+        ((driven, space),) = space.items()
     found: dict[int, Outcome] = {}
     for first in range(0, episodes, env.num_envs):
         some = seeds[first : first + env.num_envs]
@@ -174,13 +182,16 @@ def evaluate_in(
         mask = np.arange(env.num_envs) < count
         padded: list[int | None] = [*some, *[None] * (env.num_envs - count)]
         options = {} if first == 0 else {"reset_mask": mask}
-        observations, _ = env.reset(seed=padded, options=options)
+        observations, infos = env.reset(seed=padded, options=options)
+        _raise_any(infos, mask)
         going, totals, lengths = mask.copy(), np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=np.int64)
         actions = np.zeros((env.num_envs, *space.shape), dtype=space.dtype)
         while going.any():
             for i in np.flatnonzero(going):
-                actions[i] = _fitting(network(observations[i]), space)
-            observations, rewards, terminated, truncated, infos = env.step(actions)
+                actions[i] = _fitting(network(_of(observations, int(i))), space)
+            given = actions if driven is None else {driven: actions}
+            observations, rewards, terminated, truncated, infos = env.step(given)
+            _raise_any(infos, going)
             totals[going] += rewards[going]
             lengths[going] += 1
             for i in np.flatnonzero(going & (terminated | truncated)):
@@ -229,6 +240,21 @@ async def evaluate_on(
         if on_episode is not None:
             on_episode(outcomes[-1])
     return Evaluation.of(outcomes, confidence)
+
+
+def _of(observations: Any, index: int) -> Any:
+    """Return the observation of one environment."""
+    if isinstance(observations, dict):
+        entries = cast("dict[str, Any]", observations)
+        return {name: _of(entry, index) for name, entry in entries.items()}
+    return observations[index]
+
+
+def _raise_any(infos: dict[str, Any], which: NDArray[np.bool_]) -> None:
+    """Raise what failed in one of these environments: an episode without an end has no outcome."""
+    for error in infos["error"][which] if "error" in infos else ():
+        if error is not None:
+            raise error
 
 
 def _fitting(output: Floats, space: Any) -> Floats:

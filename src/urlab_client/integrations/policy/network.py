@@ -12,7 +12,7 @@ from urlab_client._extras import need
 from urlab_client.integrations.policy.spec import PolicyFileError
 from urlab_client.protocol.base import Floats
 
-__all__ = ["Network", "OnnxNetwork"]
+__all__ = ["Network", "OnnxDictNetwork", "OnnxNetwork"]
 
 
 class Network(Protocol):
@@ -39,19 +39,13 @@ class OnnxNetwork:
             PolicyFileError: It is missing, no ONNX file, or has other inputs and outputs than one of each.
             ImportError: The extra `onnx` is not installed.
         """
-        need("onnxruntime", extra="onnx")
-        if not path.is_file():
-            raise PolicyFileError(f"{path}: no such file.", hint="A policy is a .onnx file and a .toml file beside it.")
-        runtime: Any = importlib.import_module("onnxruntime")  # it brings no types
-        options = runtime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = (
-            1  # small networks: threads cost more than they do
-        )
-        options.log_severity_level = 4
-        try:
-            self._session = runtime.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
-        except Exception as error:
-            raise PolicyFileError(f"{path}: not a network that ONNX Runtime can run: {_line(error)}") from error
+        self._session = _session(path)
+        ends = {"input": self._session.get_inputs(), "output": self._session.get_outputs()}
+        for kind, found in ends.items():
+            if len(found) != 1 or found[0].type != "tensor(float)" or not 1 <= len(found[0].shape) <= 2:
+                raise PolicyFileError(
+                    f"{path}: it needs one {kind}, float32 of shape [n] or [batch, n]; it has: {_told(found)}."
+                )
         self.path = path
         ends = {"input": self._session.get_inputs(), "output": self._session.get_outputs()}
         for kind, found in ends.items():
@@ -70,6 +64,98 @@ class OnnxNetwork:
         fed = np.asarray(observation, dtype=np.float32)
         (outputs,) = self._session.run(None, {self._input: fed[None] if self._batched else fed})
         return np.asarray(outputs, dtype=np.float64).reshape(-1)
+
+
+class OnnxDictNetwork:
+    """A network in an ONNX file that maps dictionary observations, with pictures for example, to actions.
+
+    Each input has the name of an entry, such as `arm/qpos`, `task` or `cameras/arm/overview`, and its shape behind an
+    axis for the batch; pictures are uint8, numbers float32. Entries that no input is named after are not used. The only
+    output is the action of the only articulation that is driven.
+
+    Attributes:
+        path: The file.
+        inputs: Names of the entries that it sees.
+    """
+
+    def __init__(self, path: Path, observation_space: Any, outputs: int) -> None:
+        """Load a file.
+
+        Args:
+            path: The file.
+            observation_space: `single_observation_space` of the environment, a `Dict`.
+            outputs: Numbers of an action.
+
+        Raises:
+            PolicyFileError: The file is missing, no ONNX file, or does not fit.
+            ImportError: The extra `onnx` is not installed.
+        """
+        self._session = _session(path)
+        entries = _entries(observation_space)
+        given, made = self._session.get_inputs(), self._session.get_outputs()
+        for one in given:
+            space = entries.get(one.name)
+            if space is None:
+                raise PolicyFileError(
+                    f"{path}: its input {one.name!r} is not an entry of the observation; there are: "
+                    f"{', '.join(entries)}."
+                )
+            wanted = "tensor(uint8)" if space.dtype == np.uint8 else "tensor(float)"
+            sizes = list(space.shape)
+            if one.type != wanted or len(one.shape) != 1 + len(sizes) or not _fits(one.shape[1:], sizes):
+                raise PolicyFileError(
+                    f"{path}: its input {one.name!r} must be {wanted} of shape {['batch', *sizes]}, "
+                    f"not {one.type} {one.shape}."
+                )
+        if len(made) != 1 or made[0].type != "tensor(float)" or not _fits(made[0].shape[1:], [outputs]):
+            raise PolicyFileError(
+                f"{path}: it needs one output, float32 of shape ['batch', {outputs}]; it has: {_told(made)}."
+            )
+        self.path = path
+        self.inputs: tuple[str, ...] = tuple(one.name for one in given)
+        self._types = {name: np.uint8 if entries[name].dtype == np.uint8 else np.float32 for name in self.inputs}
+
+    def __call__(self, observation: Any, /) -> Floats:
+        """Return the action, shape (n,), for the observation of one environment."""
+        seen = _entries(observation)
+        (outputs,) = self._session.run(
+            None, {name: np.asarray(seen[name], dtype)[None] for name, dtype in self._types.items()}
+        )
+        return np.asarray(outputs[0], dtype=np.float64)
+
+
+def _session(path: Path) -> Any:
+    """Return ONNX Runtime's session of a file, on one thread: small networks lose more by threads than they gain."""
+    need("onnxruntime", extra="onnx")
+    if not path.is_file():
+        raise PolicyFileError(f"{path}: no such file.", hint="A policy is a .onnx file and a .toml file beside it.")
+    runtime: Any = importlib.import_module("onnxruntime")  # it brings no types
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 4
+    try:
+        return runtime.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
+    except Exception as error:
+        raise PolicyFileError(f"{path}: not a network that ONNX Runtime can run: {_line(error)}") from error
+
+
+def _entries(nested: Any, prefix: str = "") -> dict[str, Any]:
+    """Return what a dictionary of dictionaries holds, by names such as `arm/qpos`."""
+    found: dict[str, Any] = {}
+    for name, entry in nested.items():
+        found |= _entries(entry, f"{prefix}{name}/") if hasattr(entry, "items") else {f"{prefix}{name}": entry}
+    return found
+
+
+def _fits(shape: list[Any], sizes: list[int]) -> bool:
+    """Return whether a shape, whose open axes are names, can be of these sizes."""
+    return len(shape) == len(sizes) and all(
+        one in (size, None) or isinstance(one, str) for one, size in zip(shape, sizes, strict=True)
+    )
+
+
+def _told(ends: list[Any]) -> str:
+    return ", ".join(f"{end.name} {end.type} {end.shape}" for end in ends)
 
 
 def _width(shape: list[Any]) -> int | None:

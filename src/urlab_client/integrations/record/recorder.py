@@ -21,6 +21,7 @@ from urlab_client.integrations._feed.blocking import BlockingTwin
 from urlab_client.integrations._feed.follower import Follower
 from urlab_client.integrations._feed.messages import EpisodeOutcome
 from urlab_client.integrations._feed.samples import EpisodeMark
+from urlab_client.integrations._varied import OVER_WIRE
 from urlab_client.integrations.record.writer import RecorderStats, WriterOptions, WriterThread
 from urlab_client.protocol.errors import URLabError
 from urlab_client.randomise.variation import declared_in
@@ -284,8 +285,10 @@ def record(
 
 
 def _varied(client: AsyncClient) -> dict[str, str]:
-    """Return what the server of a client varies, as an entry of a recording's metadata."""
+    """Return what varies, by the server or by an environment over the wire, as an entry of a recording's metadata."""
     declared = None if client.model is None else declared_in(client.model)
+    if declared is None and client in OVER_WIRE:
+        declared = OVER_WIRE[client].declaration
     return {} if declared is None else {"randomise": declared.to_json()}
 
 

@@ -405,12 +405,15 @@ class _Sink:
     def _write_episode(self, item: State, now: int) -> None:
         """Write what varies in an episode, once: an environment may reset several times at its start."""
         variation, seed, episode = item.scene.variation, item.seed, self._clock.episode
-        if variation is None or seed is None or self._varied == (episode, seed):
+        if seed is None or self._varied == (episode, seed):
+            return
+        draws = item.draws if variation is None else variation.draw(seed)
+        if draws is None:
             return
         self._varied = (episode, seed)
         varied = [
             VariedQuantity(vary.what, vary.by, dict(zip(elements.names, drawn.tolist(), strict=True)))
-            for vary, elements, drawn in variation.draw(seed).varied
+            for vary, elements, drawn in draws.varied
         ]
         self._add("/recording/episodes", EpisodeMessage(Time.of(now), episode, seed, varied), now, item.wall_ns, {})
 
