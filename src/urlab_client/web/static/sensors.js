@@ -38,7 +38,10 @@ function take(state) {
 }
 
 function clear() {
-  for (const chart of charts) chart.data = new ChartData();
+  for (const chart of charts) {
+    chart.data = new ChartData();
+    chart.touch();
+  }
   view.first = view.last = 0;
 }
 
