@@ -24,7 +24,7 @@ from urlab_client.protocol.names import NameMap
 from urlab_client.protocol.observer import ClientObserver
 
 if TYPE_CHECKING:
-    import mujoco
+    from urlab_client.protocol.mujoco_types import MjData, MjModel
 
 __all__ = ["ClientState"]
 
@@ -100,12 +100,12 @@ class ClientState:
         return self._state.mode
 
     @property
-    def model(self) -> mujoco.MjModel | None:
+    def model(self) -> MjModel | None:
         """The compiled model, or None before play or with local_model=False."""
         return self._state.mirror.model
 
     @property
-    def data(self) -> mujoco.MjData | None:
+    def data(self) -> MjData | None:
         """Local state that mirrors the server's after each reply, or None without a model.
 
         Poses and velocities that follow from the state (`xpos`, `site_xpos`, `cvel`, …) are computed when this is read

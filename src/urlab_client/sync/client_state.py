@@ -20,7 +20,7 @@ from urlab_client.sync.articulation import URLabArticulation, URLabEntity
 from urlab_client.sync.cameras import URLabCameraView
 
 if TYPE_CHECKING:
-    import mujoco
+    from urlab_client.protocol.mujoco_types import MjData, MjModel
 
 __all__ = ["ClientState"]
 
@@ -87,12 +87,12 @@ class ClientState(Facade, twin=aio.ClientState):
         return self._aio.step_mode
 
     @property
-    def model(self) -> mujoco.MjModel | None:
+    def model(self) -> MjModel | None:
         """The compiled model, or None before play or with local_model=False."""
         return self._aio.model
 
     @property
-    def data(self) -> mujoco.MjData | None:
+    def data(self) -> MjData | None:
         """Local state that mirrors the server's after each reply, or None without a model.
 
         Poses and velocities that follow from the state (`xpos`, `site_xpos`, `cvel`, …) are computed when this is read

@@ -7,6 +7,7 @@ time, spoil the state or keep the solver busy for good: the server may have othe
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from typing import Any, Final, get_type_hints
 
 import mujoco
@@ -23,7 +24,7 @@ from urlab_client.server.refusal import Refusal
 
 __all__ = ["OptionOverrides"]
 
-CHOICES: Final = {
+CHOICES: Final[Mapping[str, Mapping[str, Any]]] = {
     "integrator": {
         "euler": mujoco.mjtIntegrator.mjINT_EULER,
         "rk4": mujoco.mjtIntegrator.mjINT_RK4,
