@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 import msgspec
@@ -89,9 +90,11 @@ async def reset(call: Call, keyframe: str | None = None, joints: dict[str, dict[
     """
     for name, positions in (joints or {}).items():
         for joint, position in positions.items():
-            low, high = call.robot(name).joints[joint].limits or (position, position)
+            found = call.robot(name).joints[joint]
+            low, high = found.limits or (-math.inf, math.inf)
             if not low <= position <= high:
-                raise ValueError(f"joint {joint!r} of {name!r} takes {low:g} to {high:g}, got {position:g}.")
+                takes = f"{low:g} to {high:g} {found.unit}"
+                raise ValueError(f"joint {joint!r} of {name!r} takes {takes}, got {position:g}. Nothing was reset.")
     await call.client.reset(keyframe, per_articulation_qpos=joints)
     return Done(done="The simulation is at its beginning.")
 
