@@ -383,6 +383,9 @@ def test_a_recording_is_made_converted_replayed_in_seconds_and_removed(
             assert elbow(state) == pytest.approx(recorded[row], abs=1e-4)
             assert state["time"] == pytest.approx(table.time[row] - table.time[0])
         assert abs(recorded[0] - live) > 0.03
+        http.post("/api/replay", json={"time": 1.0})
+        past = http.get("/api/replay/states?seconds=0.5").json()["states"]
+        assert [elbow(state) for state in past] == pytest.approx(recorded[2:6], abs=1e-4), "those of the curves"
         pictures = list(read_run(file).frames(camera))
         with http.websocket_connect(f"ws://localhost/api/cameras/{camera}/live") as watching:
             for wanted in (pictures[4], pictures[0], pictures[-1]):
