@@ -1,6 +1,6 @@
 """A robot behind FastAPI: one client for all requests, states to many browsers, events, a restart underneath.
 
-Run: uvicorn fastapi_backend:app --app-dir examples
+Run: uvicorn fastapi_backend:app --app-dir examples --timeout-graceful-shutdown 3
 """
 
 import os

@@ -146,14 +146,18 @@ def minari() -> str:
             env = gymnasium.make("urlab/Reach-v0", max_episode_steps=20, **options)
             if options:
                 env = envhub.ForLeRobot(env, description="reach")
-            collector = library.DataCollector(env, jpeg_encoding=False)  # pictures without loss
+            collector = library.DataCollector(env, record_infos=True, jpeg_encoding=False)  # pictures without loss
             driven: list[tuple[list[Any], list[Any], list[Any]]] = []
+            told: list[list[bool]] = []
             for seed in range(2):
-                seen: list[Any] = [collector.reset(seed=seed)[0]]
+                first, info = collector.reset(seed=seed)
+                seen: list[Any] = [first]
                 actions, rewards, over = [], [], False
+                told.append([info["success"]])
                 while not over:
                     actions.append(rng.uniform(-0.3, 0.3, 7).astype(np.float32))
-                    observation, reward, terminated, truncated, _ = collector.step(actions[-1])
+                    observation, reward, terminated, truncated, info = collector.step(actions[-1])
+                    told[-1].append(info["success"])
                     seen.append(observation)
                     rewards.append(reward)
                     over = terminated or truncated
@@ -162,9 +166,12 @@ def minari() -> str:
             collector.create_dataset(name, algorithm_name="random", code_permalink="-", author="-", author_email="-")
             collector.close()
             loaded = library.load_dataset(name)
-            for episode, (seen, actions, rewards) in zip(loaded.iterate_episodes(), driven, strict=True):
+            for episode, (seen, actions, rewards), successes in zip(
+                loaded.iterate_episodes(), driven, told, strict=True
+            ):
                 found = episode.observations
                 pairs = [(found, seen), (episode.actions, actions), (episode.rewards, rewards)]
+                pairs.append((episode.infos["success"], successes))
                 if options:
                     pairs[0] = (found["agent_pos"], [each["agent_pos"] for each in seen])
                     looked = [each["pixels"]["arm.wrist"] for each in seen]

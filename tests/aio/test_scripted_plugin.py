@@ -401,8 +401,11 @@ async def test_a_frame_of_the_wrong_size_spoils_the_whole_reply(plugin: Any, con
 async def test_an_unknown_camera_is_told_before_sending(plugin: Any, connect: Any) -> None:
     async with connect() as client:
         await client.discover()
-        with pytest.raises(KeyError, match=r"no camera 'c2'; there are: robot/c1, robot/c10"):
+        with pytest.raises(KeyError) as told:
             await client.step(include_cameras={"c2": "sync"})
+        assert str(told.value) == "no camera 'c2'. Known: 'robot/c1' and 'robot/c10'."
+        with pytest.raises(KeyError, match=r"^no camera 'robot/c2'\. Did you mean 'robot/c1' or 'robot/c10'\?"):
+            client.camera("robot/c2")
         assert plugin.requests == []
 
 

@@ -31,6 +31,8 @@ NOT_RUN = {
     r"uvicorn fastapi_backend:app": "tests/examples/test_fastapi_backend.py serves it",
     r"(python examples/clone_behaviour.py|urlab (evaluate|run-policy) clone/)": "takes long: "
     "tests/examples/test_clone_behaviour.py runs its short form",
+    r"(python examples/push_by_sight.py|urlab evaluate \S*push.onnx)": "takes minutes, and PyTorch: "
+    "tests/integrations/test_evaluate.py evaluates a network that sees pictures",
     r"urlab teleop ": "takes keys from a terminal",
     r".* --python lerobot-env/": "needs LeRobot, which has an environment of its own",
     r"(KEY=\$\()?curl ": "test_docs_console.py makes these requests",

@@ -121,7 +121,7 @@ def test_bad_frames_are_refused(client: URLabClient, ik: InverseKinematics) -> N
         InverseKinematics(client, "arm", body="base")
     with pytest.raises(Exception, match="Name the articulation: the scene has arm, quadruped"):
         InverseKinematics(client, site="grip")
-    with pytest.raises(KeyError, match="no joint 'left_finger' moves 'grip'"):
+    with pytest.raises(KeyError, match=r"^the chain to 'grip' has no joint 'left_finger'"):
         ik.solve([0.4, 0.0, 0.4], start={"left_finger": 0.0})
 
 

@@ -419,6 +419,11 @@ def test_damage_costs_what_is_damaged_and_no_more(
     with path.open("rb") as file:
         chunks = make_reader(file).get_summary().chunk_indexes
     assert len(chunks) > 4
+    whole = read_run(path)
+    for moment, step in zip(table.time, table.step, strict=True):  # also where one robot's state is in the next chunk
+        found = whole.state_at(moment)
+        assert found is not None
+        assert (found.step, len(found.articulations)) == (step, 2)
     hurt = chunks[len(chunks) // 2]
     with path.open("r+b") as file:
         file.seek(hurt.chunk_start_offset + hurt.chunk_length // 2)

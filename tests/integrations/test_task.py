@@ -196,7 +196,7 @@ def test_poses_and_contacts_are_those_of_the_state(made: list[Any]) -> None:
     assert not states.touching("geom:quadruped/FL_calf").any(), "the shin, not the foot of the body with its name"
     assert not states.touching("quadruped/trunk").any()
     assert not states.touching("quadruped/FL_calf", "quadruped/FR_calf").any()
-    with pytest.raises(KeyError, match=r"no body 'quadruped/tail'; there are: .*quadruped_trunk"):
+    with pytest.raises(KeyError, match=r"^no body 'quadruped/tail'\. .*quadruped_"):
         states.body_position("quadruped/tail")
     with pytest.raises(ValueError, match="has no free joint"):
         Start(states.scene, states.qpos[0]).place("quadruped/FL_calf", [0, 0, 0])

@@ -383,6 +383,9 @@ def test_a_recording_is_made_converted_replayed_in_seconds_and_removed(
             assert elbow(state) == pytest.approx(recorded[row], abs=1e-4)
             assert state["time"] == pytest.approx(table.time[row] - table.time[0])
         assert abs(recorded[0] - live) > 0.03
+        http.post("/api/replay", json={"time": 1.0})
+        past = http.get("/api/replay/states?seconds=0.5").json()["states"]
+        assert [elbow(state) for state in past] == pytest.approx(recorded[2:6], abs=1e-4), "those of the curves"
         pictures = list(read_run(file).frames(camera))
         with http.websocket_connect(f"ws://localhost/api/cameras/{camera}/live") as watching:
             for wanted in (pictures[4], pictures[0], pictures[-1]):
@@ -481,10 +484,16 @@ def test_pictures_come_as_files_too_while_running_paused_and_stepped(http: TestC
         assert http.get(f"/api/cameras/arm/nothing.{kind}").status_code == 404
 
 
-def test_a_mujoco_without_its_viewer_is_named(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mujoco_without_its_viewer_is_named_and_bodies_do_not_need_it(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(mujoco_viewer, "files", lambda: None)
+    monkeypatch.setattr(mujoco_viewer, "_payload", lambda: None)
     http: TestClient = request.getfixturevalue("http")  # describes the world when it has connected
     assert f"MuJoCo {mujoco.__version__} has no web viewer" in http.get("/api/world").json()["no_view"]
+    with http.websocket_connect("ws://localhost/api/live") as live:
+        heard(live, "state")
+        assert "hand" in {one["name"] for one in http.get("/api/bodies").json()["bodies"]}
 
 
 def test_the_viewer_gets_the_model_and_the_state_that_is_shown(http: TestClient) -> None:

@@ -20,7 +20,7 @@ from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import NoSession
 from urlab_client.protocol.messages.session import NOT_SENT
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.protocol.names import NameMap
+from urlab_client.protocol.names import NameMap, unknown_name
 from urlab_client.protocol.observer import ClientObserver
 
 if TYPE_CHECKING:
@@ -219,12 +219,12 @@ class ClientState:
         """Return a camera by `<articulation>/<camera>`, or by `<camera>` where that means one of them.
 
         Raises:
-            KeyError: There is no such camera, or there are several.
+            UnknownName: A `KeyError`: there is no such camera, or there are several.
         """
         objects = self._state.objects
         view = objects.camera(name)
         if view is None:
-            raise KeyError(f"no camera is called {objects.camera_name(name)!r}")
+            raise unknown_name("camera", name, objects.camera_names())
         return view
 
     def matches(self, snapshot: StateSnapshot) -> bool:

@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar, cast, overload
 
-__all__ = ["NameMap", "UnknownName", "compiled_names", "did_you_mean", "owner_of", "split_prefix"]
+__all__ = ["NameMap", "UnknownName", "compiled_names", "did_you_mean", "owner_of", "split_prefix", "unknown_name"]
 
 T = TypeVar("T")
 D = TypeVar("D")
@@ -73,6 +73,13 @@ class UnknownName(KeyError):
     def __reduce__(self) -> tuple[Any, ...]:
         kind = functools.partial(type(self), owner=self.owner)
         return kind, (self.kind, self.name, self.matches, self.known, self.suggestions)
+
+
+def unknown_name(kind: str, name: object, known: Iterable[str], *, owner: str = "") -> UnknownName:
+    """Return the exception for a name that is none of those, with the ones spelled alike."""
+    names = tuple(known)
+    close = difflib.get_close_matches(name, names) if isinstance(name, str) else []
+    return UnknownName(kind, name, (), names, tuple(close), owner=owner)
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

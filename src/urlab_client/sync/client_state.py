@@ -188,7 +188,7 @@ class ClientState(Facade, twin=aio.ClientState):
         """Return a camera by `<articulation>/<camera>`, or by `<camera>` where that means one of them.
 
         Raises:
-            KeyError: There is no such camera, or there are several.
+            UnknownName: A `KeyError`: there is no such camera, or there are several.
         """
         return self._wrap(URLabCameraView, self._aio.camera(name))
 

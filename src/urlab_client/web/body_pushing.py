@@ -188,7 +188,7 @@ class BodyPushing:
     async def _now(self) -> Shown:
         viewer = self._console.mujoco_viewer
         if await viewer.shown() is None or (shown := viewer.latest()) is None:
-            raise ValueError(viewer.missing or "No state has arrived yet.")
+            raise ValueError(viewer.no_model or "No state has arrived yet.")
         return shown
 
     def _robot(self, shown: Shown, body: int) -> URLabArticulation:

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 
 import anyio
 import anyio.to_thread
-import numpy as np
 from msgspec import structs
 
 from urlab_client.protocol.enums import StepMode
@@ -38,12 +37,13 @@ from urlab_client.web.controls import Controls
 from urlab_client.web.description import WorldDescription, describe
 from urlab_client.web.driving_lease import DrivingLease, Viewer
 from urlab_client.web.hand_driving import HandDriving
-from urlab_client.web.messages import ArticulationSample, Ctrl, EntitySample, Hand, Link, LogEntry, State, Status, World
+from urlab_client.web.messages import Ctrl, Hand, Link, LogEntry, Status, World
 from urlab_client.web.mujoco_viewer import MujocoViewer
 from urlab_client.web.ops import encode
 from urlab_client.web.pictures import Feed
 from urlab_client.web.recordings import Recordings
 from urlab_client.web.replay import Replay
+from urlab_client.web.state_message import rounded, state_message
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabCameraView, URLabClient
@@ -57,7 +57,6 @@ _RETRY_S = 1.0
 _PULSE_S = 0.5
 _CONNECT_S = 3.0
 _KEPT = 300
-_DIGITS = 5
 _AGENT_NAME = 40
 _MOVING_S = 0.4  # a paused server repeats its state ten times a second
 
@@ -310,34 +309,12 @@ class ConsoleSession:
         self.snapshot = snapshot
         self.mujoco_viewer.follow(snapshot)
         self.state_seq += 1
-        wall = snapshot.wall_time.sec + snapshot.wall_time.nsec / 1e9
-        received = snapshot.recv_wall_time_ns / 1e9
-        # The server's own clock where it can be the same as ours; else what we know, when it got here.
-        made = wall if 0 <= received - wall < 10 else received
-        self.state_json = encode(
-            State(
-                seq=self.state_seq,
-                time=snapshot.time,
-                step=snapshot.step,
-                made=made * 1e3,
-                articulations={
-                    key: ArticulationSample(
-                        qpos=_rounded(state.qpos),
-                        qvel=_rounded(state.qvel),
-                        ctrl=None if state.ctrl is None else _rounded(state.ctrl),
-                        sensors={name: _rounded(value) for name, value in (state.sensors or {}).items()},
-                        targets=targets.get(key),
-                    )
-                    for key, state in snapshot.per_articulation.items()
-                },
-                entities={name: EntitySample(_rounded(pose.xpos)) for name, pose in snapshot.entities.items()},
-            )
-        )
+        self.state_json = encode(state_message(self.state_seq, snapshot, targets))
         self.tell()
 
     def _targets(self, key: str) -> list[float] | None:
         art = self.client.articulations.get(key)
-        return _rounded(art.ctrl_array) if art is not None and self.controls.commands(key) else None
+        return rounded(art.ctrl_array) if art is not None and self.controls.commands(key) else None
 
     @property
     def moving(self) -> bool:
@@ -424,10 +401,6 @@ class ConsoleSession:
             return self.client.global_cameras.get(name)
         art = self.client.articulations.get(owner)
         return None if art is None else art.cameras.get(name)
-
-
-def _rounded(values: Any) -> list[Any]:
-    return np.round(np.asarray(values, dtype=np.float64), _DIGITS).tolist()
 
 
 def _said(event: ClientEvent) -> dict[str, Any]:

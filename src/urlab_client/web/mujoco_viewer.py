@@ -95,6 +95,7 @@ def _payload() -> Any:
 class Shown(NamedTuple):
     """A model as the page gets it: `bundle` with the number `crc` that tells it from others, and where values go.
 
+    Without MuJoCo's web viewer there is no page, and `bundle` and `layout` are empty.
     `prefixes` are those of the robots' compiled names. `layout` tells a page where in a state the camera, the selection
     and the overlays lie, so that each page can have its own.
     """
@@ -132,6 +133,11 @@ class MujocoViewer:
             import mujoco  # noqa: PLC0415
 
             return f"MuJoCo {mujoco.__version__} has no web viewer here. Wheels for Linux and macOS have one since 4.0."
+        return self.no_model
+
+    @property
+    def no_model(self) -> str:
+        """Why there is no model; empty when there is one."""
         if self._client.model is not None:
             return ""
         if not self._client.manager_present:
@@ -139,9 +145,9 @@ class MujocoViewer:
         return "There is no compiled model here, without which the 3-D view has nothing to draw."
 
     async def shown(self) -> Shown | None:
-        """Return the client's model, made ready for browsers, or None without one."""
+        """Return the client's model, made ready for browsers where MuJoCo has a viewer for them, or None."""
         model = self._client.model
-        if model is None or files() is None:
+        if model is None:
             return None
         if self._shown is None or self._shown.model is not model:
             prefixes = {key: art.compiled_prefix for key, art in self._client.articulations.items()}
@@ -210,14 +216,15 @@ class MujocoViewer:
 def _prepare(model: mujoco.MjModel, prefixes: Mapping[str, str]) -> Shown:
     import mujoco  # noqa: PLC0415
 
-    bundle: bytes = _payload().serialize_model_bundle(model)
+    viewed = files() is not None
+    bundle: bytes = _payload().serialize_model_bundle(model) if viewed else b""
     camera = mujoco.MjvCamera()
     mujoco.mjv_defaultFreeCamera(model, camera)
     layouts = articulation_layouts(model, prefixes)
     addresses = {key: layout.qpos_adr for key, layout in layouts.items()}
     velocities = {key: layout.qvel_adr for key, layout in layouts.items()}
     flags = [int(flag) for flag in mujoco.MjvScene(model, maxgeom=1).flags]  # shadows, reflections, sky
-    data, layout = mujoco.MjData(model), _layout(model)
+    data, layout = mujoco.MjData(model), _layout(model) if viewed else ""
     return Shown(model, data, bundle, zlib.crc32(bundle), addresses, velocities, camera, flags, prefixes, layout)
 
 

@@ -255,6 +255,7 @@ _PATHS: dict[str, Any] = {
         **_path("post", "replay", "Replay `{name, placing}`, or go on with `{time, playing, rate}`, seconds."),
         **_path("delete", "end_replay", "Show what the server sends again. Needs the controls."),
     },
+    "/api/replay/states": _path("get", "replayed", "States of the last `?seconds` before the replay's place."),
     "/api/lease": {
         **_path("post", "take_controls", "Take the controls, or keep them."),
         **_path("delete", "release_controls", "Give the controls back."),

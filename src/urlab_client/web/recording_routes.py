@@ -11,6 +11,7 @@ from starlette.responses import FileResponse, Response
 from urlab_client.integrations._feed.messages import EpisodeOutcome
 from urlab_client.web.ops import encode
 from urlab_client.web.route_group import Handler, RouteGroup
+from urlab_client.web.state_message import state_message
 
 __all__ = ["RecordingRoutes"]
 
@@ -42,6 +43,7 @@ class RecordingRoutes(RouteGroup):
             ("/api/recordings", self._list, ["GET"]),
             ("/api/recordings/{name}", self._recording, ["GET", "PUT", "DELETE"]),
             ("/api/replay", self._replay, ["POST", "DELETE"]),
+            ("/api/replay/states", self._past, ["GET"]),
         ]
 
     async def _record(self, request: Request) -> Response:
@@ -107,6 +109,10 @@ class RecordingRoutes(RouteGroup):
             await console.replay.begin(console.recordings.path(asked.name), placing=asked.placing)
             console.note("call", viewer.name, "replay", asked.name)
         return _json(await console.replay.change(at=asked.time, playing=asked.playing, rate=asked.rate))
+
+    async def _past(self, request: Request) -> Response:
+        states = await self._console.replay.past(float(request.query_params.get("seconds", 8.0)))
+        return _json({"states": [state_message(n, state, {}) for n, state in enumerate(states)]})
 
 
 def _json(value: object) -> Response:

@@ -38,6 +38,7 @@ __all__ = ["Replay", "ReplayView"]
 _PERIOD_S = 1 / 60
 _PLACED_S = 1 / 25
 _OF_SCENE = "-/"
+_PAST_STATES = 200
 
 
 class ReplayView(Struct):
@@ -167,6 +168,27 @@ class Replay:
         found = await _read(lambda: run.encoded_picture_at(camera.removeprefix(_OF_SCENE), at))
         return found.time - self._start, found
 
+    async def past(self, seconds: float) -> list[StateSnapshot]:
+        """Return states of the last seconds before where it is, evenly spaced, the oldest first.
+
+        Raises:
+            ValueError: Nothing is replayed.
+            URLabError: The file is damaged there.
+        """
+        run, robots, start, at = self._run, self._robots, self._start, self._at
+        if run is None:
+            raise ValueError("no recording is replayed")
+
+        def read() -> list[StateSnapshot]:
+            found: dict[float, StateSnapshot] = {}
+            for moment in np.linspace(max(0.0, at - seconds), at, _PAST_STATES).tolist():
+                state = run.state_at(start + moment)
+                if state is not None and state.time not in found:
+                    found[state.time] = _snapshot(state, _present(state, robots), state.time - start)
+            return [*found.values()]
+
+        return await _read(read)
+
     async def begin(self, file: Path, *, placing: bool = False) -> None:
         """Show a recording from its start.
 
@@ -269,7 +291,7 @@ class Replay:
             if state is None or self._run is not run:
                 return
             self._state = state
-            robots = {key: found for key, robot in self._robots.items() if (found := _values(state, robot))}
+            robots = _present(state, self._robots)
             targets = {key: values.set_points.tolist() for key, values in robots.items() if len(values.set_points)}
             self._console.show(_snapshot(state, robots, state.time - self._start), targets)
 
@@ -324,6 +346,10 @@ def _robot(names: Mapping[str, list[str]], key: str, art: URLabArticulation) -> 
             return None
         places += own
     return _Robot("joints", size, places) if len(places) == size else None
+
+
+def _present(state: RecordedState, robots: Mapping[str, _Robot]) -> dict[str, RecordedArticulation]:
+    return {key: found for key, robot in robots.items() if (found := _values(state, robot))}
 
 
 def _values(state: RecordedState, robot: _Robot) -> RecordedArticulation | None:

@@ -18,7 +18,7 @@ from urlab_client.aio.session import Session
 from urlab_client.aio.state.handshake import Examined
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraFrame, CameraInfo, HelloOk, StepOk
-from urlab_client.protocol.names import NameMap
+from urlab_client.protocol.names import NameMap, UnknownName, unknown_name
 
 __all__ = ["SceneObjects"]
 
@@ -89,7 +89,7 @@ class SceneObjects:
         """Return which of `camera_names` a user means by `<articulation>/<camera>` or just `<camera>`.
 
         Raises:
-            KeyError: None of them, or several.
+            UnknownName: None of them, or several.
         """
         names = self.camera_names()
         owner, slash, short = text("camera", name).rpartition("/")
@@ -99,9 +99,9 @@ class SceneObjects:
         else:
             found = [known for known in names if known == name or known.endswith(f"/{name}")]
         if not found:
-            raise KeyError(f"no camera {name!r}; there are: {', '.join(names) or 'none'}")
+            raise unknown_name("camera", name, names)
         if len(found) > 1:
-            raise KeyError(f"camera {name!r} is ambiguous: it could mean {' or '.join(map(repr, found))}")
+            raise UnknownName("camera", name, tuple(found), tuple(names), ())
         return found[0]
 
     def with_cameras(

@@ -16,6 +16,7 @@ from urlab_client.aio.model.mirror import model_names
 from urlab_client.integrations.gym.spaces import Observation, Space, SpaceMapping, SpaceMode, dict_space
 from urlab_client.integrations.gym.starts import ResetNoise, noise_of
 from urlab_client.protocol.base import Floats
+from urlab_client.protocol.names import unknown_name
 
 __all__ = [
     "EpisodeSettings",
@@ -55,7 +56,7 @@ class TaskScene:
         known = self._ids.setdefault(kind, {n: i for i, n in enumerate(model_names(self.model, kind))})
         found = known.get(name, known.get(name.replace("/", "_", 1)))
         if found is None:
-            raise KeyError(f"no {kind} {name!r}; there are: {', '.join(filter(None, known))}")
+            raise unknown_name(kind, name, filter(None, known))
         return found
 
     def geoms(self, name: str) -> NDArray[np.intp]:

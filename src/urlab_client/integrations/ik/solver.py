@@ -19,7 +19,7 @@ from urlab_client.aio.model.mirror import model_names
 from urlab_client.aio.model.numbers import finite, finite_array
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.errors import URLabError
-from urlab_client.protocol.names import did_you_mean
+from urlab_client.protocol.names import unknown_name
 from urlab_client.protocol.serializable import Serializable
 from urlab_client.sync.articulation import URLabArticulation
 from urlab_client.sync.client import URLabClient
@@ -152,7 +152,7 @@ class InverseKinematics:
         qpos = self._present()
         for name, position in (joints or {}).items():
             if name not in self.joints:
-                raise KeyError(f"no joint {name!r} moves {self.frame!r}; those that do: {', '.join(self.joints)}")
+                raise unknown_name("joint", name, self.joints, owner=f"the chain to {self.frame!r}")
             qpos[self._qpos[self.joints.index(name)]] = finite(f"joint {name!r}", position)
         self._configuration.update(qpos)
         return self._frame_pose()
@@ -227,7 +227,7 @@ class InverseKinematics:
         first: NDArray[np.float64] = qpos[self._qpos]
         for name, position in (start or {}).items():
             if name not in self.joints:
-                raise KeyError(f"no joint {name!r} moves {self.frame!r}; those that do: {', '.join(self.joints)}")
+                raise unknown_name("joint", name, self.joints, owner=f"the chain to {self.frame!r}")
             first[self.joints.index(name)] = finite(f"start: joint {name!r}", position)
         low, high = np.maximum(self._low, -np.pi), np.minimum(self._high, np.pi)
         for i in range(starts):
@@ -312,9 +312,7 @@ def _frame_id(model: mujoco.MjModel, robot: URLabArticulation | AsyncArticulatio
     found = own.get(prefix + name, own.get(name))
     if found is None:
         short = [known.removeprefix(prefix) for known in own]
-        raise KeyError(
-            f"{robot.name!r} has no site {name!r}.{did_you_mean(name, short)} It has: {', '.join(short) or 'none'}"
-        )
+        raise unknown_name("site", name, short, owner=robot.name)
     return found
 
 

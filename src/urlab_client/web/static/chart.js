@@ -86,9 +86,14 @@ export class Chart {
   }
 
   draw(colors) {
-    if (!this.stale || !this.seen || !this.data.times.length) return;
+    if (!this.stale || !this.seen) return;
     this.stale = false;
     const { times, values } = this.data;
+    if (!times.length) {
+      this.canvas.getContext("2d").clearRect(0, 0, this.canvas.width, this.canvas.height);
+      this.values.forEach((box) => text(box, ""));
+      return;
+    }
     const { span, hover } = this.view;
     const { end } = this;
     const [from, to] = [Math.max(0, this.data.at(end - span) - 1), this.data.at(end + 1e-9)];

@@ -51,6 +51,10 @@ function keys(event) {
 export function makeReplay() {
   $("replay").append(h("span", { class: "tag" }, "Replay"), name, play, line, where, pace, placing,
     h("button", { id: "replay-end", class: "primary", onclick: () => ask("DELETE", "api/replay") }, "Back to live"));
+  // Below the bar where that stays in sight, so that both are there while cameras and curves are looked at.
+  new ResizeObserver(() => {
+    $("replay").style.top = getComputedStyle($("bar")).position === "sticky" ? `${$("bar").offsetHeight}px` : "0";
+  }).observe($("bar"));
   on("status", (status) => {
     replay = status.replay;
     $("replay").hidden = replay === null;

@@ -1,13 +1,16 @@
 // Curves over the last seconds of simulation time: sensors, and of each robot what joints and actuators do.
 
-import { Chart, COLORS } from "./chart.js";
+import { Chart, ChartData, COLORS } from "./chart.js";
 import { $, h } from "./dom.js";
-import { on } from "./link.js";
+import { ask, on } from "./link.js";
 
 const SPANS = [2, 8, 30, 120];
 const AXES = { 3: ["x", "y", "z"], 4: ["w", "x", "y", "z"] };
 const KEPT_S = SPANS.at(-1);
-const span = h("select", { id: "span", "aria-label": "Seconds of the curves", onchange: () => charts.forEach((chart) => chart.touch()) },
+const span = h("select", { id: "span", "aria-label": "Seconds of the curves", onchange: () => {
+  charts.forEach((chart) => chart.touch());
+  if (replay) fill();
+} },
   SPANS.map((seconds) => h("option", { value: seconds, selected: seconds === 8 }, `${seconds} s`)));
 const pause = h("button", { id: "pause-curves", "aria-pressed": "false", onclick: () => hold(!view.held) }, "❚❚ Hold");
 const back = h("input", { type: "range", id: "scroll-back", min: 0, max: KEPT_S, step: "any", value: KEPT_S, "aria-label": "Scroll back", hidden: true,
@@ -17,6 +20,52 @@ const probe = h("i", { hidden: true });
 /** What all curves show alike: up to when, or the newest while nothing is held; where somebody points. */
 const view = { held: false, end: 0, last: 0, first: 0, hover: null, get span() { return +span.value; } };
 let charts = [];
+let replay = null;
+let came = 0;
+let filling = false;
+let again = false;
+
+function take(state) {
+  if (state.time < view.last) view.first = state.time;
+  view.last = state.time;
+  view.first = Math.max(view.first, view.last - KEPT_S);
+  for (const chart of charts) {
+    const own = state.articulations[chart.source.art];
+    const values = own && chart.source.read(own);
+    if (values) chart.data.add(state.time, values, KEPT_S);
+  }
+  if (!view.held) charts.forEach((chart) => chart.touch());
+}
+
+function clear() {
+  for (const chart of charts) {
+    chart.data = new ChartData();
+    chart.touch();
+  }
+  view.first = view.last = 0;
+}
+
+/** Show what comes before the replay's place, as if it had been watched up to there. */
+async function fill() {
+  again = true;
+  if (filling) return;
+  filling = true;
+  while (again && replay) {
+    again = false;
+    const past = await ask("GET", `api/replay/states?seconds=${view.span}`, undefined, { quiet: true });
+    if (!past || !replay) break;
+    clear();
+    past.states.forEach(take);
+  }
+  filling = false;
+}
+
+/** Whether a replay went to another place, rather than on. */
+function jumped(time) {
+  const due = ((performance.now() - came) / 1000) * (replay?.rate ?? 1) + 0.5;
+  came = performance.now();
+  return time < view.last || time > view.last + due;
+}
 
 function hold(held) {
   Object.assign(view, { held, end: view.last });
@@ -101,15 +150,15 @@ export function makeSensors() {
   });
   on("state", (state) => {
     if (state.time < view.last && view.held) hold(false);
-    if (state.time < view.last) view.first = state.time;
-    view.last = state.time;
-    view.first = Math.max(view.first, view.last - KEPT_S);
-    for (const chart of charts) {
-      const own = state.articulations[chart.source.art];
-      const values = own && chart.source.read(own);
-      if (values) chart.data.add(state.time, values, KEPT_S);
-    }
-    if (!view.held) charts.forEach((chart) => chart.touch());
+    if (jumped(state.time) && replay) fill();
+    take(state);
+  });
+  on("status", (status) => {
+    const other = status.replay?.name !== replay?.name;
+    replay = status.replay;
+    if (!other) return;
+    clear();
+    if (replay) fill();
   });
   const paint = () => {
     requestAnimationFrame(paint);
