@@ -92,6 +92,7 @@ class Call:
         self.models = models
         self._progress = progress
         self._seconds = 0.0
+        self._rests = True
 
     def robot(self, name: str) -> URLabArticulation:
         """Return a robot.
@@ -139,7 +140,7 @@ class Call:
 
         Raises:
             NotDriving: Somebody else has the controls; nothing was done.
-            Stopped: Somebody took the controls meanwhile, or it took too long; the simulation is at rest.
+            Stopped: Somebody took the controls meanwhile, or it took too long; the text says whether the simulation is at rest.
         """
         began = False
         why = f"It took longer than {self.limits.wall_seconds:g} s on the wall."
@@ -152,7 +153,8 @@ class Call:
                 why = str(refusal)
                 if not began:
                     raise NotDriving(f"{why} Nothing was done. Call again later, or ask.") from None
-        raise Stopped(f"{why} The call was broken off, and the simulation is at rest. Call state before going on.")
+        rests = "and the simulation is at rest" if self._rests else "but the simulation may still move"
+        raise Stopped(f"{why} The call was broken off, {rests}. Call state before going on.")
 
     async def _reported(self, work: Callable[[], Awaitable[T]]) -> T:
         """Do something, report its progress, and leave the simulation at rest if it is broken off."""
@@ -182,7 +184,9 @@ class Call:
 
     async def _rest(self) -> None:
         """Leave the simulation at rest: nothing in doubt, and paused where time passes by itself."""
+        self._rests = False
         with anyio.move_on_after(_REST_S), contextlib.suppress(URLabError):
             await self.client.resync()
             if self.client.step_mode is StepMode.LIVE:
                 await self.client.runtime.set_paused(True)
+            self._rests = True
