@@ -114,15 +114,17 @@ class Page:
         return f"Math.abs(parseFloat({shown}.replace('\u2212', '-')) - {value}) < 0.03"
 
     def phone(self) -> contextlib.AbstractContextManager[None]:
-        """Be as small as a phone for a while."""
+        """Be as small as a phone for a while, and touched instead of clicked."""
 
         @contextlib.contextmanager
         def held() -> Iterator[None]:
             self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", PHONE)
+            self.driver.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", {"enabled": True})
             try:
                 self.until(f"innerWidth === {PHONE['width']}")
                 yield
             finally:
+                self.driver.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", {"enabled": False})
                 self.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
         return held()

@@ -383,6 +383,7 @@ def test_the_log_is_for_people_and_every_control_has_a_name_and_a_size(page: Pag
 
 def test_the_controls_are_a_sheet_on_a_phone(page: Page) -> None:
     with page.phone():
+        page.until("document.querySelector('#view .hint').textContent.includes('two fingers')")
         visible = "getComputedStyle(document.querySelector('#sheet')).visibility === 'visible'"
         page.until(f"!({visible})")
         page.click("#sheet-toggle")

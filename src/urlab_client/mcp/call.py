@@ -140,7 +140,7 @@ class Call:
 
         Raises:
             NotDriving: Somebody else has the controls; nothing was done.
-            Stopped: Somebody took the controls meanwhile, or it took too long; the text says whether the simulation is at rest.
+            Stopped: Somebody took the controls meanwhile, or it took too long; says whether the simulation is at rest.
         """
         began = False
         why = f"It took longer than {self.limits.wall_seconds:g} s on the wall."

@@ -150,7 +150,9 @@ class BodyPushing:
             raise ValueError("A replay is shown. Go back to live to push.")
         client = self._console.client
         if client.step_mode is StepMode.LIVE:
-            raise ValueError("In mode live the server takes no forces. Choose mode direct and Play, or puppet.")
+            raise ValueError(
+                "In mode live a force lasts one physics step at most. To push, choose mode direct and Play, or puppet."
+            )
         self._console.lease.use(viewer)
         if client.step_mode is StepMode.PUPPET:
             await self._place(shown, push, robot)

@@ -104,5 +104,5 @@ export function makeBodies(frame) {
   on("world", () => { here.fitted = false; });
   setInterval(look, LOOK_MS);
   push.disabled = true;
-  return { bar, hear, begun: () => { here.fitted = false; } };
+  return { bar, hear, fit, begun: () => { here.fitted = false; } };
 }

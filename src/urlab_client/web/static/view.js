@@ -6,6 +6,10 @@ import { $, h, text } from "./dom.js";
 import { on } from "./link.js";
 
 const OPEN = "urlab-view";
+const TOUCH = window.matchMedia("(pointer: coarse)");
+const UPRIGHT = window.matchMedia("(orientation: portrait)");
+const WITH_MOUSE = "Drag to turn, with the right button or Shift to move, scroll for the distance. Click a body to select it; Push, or Ctrl, and drag to push it.";
+const WITH_FINGERS = "Drag to turn, with two fingers to move and for the distance. Tap a body to select it; Push and drag to push it.";
 
 /** Why this browser cannot show it, or nothing. */
 function lacking() {
@@ -18,8 +22,9 @@ export function makeView() {
   const cover = h("p", { class: "cover", role: "status" });
   const stage = h("div", { class: "stage" }, cover);
   const bodies = makeBodies(() => stage.querySelector("iframe")?.contentWindow);
+  const hint = h("p", { class: "hint" });
   const box = h("details", { id: "view-box" }, h("summary", {}, h("h2", {}, "3-D view")), bodies.bar, stage,
-    h("p", { class: "hint" }, "Drag to turn, with the right button or Shift to move, scroll for the distance. Click a body to select it; Push, or Ctrl, and drag to push it."));
+    hint);
   $("view").append(box);
   const here = { socket: false, link: "connecting", missing: "", shown: false };
   const unable = lacking();
@@ -62,6 +67,10 @@ export function makeView() {
     }
     bodies.hear(data);
   });
+  const explain = () => text(hint, TOUCH.matches ? WITH_FINGERS : WITH_MOUSE);
+  TOUCH.addEventListener("change", explain);
+  explain();
+  UPRIGHT.addEventListener("change", () => requestAnimationFrame(bodies.fit)); // a phone was turned
   on("open", () => { here.socket = true; show(); });
   on("closed", () => { here.socket = false; show(); });
   on("status", (status) => { here.link = status.link.state; show(); });
