@@ -26,6 +26,7 @@ PICTURES = {
     "console_sheet.webp": ("tools/console_pictures.py", ""),
     "frames.svg": ("tools/gen_frames.py", ""),
     "gym_arm.png": ("examples/gym_env.py", "arm.png"),
+    "home.webp": ("tools/home_picture.py", ""),
     "policy.png": ("examples/run_policy.py", "policy.png"),
     "ray_timeline.png": ("examples/ray_rollouts.py", "timeline.png"),
     "recorded_run.png": ("examples/record_run.py", "run.png"),

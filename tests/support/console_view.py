@@ -39,8 +39,8 @@ class View:
         # Blue, as parts of the arm are, and nothing else.
         self.until_picture(lambda seen: ((seen @ [-1.0, -0.5, 1.0]) > 60).mean() > 0.001, "the arm never appeared")
 
-    def until_it_differs(self, before: Picture, problem: str, least: float) -> None:
-        self.until_picture(lambda seen: _share_that_differs(seen, before) > least, problem)
+    def until_it_differs(self, before: Picture, problem: str) -> None:
+        self.until_picture(lambda seen: _share_that_differs(seen, before) > 0.0003, problem)
 
     def until_it_is(self, before: Picture, problem: str) -> None:
         self.until_picture(lambda seen: _share_that_differs(seen, before) < 0.0001, problem)

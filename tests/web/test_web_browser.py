@@ -410,12 +410,10 @@ def test_a_second_viewer_drives_only_when_the_first_lets_go(page: Page, tmp_path
         page.until("document.querySelector('#driver').dataset.who === 'other'")
 
 
-@pytest.fixture
-def solid(page: Page, tmp_path: Path) -> Iterator[View]:
-    """The 3-D view of a browser that can draw it; all robots are seen, and nobody drives."""
+def test_the_3d_view_follows_the_robot_shows_overlays_and_is_pushed(page: Page, tmp_path: Path) -> None:
     page.until("document.querySelector('#view').innerText.includes('no WebGL')")
     page.until("document.querySelector('#driver').dataset.who !== 'other'")  # who drove has closed their browser
-    with opened(tmp_path, page.invitation(), (*SOLID, "--window-size=1000,1000")) as one:
+    with opened(tmp_path, page.invitation(), (*SOLID, "--window-size=640,640")) as one:
         view = View(one)
         view.until_the_arm_is_seen()
         one.until("document.querySelector('#body').options.length > 3")
@@ -423,44 +421,40 @@ def solid(page: Page, tmp_path: Path) -> Iterator[View]:
         if page.look("document.querySelector('#driver').dataset.who === 'me'"):
             page.click("#drive")
         one.until("document.querySelector('#driver').dataset.who === 'free'")
-        yield view
+        one.slide(0.0)
+        one.until(one.elbow_is(0.0))
+        before = view.picture()
+        one.slide(1.2)
+        view.until_it_differs(before, "the arm never moved")
+        shows_overlays(view)
+        is_pushed(view)
 
 
-def test_the_3d_view_shows_the_robot_and_follows_it(solid: View) -> None:
-    solid.page.slide(0.0)
-    solid.page.until(solid.page.elbow_is(0.0))
-    before = solid.picture()
-    solid.page.slide(1.2)
-    solid.until_it_differs(before, "the arm never moved", least=0.0005)
-
-
-def test_frames_and_contacts_are_drawn_in_the_3d_view(solid: View) -> None:
-    solid.page.click("#stop")
-    solid.page.until(f"!({RUNNING})")
-    plain = solid.picture()
+def shows_overlays(view: View) -> None:
+    view.page.click("#stop")
+    view.page.until(f"!({RUNNING})")
+    plain = view.picture()
     for overlay in ("#show-frames", "#show-contacts"):
-        solid.page.click(overlay)
-        solid.until_it_differs(plain, f"{overlay} showed nothing", least=0.0003)
-        solid.page.click(overlay)
-        solid.until_it_is(plain, f"{overlay} stayed")
-    solid.page.click("#play")
-    solid.page.until(RUNNING)
+        view.page.click(overlay)
+        view.until_it_differs(plain, f"{overlay} showed nothing")
+        view.page.click(overlay)
+        view.until_it_is(plain, f"{overlay} stayed")
 
 
-def test_a_body_in_the_3d_view_is_selected_and_pushed_with_the_mouse(solid: View) -> None:
-    page = solid.page
+def is_pushed(view: View) -> None:
+    page = view.page
     page.choose("#mode", "direct")
     page.until("!document.querySelector('#step').disabled")
     if not page.look(RUNNING):
         page.click("#play")
     page.until(RUNNING)
-    x, y, body = solid.select("quadruped")
+    x, y, body = view.select("quadruped")
     height = page.ask(f"api/bodies/{body}")["position"][2]
     page.click("#push")
-    solid.pointer("pointerdown", x, y)
-    solid.pointer("pointermove", x, y - 150)
+    view.pointer("pointerdown", x, y)
+    view.pointer("pointermove", x, y - 60)
     page.asked(f"api/bodies/{body}", lambda one: one["position"][2] > height + 0.1)
-    solid.pointer("pointerup", x, y - 150)
+    view.pointer("pointerup", x, y - 60)
     page.asked(f"api/bodies/{body}", lambda one: one["position"][2] < height + 0.05)
     page.choose("#mode", "live")
     page.until(RUNNING)
