@@ -14,11 +14,11 @@ import anyio
 import pytest
 from agents import ALL, Desk, desk, text_of
 from jsonschema import Draft202012Validator
+from mcp import Client
 from mcp.shared.exceptions import MCPError
 from PIL import Image
 from waiting import until
 
-from mcp import Client
 from urlab_client.aio import URLabClient
 from urlab_client.integrations.record import read_run
 from urlab_client.mcp import Agent, Limits

@@ -12,12 +12,12 @@ import httpx2
 import pytest
 from agents import ALL, text_of
 from http_served import served
+from mcp import Client
 from mcp.client.stdio import StdioServerParameters, stdio_client
 from mcp.client.streamable_http import streamable_http_client
 from ports import free_port
 from waiting import DEADLINE_S
 
-from mcp import Client
 from urlab_client._installation import install_command
 from urlab_client.aio import URLabClient
 from urlab_client.cli import main

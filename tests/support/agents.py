@@ -8,9 +8,9 @@ from collections.abc import AsyncGenerator, Callable
 from pathlib import Path
 from typing import Any
 
+from mcp import Client
 from mcp.types import CallToolResult
 
-from mcp import Client
 from urlab_client.aio import URLabClient
 from urlab_client.mcp import Agent, Limits
 from urlab_client.server import SimulatedServer

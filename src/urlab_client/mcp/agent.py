@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
+from mcp import types
 from mcp.server import Server
 from mcp.server.context import ServerRequestContext
 from mcp.shared.exceptions import MCPError
 from msgspec import Struct
 
-from mcp import types
 from urlab_client.mcp import editing, looking, moving
 from urlab_client.mcp.call import TAKEN_OVER, Call, Caller, Limits, Stopped
 from urlab_client.mcp.declaration import Declared, Needs, declared
