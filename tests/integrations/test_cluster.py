@@ -100,12 +100,18 @@ def test_episodes_are_whole_and_differ_by_seed(expected: dict[int, Any]) -> None
 
 
 def notes_children(folder: Path) -> Any:
-    """Return a policy that notes the children's process ids, in a file for each process."""
+    """Return a policy that notes the children's process ids, in a file for each process, and waits for the other one.
+
+    Otherwise a worker that is quick could have done everything before the other has begun.
+    """
     inner, name = noisy(), str(folder)
 
     def policy(observation: Any, rng: np.random.Generator) -> Any:
         children = [file.read_text() for file in Path("/proc/self/task").glob("*/children")]
         Path(name, str(os.getpid())).write_text("".join(children))
+        deadline = time.monotonic() + 60
+        while len(os.listdir(name)) < 2 and time.monotonic() < deadline:
+            time.sleep(0.01)
         return inner(observation, rng)
 
     return policy
