@@ -16,16 +16,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-
-def _fast(renderer: Any) -> None:
-    gl: Any = importlib.import_module("OpenGL.GL")  # after the context, whose module chooses its platform
-    for texture, kind in zip(renderer.texture, renderer.textureType, strict=True):
-        if texture:
-            flat = kind == mujoco.mjtTexture.mjTEXTURE_2D
-            target = gl.GL_TEXTURE_2D if flat else gl.GL_TEXTURE_CUBE_MAP
-            gl.glBindTexture(target, int(texture))
-            sampling = gl.GL_LINEAR_MIPMAP_NEAREST if flat else gl.GL_LINEAR
-            gl.glTexParameteri(target, gl.GL_TEXTURE_MIN_FILTER, sampling)
+from urlab_client.server.render.drawing import simplify_textures
 
 
 def _main(backend: str, path: str, camera: str, width: int, height: int) -> None:
@@ -45,7 +36,7 @@ def _main(backend: str, path: str, camera: str, width: int, height: int) -> None
     scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
     renderer: Any = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
     mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, renderer)
-    _fast(renderer)
+    simplify_textures(renderer, importlib.import_module("OpenGL.GL"))  # only now: the context chooses its platform
     area, pixels = mujoco.MjrRect(0, 0, width, height), np.empty((height, width, 3), np.uint8)
     for line in sys.stdin:
         times: list[float] = []

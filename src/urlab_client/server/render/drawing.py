@@ -29,7 +29,7 @@ from urlab_client.server.render.viewport_picture import (
     showing,
 )
 
-__all__ = ["NO_HIT_CM", "RenderQuality", "Stage"]
+__all__ = ["NO_HIT_CM", "RenderQuality", "Stage", "simplify_textures"]
 
 Bytes = NDArray[np.uint8]
 
@@ -84,7 +84,7 @@ class Stage:
         self._renderer.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
         self._opengl: Any = importlib.import_module("OpenGL.GL")  # only now: the context's module chooses its platform
         if self._fast:
-            self._simplify_textures()
+            simplify_textures(self._renderer, self._opengl)
 
     def __enter__(self) -> Self:
         return self
@@ -165,17 +165,6 @@ class Stage:
             mujoco.mjr_overlay(font, corner, area, ascii_text(picture.overlay), "", renderer)
         return self._read_colors(area, "RGBA")
 
-    def _simplify_textures(self) -> None:
-        """Sample one mipmap of a texture, and none of a cube, which is seen enlarged: a third of the time."""
-        gl, renderer = self._opengl, self._renderer
-        for texture, kind in zip(renderer.texture, renderer.textureType, strict=True):
-            if texture:
-                flat = kind == mujoco.mjtTexture.mjTEXTURE_2D
-                target = gl.GL_TEXTURE_2D if flat else gl.GL_TEXTURE_CUBE_MAP
-                gl.glBindTexture(target, int(texture))
-                sampling = gl.GL_LINEAR_MIPMAP_NEAREST if flat else gl.GL_LINEAR
-                gl.glTexParameteri(target, gl.GL_TEXTURE_MIN_FILTER, sampling)
-
     def _read_colors(self, area: mujoco.MjrRect, order: str) -> Bytes:
         """Return what was drawn, opaque, from the top, shape (height, width, 4).
 
@@ -207,6 +196,22 @@ class Stage:
                 palette[drawn.segid + 1, :3] = tints[drawn.objid]
         ids = colors.astype(np.uint32) @ np.array([1, 1 << 8, 1 << 16], np.uint32)
         return palette[ids]
+
+
+def simplify_textures(renderer: Any, gl: Any) -> None:
+    """Sample one mipmap of a texture, and none of a cube, which is seen enlarged: a third of the time.
+
+    Args:
+        renderer: `MjrContext` whose textures these are.
+        gl: `OpenGL.GL`, imported after the context was made.
+    """
+    for texture, kind in zip(renderer.texture, renderer.textureType, strict=True):
+        if texture:
+            flat = kind == mujoco.mjtTexture.mjTEXTURE_2D
+            target = gl.GL_TEXTURE_2D if flat else gl.GL_TEXTURE_CUBE_MAP
+            gl.glBindTexture(target, int(texture))
+            sampling = gl.GL_LINEAR_MIPMAP_NEAREST if flat else gl.GL_LINEAR
+            gl.glTexParameteri(target, gl.GL_TEXTURE_MIN_FILTER, sampling)
 
 
 def _bring_near(camera: Any) -> None:
