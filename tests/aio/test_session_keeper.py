@@ -15,7 +15,7 @@ from waiting import until as wait_until
 
 from urlab_client.aio import Stream, URLabClient
 from urlab_client.aio.state import session_keeper
-from urlab_client.protocol.errors import SessionTakenOver
+from urlab_client.protocol.errors import ServerRestarted, SessionTakenOver
 from urlab_client.protocol.messages.streams import (
     ClientEvent,
     PlayEnded,
@@ -73,6 +73,29 @@ async def test_a_restarted_server_is_discovered_again(ports: dict[str, int]) -> 
         await wait_until(lambda: client.step_count == 0)
         assert client.articulations["arm"] is arm
         assert (await client.step(3)).step == 3
+
+
+@pytest.mark.parametrize(("mode", "keep"), [("direct", True), ("direct", False), ("live", False)])
+async def test_waiting_across_a_restart_says_that_the_server_was_started_again(
+    mode: str, keep: bool, ports: dict[str, int]
+) -> None:
+    async with SimulatedServer("arm", play=True, unpaused=True, **ports) as first:
+        client = keeping(first, step_mode=mode, keep_session=keep)
+        await client.discover()
+        events = client.events()
+        if mode == "live":
+            waiting = asyncio.create_task(client.wait_until(lambda: False, timeout=1e6))
+            await wait_until(lambda: client.sim_time > 0.1)
+    await is_gone(client, events)
+    if mode == "direct":
+        waiting = asyncio.create_task(client.wait_until(lambda: False, timeout=1e6))
+    async with SimulatedServer("arm", play=True, unpaused=True, **ports), client:
+        with pytest.raises(ServerRestarted, match=r"was started again.* Call discover\(\)") as info:
+            await waiting
+        assert "another" not in str(info.value)
+        assert "takes the server over" not in str(info.value)
+        await client.discover()
+        await client.run_for(0.01)
 
 
 async def test_a_session_that_was_taken_over_is_not_taken_back(ports: dict[str, int]) -> None:

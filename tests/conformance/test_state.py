@@ -387,3 +387,30 @@ async def test_an_actuator_behind_one_of_several_controls_has_its_own_range_and_
         robot.set_ctrl({"last": 1.5})
         await client.step()
         assert robot.ctrl_array.tolist() == robot.last_applied_ctrl.tolist() == [0.0, 0.0, 0.0, 1.5]
+
+
+async def test_after_each_handshake_the_state_is_the_servers(connect: Any, serve: Any, bot: str) -> None:
+    """Also where play went on, or ran long before this client came: a handshake tells of the model alone."""
+    with serve(bot, play=True) as server:
+        client, late = connect(server, step_mode="direct"), connect(server, step_mode="direct", local_model=False)
+
+        def state(of: Any) -> list[Any]:
+            (art,) = of.articulations.values()
+            local = [] if of.data is None else [of.data.time, of.data.qpos.tolist()]
+            assert of.sim_time == pytest.approx(of.sim_time_sec + of.sim_time_nsec / 1e9)
+            return [of.sim_time, art.qpos_array.tolist(), art.qvel_array.tolist(), *local]
+
+        await client.discover()
+        begun = state(client)
+        await client.step(50)
+        ran = state(client)
+        await client.sim.start()
+        assert (state(client), client.step_count) == (ran, 50), "play went on"
+        await late.discover()
+        assert (state(late), late.step_count) == (ran[:3], 0)
+        await late.sim.stop()
+        await late.sim.start()
+        assert (state(late), late.step_count) == (begun[:3], 0)
+        await late.step(50)
+        await client.discover()
+        assert (state(client), client.step_count) == (ran, 0)

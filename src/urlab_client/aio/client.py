@@ -193,6 +193,7 @@ class URLabClient(ClientState):
             self,
             driven=lambda: any(record.driven for record in self._state.objects.records.values()),
             patience=rcv_timeout_ms / 1000,
+            session=session,
         )
         state = SimState(
             session, self._publishers, self._motion, wanted_mode=StepMode(step_mode), live_pictures=live_pictures

@@ -15,8 +15,9 @@ from urlab_client.aio.arguments import mapping
 from urlab_client.aio.event_loop import running_loop
 from urlab_client.aio.model.elements import Actuator, Joint
 from urlab_client.aio.model.numbers import finite
+from urlab_client.aio.session import Session, server_restarted
 from urlab_client.aio.streams import Stream
-from urlab_client.protocol.client_types import Diagnosis, Resync, Verdict
+from urlab_client.protocol.client_types import Diagnosis, Verdict
 from urlab_client.protocol.enums import OutOfRange, StepMode
 from urlab_client.protocol.errors import NotSettled, URLabTimeoutError
 from urlab_client.protocol.messages.session import StepOk
@@ -42,12 +43,9 @@ class Simulation(Protocol):
     @property
     def sim_time(self) -> float: ...
     @property
-    def step_count(self) -> int: ...
-    @property
     def model(self) -> mujoco.MjModel | None: ...
     async def step(self, n_steps: int = 1) -> StepOk: ...
     def state_stream(self) -> Stream[StateSnapshot]: ...
-    async def resync(self) -> Resync: ...
     async def explain(self) -> Diagnosis: ...
 
 
@@ -69,10 +67,14 @@ class Motion:
         simulation: The client.
         driven: Tells whether the client has set-points of its own, which in live mode must be handed over.
         patience: Seconds on the wall in which simulation time must move; None waits without limit.
+        session: Tells of restarts of the server.
     """
 
-    def __init__(self, simulation: Simulation, *, driven: Callable[[], bool], patience: float | None) -> None:
+    def __init__(
+        self, simulation: Simulation, *, driven: Callable[[], bool], patience: float | None, session: Session
+    ) -> None:
         self._simulation = simulation
+        self._session = session
         self._driven = driven
         self._patience = patience
 
@@ -137,14 +139,14 @@ class Motion:
         """Let time pass until something is so or the limit has come; return how much passed, and whether it is so."""
         simulation = self._simulation
         live = simulation.step_mode is StepMode.LIVE
-        if not live and not simulation.step_count:
-            await simulation.resync()  # where a simulation stands that ran before this client came
         if done():
             return 0.0, True
         start = simulation.sim_time
+        restarts = self._session.restarts
         passed = 0.0
         async with aclosing(self._passing(what, limit, slice_s)) as times:
             async for now in times:
+                self._check_restarts(what, restarts)
                 if live:  # the first that is known to be new, whatever was known before
                     start, live = now, False
                 # A reset puts the clock back: what passed since counts, too.
@@ -178,10 +180,11 @@ class Motion:
         loop = running_loop()
         if self._driven():
             await self._simulation.step()
-        newest, since = -1.0, loop.time()
+        newest, since, restarts = -1.0, loop.time(), self._session.restarts
         async with self._simulation.state_stream() as snapshots:
             while True:
                 now = (await snapshots.receive(timeout=self._patience)).time
+                self._check_restarts(what, restarts)  # a new server is paused: time stands still there
                 if now != newest:
                     newest, since = now, loop.time()
                     yield now
@@ -190,6 +193,10 @@ class Motion:
                         f"{what}: simulation time has stood still at {now:.3f} s for {self._patience:g} s.",
                         hint=await self._findings(),
                     )
+
+    def _check_restarts(self, what: str, before: int) -> None:
+        if self._session.restarts != before:  # by now the session may be one with the new server
+            raise server_restarted(what, self._session.transport.endpoint)
 
     @staticmethod
     def _still_moving(joints: Iterable[Joint]) -> str | None:

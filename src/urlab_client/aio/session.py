@@ -31,6 +31,7 @@ from urlab_client.protocol.errors import (
     ConnectionLost,
     NoSession,
     ReadOnlyClient,
+    ServerRestarted,
     ServerUnreachable,
     SessionTakenOver,
     UnknownOp,
@@ -42,7 +43,7 @@ from urlab_client.protocol.features import Features
 from urlab_client.protocol.messages.jobs import OpStarted, OpStatus
 from urlab_client.protocol.messages.session import Hello, HelloOk, Meta, StateReply
 
-__all__ = ["Session", "Turn"]
+__all__ = ["Session", "Turn", "server_restarted"]
 
 log: logging.Logger = logging.getLogger("urlab_client.session")
 
@@ -70,6 +71,8 @@ class Session:
         on_refusal: Told of each refusal before it is raised.
         confirmed: Whether the server has answered within this session since the connection was made. It may be another
             server after that was lost, which only a refused or accepted session id shows.
+        was_down: Whether nobody listened at the address for a while since the server last answered within this session.
+        restarts: How many sessions ended because the server was started again.
         line: Held while a request is under way, from encoding it to its reply.
         turns: Held by the `Turn` under way.
         editing: Held while the editor has a job.
@@ -91,6 +94,9 @@ class Session:
         self.on_opened: Callable[[HelloOk], None] | None = None
         self.on_refusal: Callable[[URLabRPCError], None] | None = None
         self.confirmed: bool = False
+        self.was_down: bool = False
+        self.restarts: int = 0
+        self._lost_to_restart = ""
         self._transport = transport
         self._call_records = None if observe is None else CallRecords(observe, transport)
         self._way = self._call_records or transport
@@ -330,9 +336,17 @@ class Session:
                 raise NoSession("no session is open.", op=op.name) from None
             if self.on_refusal is not None:
                 self.on_refusal(refusal)
+            if self.was_down:
+                raise self._after_restart(stamped, op, refusal.message) from None
             if self._unanswered:
                 raise _by_ourselves(refusal) from None
             raise
+
+    def _after_restart(self, stamped: str, op: Op, said: str) -> ServerRestarted:
+        if stamped != self._lost_to_restart:  # several requests may be refused for one restart
+            self._lost_to_restart = stamped
+            self.restarts += 1
+        return server_restarted(op.name, self._transport.endpoint, said)
 
     def _read(self, kind: type[R], op: Op, stamped: str, answer: bytes) -> R | OpStarted:
         """Decode the answer to a request that was sent in the session `stamped`, and learn what it tells."""
@@ -351,11 +365,13 @@ class Session:
             self._open(reply)
         if not self.confirmed:
             self.confirmed = op.needs is not Needs.NOTHING and stamped == self.session_id
+            self.was_down = self.was_down and not self.confirmed
         return reply
 
     def _open(self, hello: HelloOk) -> None:
         self.session_id = hello.session_id
         self.confirmed = True
+        self.was_down = False
         self._given_up = None
         self._unanswered = False
         if self.on_opened is not None:
@@ -430,6 +446,12 @@ class Session:
 def op_reply(request: Request[R], op: Op) -> type[R]:
     """Return the reply struct of a request, typed: the registry knows it, type checkers know it from the request."""
     return op.reply  # type: ignore[return-value]  # Op cannot carry R: the registry holds ops of every R
+
+
+def server_restarted(what: str, endpoint: str, said: str = "") -> ServerRestarted:
+    """Return the error of what a restart of the server ended, with what the server said of the session."""
+    words = f" ({said})" if said else ""
+    return ServerRestarted(f"the server at {endpoint} was started again, and knows the session no more{words}.", op=what)
 
 
 def _by_ourselves(refusal: SessionTakenOver) -> SessionTakenOver:

@@ -20,10 +20,10 @@ from mcp.shared.exceptions import MCPError
 from msgspec import Struct
 
 from urlab_client.mcp import editing, looking, moving
-from urlab_client.mcp.call import TAKEN_OVER, Call, Caller, Limits, Stopped
+from urlab_client.mcp.call import RESTARTED, TAKEN_OVER, Call, Caller, Limits, Stopped
 from urlab_client.mcp.declaration import Declared, Needs, declared
 from urlab_client.mcp.results import Moment
-from urlab_client.protocol.errors import SessionTakenOver, URLabError
+from urlab_client.protocol.errors import ServerRestarted, SessionTakenOver, URLabError
 from urlab_client.web.console_session import ConsoleSession
 from urlab_client.web.driving_lease import NotDriving
 from urlab_client.web.ops import encode
@@ -45,6 +45,7 @@ _RESOURCES = {
 }
 _TOOLS = declared(looking, moving, editing)
 _LARGE = 1e3
+_MOST_CALLERS = 100  # clients of the older protocol open a session each, and need not say when it ends
 _FAILURES = (URLabError, NotDriving, Stopped, ValueError, TypeError, LookupError, OSError)
 _NO_PLAY = "No play session runs, so there are no robots. Call play with action='start'."
 _METHODS = {
@@ -93,7 +94,6 @@ class Agent:
         given = {Needs.NOTHING: True, Needs.SESSION: not looks_on, Needs.DRIVE: limits.drive, Needs.EDIT: limits.edit}
         self._offered = {name: one for name, one in _TOOLS.items() if given[one.needs]}
         self._callers: dict[tuple[str, ...], Caller] = {}
-        self._synchronised = ""
         missing = ", ".join(need.value for need, has in given.items() if not has)
         self.server: Server[Any] = Server(
             "urlab",
@@ -125,9 +125,6 @@ class Agent:
             found = self._tool(params.name)
             arguments = found.parse(params.arguments or {})
             await call.connected()
-            if self._synchronised != call.client.session_id:
-                await call.client.resync()  # where a simulation stands that ran before
-                self._synchronised = call.client.session_id
             if found.play and not call.client.manager_present:
                 raise LookupError(_NO_PLAY)
             work = partial(found.function, call, **arguments)
@@ -135,7 +132,7 @@ class Agent:
         except _FAILURES as error:
             text = _in_tools(str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error))
             if isinstance(error, SessionTakenOver):
-                text = TAKEN_OVER
+                text = RESTARTED if isinstance(error, ServerRestarted) else TAKEN_OVER
             console.note("error", caller.name, params.name, text)
             return types.CallToolResult(content=[types.TextContent(text=text)], is_error=True)
         if found.drives:
@@ -146,17 +143,21 @@ class Agent:
     def _caller(self, context: ServerRequestContext[Any]) -> Caller:
         """Return who calls: whoever brought this token, within it this session if there are any, of this program.
 
-        Present clients open no session, so two alike that share a token are one.
+        Present clients open no session, so two alike that share a token are one. Whoever has not called for the
+        longest is forgotten where there are many, unless they have the controls: they come back under another name.
         """
         client = context.session.client_params
         request = context.request
         name = "" if client is None else client.client_info.name
         token = "" if request is None else str(request.scope.get("urlab_key"))
         session = "" if request is None else request.headers.get("mcp-session-id", "")
-        known = self._callers.get(who := (name, token, session))
-        if known is None:
-            known = self._callers[who] = Caller(self._console.new_agent_name(name))
-        return known
+        who = name, token, session
+        caller = self._callers.pop(who, None) or Caller(self._console.new_agent_name(name))
+        self._callers[who] = caller  # after those that have not called for longer
+        if len(self._callers) > _MOST_CALLERS:
+            holder = self._console.lease.holder
+            del self._callers[next(known for known, one in self._callers.items() if one is not holder)]
+        return caller
 
     def _tool(self, name: str) -> Declared:
         if name in self._offered:

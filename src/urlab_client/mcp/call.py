@@ -20,13 +20,15 @@ from urlab_client.web.driving_lease import NotDriving, Viewer
 if TYPE_CHECKING:
     from urlab_client.aio import URLabArticulation
 
-__all__ = ["TAKEN_OVER", "Call", "Caller", "Limits", "Progress", "Stopped"]
+__all__ = ["RESTARTED", "TAKEN_OVER", "Call", "Caller", "Limits", "Progress", "Stopped"]
 
 T = TypeVar("T")
 Progress = Callable[[float, float], Awaitable[None]]
 """Told how much simulation time has passed, and how much may pass."""
 
 TAKEN_OVER = "Another program has taken the server over. Ask a person to take it back in the console."
+
+RESTARTED = "The server was started again, and its simulation has begun anew. Call look before going on."
 
 _CONNECT_S = 10.0
 _REPORT_S = 0.1

@@ -60,7 +60,7 @@ async def spawn(call: Call, blueprint: str, actor_id: NewId, position: Position,
         await call.client.scene.spawn_actor(
             known[blueprint], actor_id, location=position, rotation_euler=(0.0, 0.0, yaw)
         )
-    placed = await _anew(call, f"{actor_id} is placed.")
+    placed = _edited(call, f"{actor_id} is placed.")
     if (robot := call.client.articulations.get(actor_id)) is not None:
         placed.done = f"{actor_id} is placed: it is the robot {robot.name!r}."
     return placed
@@ -72,7 +72,7 @@ async def move(call: Call, actor: Actor, position: Position) -> Edited:
     target = await _target(call, actor)
     async with call.client.scene.edit():
         await call.client.scene.set_actor_transform(**target, location=position)
-    return await _anew(call, f"{actor} is moved.")
+    return _edited(call, f"{actor} is moved.")
 
 
 @tool(Needs.EDIT, play=False, destructive=True, idempotent=True)
@@ -81,7 +81,7 @@ async def remove(call: Call, actor: Actor) -> Edited:
     target = await _target(call, actor)
     async with call.client.scene.edit():
         await call.client.scene.destroy_actor(**target)
-    return await _anew(call, f"{actor} is removed.")
+    return _edited(call, f"{actor} is removed.")
 
 
 async def _target(call: Call, named: str) -> dict[str, Any]:
@@ -98,13 +98,6 @@ async def _target(call: Call, named: str) -> dict[str, Any]:
             return {"target": row.name, "by_name": True}
     known = [row.actor_id or row.name for row in rows]
     raise LookupError(f"No actor is called {named!r}.{did_you_mean(named, known)} There are: {', '.join(known)}.")
-
-
-async def _anew(call: Call, done: str) -> Edited:
-    """Describe the scene after play began anew."""
-    if call.client.manager_present:
-        await call.client.resync()
-    return _edited(call, done)
 
 
 def _edited(call: Call, done: str) -> Edited:

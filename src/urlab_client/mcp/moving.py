@@ -109,7 +109,6 @@ async def play(call: Call, action: Literal["start", "stop", "pause", "resume"]) 
     match action:
         case "start":
             await call.client.sim.start()
-            await call.client.resync()
             return Done(done="Play has started.")
         case "stop":
             await call.client.sim.stop()

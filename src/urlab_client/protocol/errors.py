@@ -93,6 +93,7 @@ __all__ = [
     "ReplyTooLarge",
     "SaveLevelFailed",
     "SelectFailed",
+    "ServerRestarted",
     "ServerUnreachable",
     "SessionTakenOver",
     "SetActorTransformFailed",
@@ -208,6 +209,21 @@ class NoSession(SessionTakenOver, advice="Call discover() first."):
     """No session is open, or what it is about is not known: `discover()` was not called, or did not finish.
 
     The op was not executed.
+    """
+
+    def __init__(self, message: str, *, op: str | None = None, hint: str | None = None) -> None:
+        super().__init__("session_expired", message, op=op, hint=hint)
+        self.args: tuple[Any, ...] = (f"{op}: {message}" if op else message,)  # the code would say something else
+
+
+class ServerRestarted(
+    SessionTakenOver,
+    advice="Call discover() to open a session with the server as it is now; keep_session=True does so by itself.",
+):
+    """The server was started again, so that the session, its play and the simulation's state are gone.
+
+    The op was not executed. Raised where that shows: nothing listened at the address for a while before the server
+    refused the session. Else a restart looks like another client's `hello`, and `SessionTakenOver` is raised.
     """
 
     def __init__(self, message: str, *, op: str | None = None, hint: str | None = None) -> None:

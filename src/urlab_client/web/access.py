@@ -19,6 +19,7 @@ __all__ = ["LOOPBACK", "Access", "Guarded"]
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
 """Names of this machine for itself."""
 
+_MOST = 1000  # invitations that nobody used, and browsers of which one is soon closed, come without end
 _SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
 _HEADERS = {
     "content-security-policy": "default-src 'self'; img-src 'self' blob: data:; frame-ancestors 'none'; "
@@ -41,7 +42,8 @@ class Access:
     """What a request must bring.
 
     A token is spent by the first browser or program that shows it, and gives that one a key: a cookie, or what
-    `POST /api/session` answers for use as `Authorization: Bearer KEY`.
+    `POST /api/session` answers for use as `Authorization: Bearer KEY`. The latest thousand tokens and the thousand keys
+    that were used last are good.
 
     Args:
         hosts: Host names under which the application is reached, in lower case. Others are refused, so that a page
@@ -54,13 +56,14 @@ class Access:
         self.hosts: frozenset[str] = frozenset(hosts)
         self.tokens = tokens
         self.cookie: str = f"urlab_{secrets.token_hex(4)}"  # cookies of a host go to all its ports
-        self._tokens: set[str] = set()
-        self._keys: set[str] = set(keys)
+        self._tokens: dict[str, None] = {}
+        self._given = frozenset(keys)
+        self._keys: dict[str, None] = {}
 
     def invite(self) -> str:
         """Return a new token, good for one use."""
         token = secrets.token_urlsafe(24)
-        self._tokens.add(token)
+        _keep(self._tokens, token)
         return token
 
     def admit(self, token: str) -> str | None:
@@ -68,21 +71,29 @@ class Access:
         found = _among(token, self._tokens)
         if found is None:
             return None
-        self._tokens.discard(found)
+        del self._tokens[found]
         key = secrets.token_urlsafe(32)
-        self._keys.add(key)
+        _keep(self._keys, key)
         return key
 
     def key_of(self, headers: Headers) -> str | None:
         """Return the valid key that came with a request, or None."""
         scheme, _, value = headers.get("authorization", "").partition(" ")
         if scheme.lower() == "bearer":
-            return _among(value.strip(), self._keys)
+            return self._known(value.strip())
         try:
             cookie = SimpleCookie(headers.get("cookie", "")).get(self.cookie)
         except CookieError:
             return None
-        return None if cookie is None else _among(cookie.value, self._keys)
+        return None if cookie is None else self._known(cookie.value)
+
+    def _known(self, value: str) -> str | None:
+        if (given := _among(value, self._given)) is not None:
+            return given
+        found = _among(value, self._keys)
+        if found is not None:
+            _keep(self._keys, found)
+        return found
 
     def refusal(self, scope: Scope) -> _Refusal | None:
         """Return status, code and reason for refusing a request whatever its key, or None."""
@@ -151,7 +162,15 @@ class Guarded:
         return response
 
 
-def _among(value: str, values: set[str]) -> str | None:
+def _keep(values: dict[str, None], value: str) -> None:
+    """Add a value as the newest, or make it so, and let the oldest go where there are too many."""
+    values.pop(value, None)
+    values[value] = None
+    if len(values) > _MOST:
+        del values[next(iter(values))]
+
+
+def _among(value: str, values: Collection[str]) -> str | None:
     given = value.encode()
     return next((known for known in values if hmac.compare_digest(known.encode(), given)), None)
 

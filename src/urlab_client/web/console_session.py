@@ -255,6 +255,7 @@ class ConsoleSession:
     def _begin_anew(self) -> None:
         """Forget what belonged to the play before."""
         self.controls.begin_anew()
+        self._feeds = {path: one for path, one in self._feeds.items() if one.watched or self.camera(path) is one.view}
         self.redescribe()
 
     def redescribe(self) -> None:

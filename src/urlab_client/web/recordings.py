@@ -81,7 +81,7 @@ class Recordings:
         self._began = 0.0
         self._task: asyncio.Task[None] | None = None
         self._stop = asyncio.Event()
-        self._described: dict[tuple[str, float], dict[str, Any]] = {}
+        self._described: dict[str, tuple[float, dict[str, Any]]] = {}
 
     @property
     def running(self) -> RunningRecording | None:
@@ -209,10 +209,11 @@ class Recordings:
             URLabError: The file is not a recording.
         """
         file = self.path(name)
-        key = name, file.stat().st_mtime
-        if key not in self._described:
-            self._described[key] = await anyio.to_thread.run_sync(_described, file)
-        return self._described[key]
+        changed = file.stat().st_mtime
+        known = self._described.get(name)
+        if known is None or known[0] != changed:
+            known = self._described[name] = changed, await anyio.to_thread.run_sync(_described, file)
+        return known[1]
 
     @contextlib.asynccontextmanager
     async def converted(self, name: str, kind: str, camera: str = "") -> AsyncGenerator[Path]:
@@ -275,6 +276,7 @@ class Recordings:
             KeyError: There is none of that name.
         """
         self.path(name).unlink()
+        self._described.pop(name, None)
 
 
 def open_run(file: Path) -> Run:

@@ -64,6 +64,7 @@ class ConnectionMonitor:
             publishers.release_regions()  # the next server may lay them out anew where they are
         publishers.events.publish(event)
         if isinstance(event, ServerReconnected):
+            self._session.was_down = self._session.was_down or event.refused
             publishers.resume_regions()
             self._look()
 

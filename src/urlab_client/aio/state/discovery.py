@@ -14,11 +14,11 @@ from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_mode import promote
 from urlab_client.protocol.codec import decode_reply, op_of
 from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.errors import URLabError, URLabVersionMismatch
-from urlab_client.protocol.messages.session import NOT_SENT, Hello, HelloOk, Meta
+from urlab_client.protocol.errors import NoActiveManager, NotReady, URLabError, URLabVersionMismatch
+from urlab_client.protocol.messages.session import NOT_SENT, Forward, ForwardOk, Hello, HelloOk, Meta
 from urlab_client.protocol.messages.streams import PlayStarted
 
-__all__ = ["Discovery"]
+__all__ = ["Discovery", "look"]
 
 log: logging.Logger = logging.getLogger("urlab_client.client")
 
@@ -143,7 +143,7 @@ class Discovery:
                 state.mirror.use(loaded)
             state.hello = hello
             state.objects.bind(hello, examined)
-            state.step_count = 0
+            state.forget_clocks()
         state.pending.play = False
         views = state.objects.views()  # binds the cameras to what the handshake says of them
         state.publishers.refresh()
@@ -160,7 +160,18 @@ class Discovery:
             await promote(state, turn, state.wanted_mode)
         else:
             state.assume_mode(StepMode.LIVE if state.wanted_mode is StepMode.AUTO else state.wanted_mode)
+        # A handshake describes the model and not where the simulation stands, which may have run for hours.
+        if hello.manager_present and not state.session.read_only and (reply := await look(turn)) is not None:
+            state.absorb(reply, "forward")
         log.info(
             "session with %s, MuJoCo %s: %d articulations, mode %s",
             hello.urlab_version, hello.mujoco_version, len(state.objects.articulations), state.mode,
         )  # fmt: skip
+
+
+async def look(turn: Turn) -> ForwardOk | None:
+    """Return where the simulation stands, None where no play runs."""
+    try:
+        return await turn.call(Forward())
+    except (NoActiveManager, NotReady):
+        return None

@@ -4,18 +4,13 @@ from __future__ import annotations
 
 from urlab_client.aio.deadline import DEFAULT, Timeout
 from urlab_client.aio.session import Turn
-from urlab_client.aio.state.discovery import Discovery
+from urlab_client.aio.state.discovery import Discovery, look
 from urlab_client.aio.state.pending_outcomes import PendingOutcomes
 from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_mode import ask_mode
 from urlab_client.protocol.client_types import Resync
 from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.errors import (
-    NoActiveManager,
-    NoSession,
-    NotReady,
-    SessionTakenOver,
-)
+from urlab_client.protocol.errors import NoSession, SessionTakenOver
 from urlab_client.protocol.messages.session import Forward, ForwardOk
 
 __all__ = ["resync"]
@@ -45,7 +40,7 @@ async def _resync(state: SimState, discovery: Discovery, pending: PendingOutcome
     before: ForwardOk | None = None
     held, renewed = True, False
     try:
-        reply = before = await _look(turn)
+        reply = before = await look(turn)
     except (SessionTakenOver, NoSession):
         reply, held, renewed = None, False, True
     if before is not None:
@@ -57,12 +52,12 @@ async def _resync(state: SimState, discovery: Discovery, pending: PendingOutcome
     if renewed or pending.play:
         renewed = True
         await discovery.open(turn, state.level)
-        reply = await _look(turn)
+        reply = await look(turn)
         if before is not None and reply is not None and applied is not None and reply.time != before.time:
             applied = _slipped_in(state, applied, reply.time - before.time)
     if reply is not None and pending.mode is not None:
         await ask_mode(state, turn, pending.mode)
-        reply = await _look(turn)  # in live mode it has moved on meanwhile
+        reply = await look(turn)  # in live mode it has moved on meanwhile
     if reply is not None:
         if was_reset:
             state.absorb_reset(reply, pending.keyframe)
@@ -81,14 +76,6 @@ async def _resync(state: SimState, discovery: Discovery, pending: PendingOutcome
         reset_applied=was_reset,
         settled=applied == sent or not pending.queued,
     )
-
-
-async def _look(turn: Turn) -> ForwardOk | None:
-    """Return where the simulation stands, None where no play runs."""
-    try:
-        return await turn.call(Forward())
-    except (NoActiveManager, NotReady):
-        return None
 
 
 def _compare(pending: PendingOutcomes, reply: ForwardOk) -> tuple[int | None, bool | None]:

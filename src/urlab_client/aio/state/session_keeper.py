@@ -23,7 +23,6 @@ from urlab_client.protocol.messages.streams import (
     ClientEvent,
     PlayStarted,
     ServerLost,
-    ServerReconnected,
     SessionLost,
     StreamPolicy,
 )
@@ -52,14 +51,13 @@ class SessionKeeper:
         self._state = state
         self._discovery = discovery
         self._task: asyncio.Task[None] | None = None
-        self._was_down = False  # since the session was accepted last
         self._time = 0.0  # of the simulation, when the connection was lost
         self._given_up = ""  # a session that another client has ended
 
     def start(self) -> None:
         """Keep the session that is open now, and those after it; on the event loop. Idempotent."""
         if self._task is None or self._task.done():
-            kinds = (ServerLost, ServerReconnected, SessionLost, PlayStarted)
+            kinds = (ServerLost, SessionLost, PlayStarted)
             events = self._state.publishers.events.stream(kinds, 100)
             self._task = asyncio.create_task(self._run(events), name="urlab-keeper")
 
@@ -83,10 +81,7 @@ class SessionKeeper:
     async def _act_on(self, event: ClientEvent) -> None:
         match event:
             case ServerLost():
-                self._was_down = False
                 self._time = self._state.sim_time
-            case ServerReconnected():
-                self._was_down = event.refused
             case SessionLost():
                 if event.session_id == self._session.session_id:
                     await self._on_lost(event.session_id)
@@ -107,7 +102,7 @@ class SessionKeeper:
     async def _on_lost(self, session_id: str) -> None:
         if session_id == self._given_up:
             return
-        if self._session.confirmed or not self._was_down or await self._world_goes_on():
+        if not self._session.was_down or await self._world_goes_on():
             self._given_up = session_id
             log.warning("another client has taken the session over; it is not taken back")
             return

@@ -346,6 +346,12 @@ class SimState:
         if reply.wall_time is not None:
             self.wall_time_sec, self.wall_time_nsec = reply.wall_time.sec, reply.wall_time.nsec
 
+    def forget_clocks(self) -> None:
+        """Start at zero, as a new play does: what was known is of the world before. Call under the lock."""
+        self.step_count = 0
+        self.sim_time = 0.0
+        self.sim_time_sec = self.sim_time_nsec = 0
+
     def mirror_qpos(self, key: str, qpos: Floats) -> None:
         """Take over the leading joint positions of an articulation that `set_qpos` wrote, by any of its names.
 

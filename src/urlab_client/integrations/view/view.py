@@ -185,11 +185,8 @@ class AsyncView:
         scene = self._follower.check()
         self._opened = True
         await anyio.to_thread.run_sync(self._backend.open)
-        client = self._client
-        with client._data_lock:  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]  # public by the reference
-            data = client.data
-            qpos, qvel = (np.zeros(0), np.zeros(0)) if data is None else (data.qpos.copy(), data.qvel.copy())
-        self._states.append(_Start(scene, qpos, qvel, round(self._client.sim_time * _NS), self._client.step_count))
+        if not self._client.config.read_only:  # which knows no state until the first one is published
+            self._states.append(self._start(scene))
         self._thread.start()
         self._follower.start(self._put)
         return self
@@ -201,6 +198,14 @@ class AsyncView:
         self._stop.set()
         await self._follower.ended()
         await anyio.to_thread.run_sync(self._thread.join, abandon_on_cancel=True)
+
+    def _start(self, scene: SceneMessages) -> _Start:
+        client = self._client
+        with client._data_lock:  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]  # public by the reference
+            data = client.data
+            if data is None:
+                return _Start(scene, np.zeros(0), np.zeros(0), round(client.sim_time * _NS), client.step_count)
+            return _Start(scene, data.qpos.copy(), data.qvel.copy(), round(data.time * _NS), client.step_count)
 
     def finish(self) -> None:
         """End when the client's loop is gone already. Blocks."""
