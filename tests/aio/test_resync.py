@@ -182,6 +182,8 @@ async def test_steps_that_the_server_has_queued_stay_open(scripted: Any) -> None
     scripted.on("set_mode", {"op": "set_mode_ok", "previous_mode": "direct", "current_mode": "direct"})
     async with URLabClient(f"tcp://127.0.0.1:{scripted.port}", step_mode="direct", local_model=False) as client:
         await client.discover()
+        while not scripted.seen.empty():
+            scripted.seen.get_nowait()
         with pytest.raises(StepTimeout):
             await client.step(3)
         found = await client.resync()

@@ -68,7 +68,7 @@ async def test_a_step_goes_over_shared_memory_once_its_size_is_known(connect: An
     assert plugin.seen == ["step"] * 3
     stats = client.transport_stats
     assert stats.over_shm == 3
-    assert stats.over_zmq == {"handshake": 2, "size of the reply not known yet": 1}
+    assert stats.over_zmq == {"handshake": 3, "size of the reply not known yet": 1}
     assert stats.sent == stats.received == 6
 
 
@@ -84,7 +84,7 @@ async def test_editor_ops_pictures_and_open_ended_replies_stay_on_zmq(
     await client.step(include_cameras=True)
     assert plugin.seen == ["set_mode"]
     assert client.transport_stats.over_zmq == {
-        "handshake": 2,
+        "handshake": 3,
         "size of the reply not known yet": 1,
         "editor op": 1,
         "reply may be too large": 1,

@@ -16,6 +16,7 @@ from agents import ALL, Desk, desk, text_of
 from jsonschema import Draft202012Validator
 from mcp import Client
 from mcp.shared.exceptions import MCPError
+from mcp.types import Implementation
 from PIL import Image
 from waiting import until
 
@@ -295,6 +296,18 @@ async def test_one_agent_drives_at_a_time_and_a_person_takes_over_from_each(dire
         await direct.call("set_actuators", robot="arm", set_points={"elbow": 0.0})
 
 
+async def test_agents_that_come_and_go_are_forgotten_but_not_the_one_that_drives(
+    direct: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("urlab_client.mcp.agent._MOST_CALLERS", 3)
+    await direct.call("run", steps=1)
+    for n in range(6):
+        async with Client(direct.agent.server, client_info=Implementation(name=f"visitor {n}", version="1")) as visitor:
+            assert not (await visitor.call_tool("look", {})).is_error
+    assert len(direct.agent._callers) == 3
+    assert (await direct.call("look"))["driver"] == "you"
+
+
 async def test_the_log_goes_on_from_the_last_call(direct: Desk) -> None:
     first = await direct.call("log")
     await direct.call("run", steps=1)
@@ -333,6 +346,9 @@ async def test_a_scene_is_edited_by_names(tmp_path: Path) -> None:
                 assert "play with action='start'" in await one.refused(tool, **arguments)
             await one.call("play", action="start")
             await one.call("state", robot="arm")
+            assert one.console.feed("arm/wrist") is not None
+            await one.call("remove", actor="arm")
+            await until(lambda: not one.console._feeds)  # nor is the robot kept by its pictures
 
 
 async def test_a_person_sees_what_an_agent_records(server: SimulatedServer, tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from urlab_client.protocol.registry import dialect_ops
 __all__ = ["ScriptedServer", "client_of", "meta_ok", "names"]
 
 HELLO = hello_ok(manager_present=False)
+NOWHERE = {"op": "error", "code": "not_ready", "message": "there is no state yet"}
 
 
 def meta_ok(dialect: DialectName) -> dict[str, Any]:
@@ -47,7 +48,11 @@ class ScriptedServer:
 
     def __init__(self, port: int = 0) -> None:
         self.seen: queue.Queue[dict[str, Any]] = queue.Queue()
-        self.answers: dict[str, Answer] = {"hello": lambda _: HELLO, "meta": lambda _: meta_ok("alpha")}
+        self.answers: dict[str, Answer] = {
+            "hello": lambda _: HELLO,
+            "meta": lambda _: meta_ok("alpha"),
+            "forward": lambda _: NOWHERE,
+        }
         self.held: queue.Queue[list[bytes]] = queue.Queue()
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.ROUTER)

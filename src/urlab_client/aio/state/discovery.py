@@ -14,7 +14,7 @@ from urlab_client.aio.state.sim_state import SimState
 from urlab_client.aio.state.step_mode import promote
 from urlab_client.protocol.codec import decode_reply, op_of
 from urlab_client.protocol.enums import StepMode
-from urlab_client.protocol.errors import NoActiveManager, NotReady, URLabError, URLabVersionMismatch
+from urlab_client.protocol.errors import NoActiveManager, NotReady, UnknownOp, URLabError, URLabVersionMismatch
 from urlab_client.protocol.messages.session import NOT_SENT, Forward, ForwardOk, Hello, HelloOk, Meta
 from urlab_client.protocol.messages.streams import PlayStarted
 
@@ -170,8 +170,8 @@ class Discovery:
 
 
 async def look(turn: Turn) -> ForwardOk | None:
-    """Return where the simulation stands, None where no play runs."""
+    """Return where the simulation stands, None where no play runs or the server does not tell."""
     try:
         return await turn.call(Forward())
-    except (NoActiveManager, NotReady):
+    except (NoActiveManager, NotReady, UnknownOp):
         return None

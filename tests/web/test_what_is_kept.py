@@ -1,0 +1,44 @@
+"""What the console keeps of those who come and go: no more than it needs, however long it runs."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+from starlette.datastructures import Headers
+
+from urlab_client.web import Access, access, recordings
+
+
+def test_the_keys_that_were_used_last_are_good(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(access, "_MOST", 2)
+    made = Access(keys=["given"])
+    unused, first, second = (made.invite() for _ in range(3))
+    assert made.admit(unused) is None
+
+    def good(key: str | None) -> bool:
+        return made.key_of(Headers({"authorization": f"Bearer {key}"})) == key
+
+    early, idle = made.admit(first), made.admit(second)
+    assert good(idle)
+    assert good(early)
+    late = made.admit(made.invite())
+    assert [good(key) for key in (early, idle, late, "given")] == [True, False, True, True]
+
+
+async def test_a_recording_that_grows_or_goes_leaves_no_descriptions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client: Any = None
+    made = recordings.Recordings(client, tmp_path)
+    file = tmp_path / "run.mcap"
+    file.touch()
+    monkeypatch.setattr(recordings, "_described", lambda file: {"at": os.stat(file).st_mtime})
+    for at in (1, 2, 2):
+        os.utime(file, (at, at))
+        assert await made.describe(file.name) == {"at": at}
+    assert len(made._described) == 1
+    made.remove(file.name)
+    assert not made._described
