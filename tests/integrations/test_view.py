@@ -150,6 +150,21 @@ async def published(client: AsyncClient, key: str) -> None:
             seen += key in (await states.receive()).per_articulation
 
 
+@pytest.mark.parametrize("looks_on", [False, True])
+async def test_the_first_frame_has_the_time_of_its_state(looks_on: bool, tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    with SimulatedServer("arm", play=True, unpaused=True) as server:
+        options = server.client_options()
+        async with AsyncClient(**options) as driver, AsyncClient(**options, read_only=looks_on) as client:
+            await driver.discover()
+            await driver.run_for(0.2)
+            await client.discover(handshake=driver.handshake() if looks_on else None)
+            async with rerun_view(client, save=path) as view:
+                await until(lambda: view.stats.states >= 2)
+    shown = rows(path, "/world/arm_forearm", "Transform3D:translation")
+    assert shown[0][0]["sim_time"] >= 200_000_000
+
+
 async def test_live_mode_is_followed_and_another_servers_robots_replace_the_first(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

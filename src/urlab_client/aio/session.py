@@ -451,7 +451,8 @@ def op_reply(request: Request[R], op: Op) -> type[R]:
 def server_restarted(what: str, endpoint: str, said: str = "") -> ServerRestarted:
     """Return the error of what a restart of the server ended, with what the server said of the session."""
     words = f" ({said})" if said else ""
-    return ServerRestarted(f"the server at {endpoint} was started again, and knows the session no more{words}.", op=what)
+    text = f"the server at {endpoint} was started again and does not know the session{words}."
+    return ServerRestarted(text, op=what)
 
 
 def _by_ourselves(refusal: SessionTakenOver) -> SessionTakenOver:
