@@ -69,7 +69,7 @@ async def test_a_step_goes_over_shared_memory_once_its_size_is_known(connect: An
     stats = client.transport_stats
     assert stats.over_shm == 3
     assert stats.over_zmq == {"handshake": 3, "size of the reply not known yet": 1}
-    assert stats.sent == stats.received == 6
+    assert stats.sent == stats.received == 7
 
 
 async def test_editor_ops_pictures_and_open_ended_replies_stay_on_zmq(

@@ -162,7 +162,7 @@ class Discovery:
             state.assume_mode(StepMode.LIVE if state.wanted_mode is StepMode.AUTO else state.wanted_mode)
         # A handshake describes the model and not where the simulation stands, which may have run for hours.
         if hello.manager_present and not state.session.read_only and (reply := await look(turn)) is not None:
-            state.absorb(reply, "forward")
+            state.absorb_found(reply, "forward")
         log.info(
             "session with %s, MuJoCo %s: %d articulations, mode %s",
             hello.urlab_version, hello.mujoco_version, len(state.objects.articulations), state.mode,

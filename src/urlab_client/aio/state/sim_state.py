@@ -271,6 +271,14 @@ class SimState:
         received = time.time_ns()
         self._take_over(reply, self._checked(reply, op), received, into_mirror=into_mirror)
 
+    def absorb_found(self, reply: StateReply, op: str) -> None:
+        """Take over where a simulation stands that a handshake told of; raises as `absorb` does.
+
+        Observers are not told: nothing has happened that they follow.
+        """
+        received = time.time_ns()
+        self._write(reply, self._checked(reply, op), received, into_mirror=True)
+
     def _checked(self, reply: StateReply | StateSnapshot, op: str) -> _Parts:
         """Compare a state with the model and the cameras, and return it with what each part of it is about.
 
@@ -301,6 +309,17 @@ class SimState:
         return articulations, entities, pictures
 
     def _take_over(self, reply: StateReply | StateSnapshot, parts: _Parts, received: int, *, into_mirror: bool) -> None:
+        self._write(reply, parts, received, into_mirror=into_mirror)
+        own = self.publishers.own_steps
+        if own and isinstance(reply, StateReply) and not (self.live or self.session.features.publishes_steps):
+            own.publish(reply)
+        for observer in self.observers:
+            try:
+                observer.on_state(reply)
+            except Exception:
+                log.exception("%r failed on a state", observer)
+
+    def _write(self, reply: StateReply | StateSnapshot, parts: _Parts, received: int, *, into_mirror: bool) -> None:
         articulations, entities, pictures = parts
         with self.mirror.lock:
             for record, state in articulations:
@@ -315,14 +334,6 @@ class SimState:
                 data.time = reply.time
             self.mirror.mark_stale()
             self._absorb_clocks(reply, received)
-        own = self.publishers.own_steps
-        if own and isinstance(reply, StateReply) and not (self.live or self.session.features.publishes_steps):
-            own.publish(reply)
-        for observer in self.observers:
-            try:
-                observer.on_state(reply)
-            except Exception:
-                log.exception("%r failed on a state", observer)
 
     def _check_perturbation(self, drag: Perturbation, op: str) -> None:
         model = self.mirror.model
