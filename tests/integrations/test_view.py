@@ -159,6 +159,7 @@ async def test_the_first_frame_has_the_time_of_its_state(looks_on: bool, tmp_pat
             await driver.discover()
             await driver.run_for(0.2)
             await client.discover(handshake=driver.handshake() if looks_on else None)
+            client._state._live.stop()  # as if nothing had been published since
             async with rerun_view(client, save=path) as view:
                 await until(lambda: view.stats.states >= 2)
     shown = rows(path, "/world/arm_forearm", "Transform3D:translation")
