@@ -17,6 +17,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import ASSETS, BALL, BOT, hasty, make_scene
+from waiting import eventually
 
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.messages.session import ArticulationCommand, Step
@@ -428,6 +429,21 @@ def test_an_error_of_the_observer_reaches_the_caller(start: Start) -> None:
         with pytest.raises(LookupError):
             sim.engine.step(Step(), observe)
     assert sim.engine.step_count == 2
+
+
+def test_a_step_that_nobody_wants_to_see_wakes_nobody(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(engine_module, "IDLE_S", DEADLINE)
+    sim = start()
+    seen: list[float] = []
+    with sim.engine.lock:
+        sim.engine.on_tick.append(lambda: seen.append(sim.engine.time))
+        sim.engine.step_wanted = lambda: bool(seen)
+    for _ in range(20):
+        sim.step()
+    assert seen == []
+    seen.append(0.0)
+    last = sim.step()
+    eventually(lambda: seen == [0.0, last])
 
 
 def test_ticks_show_the_state_of_each_direct_request(start: Start) -> None:

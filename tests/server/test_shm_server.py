@@ -296,6 +296,26 @@ def test_the_doorbell_has_room_for_so_many(server: SimulatedServer) -> None:
     assert welcomes == [b"r"] * MAX_LISTENERS + [b""] * 8
 
 
+def test_a_request_that_is_seen_before_its_ring_does_not_count_as_one_without(base: Path) -> None:
+    memory = SharedMemoryServer(base, Health())
+    memory.switch_camera("bot/eye", (4, 4))
+    memory.start(lambda request: msgspec.msgpack.encode({"op": "pong"}))
+    with RawShm(memory.directory, bell=True) as shm:
+        assert shm.call({"op": "ping"}) is not None
+        memory.publish_picture("bot/eye", bytes(64))  # whoever may have waited for the first one has it
+        before = shm.replies.sequence
+        shm.requests.publish(msgspec.msgpack.encode({"op": "ping"}))
+        eventually(lambda: shm.replies.sequence > before)
+        assert shm.bell is not None
+        shm.bell.send(b"q")
+        assert shm.call({"op": "ping"}) is not None
+        assert memory.wanted_cameras() == []
+        with RawShm(memory.directory, bell=False) as silent:
+            eventually(lambda: silent.call({"op": "ping"}) and memory.wanted_cameras() == ["bot/eye"])
+    memory.stop()
+    assert memory.join(30)
+
+
 def test_a_path_too_long_for_a_socket_leaves_polling(tmp_path: Path) -> None:
     deep = tmp_path / ("d" * 100)
     with SimulatedServer("ball", play=True, shm_dir=deep) as server, RawShm(directory_of(server), bell=False) as shm:

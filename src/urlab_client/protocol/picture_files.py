@@ -63,6 +63,8 @@ def jpeg(pixels: Pixels, mode: CameraMode | str, quality: int = JPEG_QUALITY, *,
         raise ValueError(f"the quality of a JPEG is 1 to 100, got {quality}")
     if max_size is not None and max_size < 1:
         raise ValueError(f"max_size is at least 1 pixel, got {max_size}")
+    if mode == CameraMode.REAL and max_size is None:
+        return encoded(_in_place(pixels), "JPEG", quality=quality)
     image = _image(grey(pixels)) if mode == CameraMode.DEPTH else pillow_image(pixels, mode)
     if max_size is not None:
         image.thumbnail((max_size, max_size))
@@ -89,6 +91,15 @@ def pillow_image(pixels: Pixels, mode: CameraMode | str, *, alpha: bool = False)
     channels = "RGB" if mode == CameraMode.REAL else "BGR"
     kind, raw = ("RGBA", f"{channels}A") if alpha else ("RGB", f"{channels}X")
     return Image.frombytes(kind, (width, height), np.ascontiguousarray(pixels).data, "raw", raw)
+
+
+def _in_place(pixels: Pixels) -> Image.Image:
+    """Return a picture of colours as Pillow's in the same memory. JPEG takes such ones; PNG does not."""
+    need("PIL", extra="pillow")
+    from PIL import Image  # noqa: PLC0415
+
+    height, width = pixels.shape[:2]
+    return Image.frombuffer("RGBX", (width, height), np.ascontiguousarray(pixels), "raw", "RGBX", 0, 1)
 
 
 def _image(array: NDArray[Any]) -> Image.Image:

@@ -12,7 +12,8 @@ from urlab_client.integrations._feed.scene_messages import CameraLayout, SceneMe
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraFrame, StateReply
 from urlab_client.protocol.messages.streams import StateSnapshot
-from urlab_client.protocol.picture_files import encoded, pillow_image
+from urlab_client.protocol.picture_files import encoded, jpeg, pillow_image
+from urlab_client.protocol.picture_memory import PictureMemory
 from urlab_client.protocol.pixels import Pixels, decode_camera
 
 if TYPE_CHECKING:
@@ -53,11 +54,12 @@ class CameraPicture:
     wall_ns: int
     waits: bool = False
 
-    def pixels(self) -> Pixels:
-        """Return the picture as an array, as `CameraSample.pixels` is."""
+    def pixels(self, memory: PictureMemory | None = None) -> Pixels:
+        """Return the picture as an array, as `CameraSample.pixels` is; in `memory` where it is not one yet."""
         frame = self.frame
         if isinstance(frame, CameraFrame):
-            return decode_camera(frame.data, self.camera.view.mode, frame.width, frame.height).pixels
+            mode = self.camera.view.mode
+            return decode_camera(frame.data, mode, frame.width, frame.height, memory=memory).pixels
         return frame
 
 
@@ -126,15 +128,23 @@ class SampleClock:
 
 def compressed(pixels: Pixels, mode: str, jpeg_quality: int | None) -> bytes:
     """Return a picture of bytes as JPEG, or as PNG without a quality."""
-    image = pillow_image(pixels, mode, alpha=mode != CameraMode.REAL)
     if jpeg_quality is not None:
-        return encoded(image, "JPEG", quality=jpeg_quality)
-    return encoded(image, "PNG", compress_level=1)
+        return jpeg(pixels, mode, jpeg_quality)
+    return encoded(pillow_image(pixels, mode, alpha=mode != CameraMode.REAL), "PNG", compress_level=1)
 
 
-def picture_message(picture: CameraPicture, stamp: Time, jpeg_quality: int | None) -> CompressedImage | RawImage:
-    """Return a picture as a message: depths as they are, colours as JPEG if there is a quality, all others as PNG."""
-    pixels, name, mode = picture.pixels(), picture.camera.name, picture.camera.view.mode
+def picture_message(
+    picture: CameraPicture, stamp: Time, jpeg_quality: int | None, memory: PictureMemory | None = None
+) -> CompressedImage | RawImage:
+    """Return a picture as a message: depths as they are, colours as JPEG if there is a quality, all others as PNG.
+
+    Args:
+        picture: The picture.
+        stamp: Its time.
+        jpeg_quality: 1 to 100, or None.
+        memory: That of the camera's earlier pictures, for whoever makes many messages.
+    """
+    pixels, name, mode = picture.pixels(memory), picture.camera.name, picture.camera.view.mode
     if pixels.dtype == np.float32:
         height, width = pixels.shape[:2]
         depths = np.ascontiguousarray(pixels, "<f4").tobytes()

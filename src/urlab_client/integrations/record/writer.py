@@ -47,6 +47,7 @@ from urlab_client.integrations._feed.scene_messages import SceneMessages, Simula
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.session import CameraFrame, EntityState, StepOk
 from urlab_client.protocol.messages.streams import StateSnapshot
+from urlab_client.protocol.picture_memory import PictureMemory
 from urlab_client.protocol.serializable import Serializable
 
 __all__ = ["FORMAT", "RecorderStats", "RecordingError", "WriterOptions", "WriterThread"]
@@ -308,7 +309,7 @@ class _Sink:
     options: WriterOptions
     states: int = 0
     frames: int = 0
-    cameras: set[str] = field(default_factory=set[str])
+    cameras: dict[str, PictureMemory] = field(default_factory=dict[str, PictureMemory])
     _clock: SampleClock = field(default_factory=SampleClock)
     _schemas: dict[type[Struct], int] = field(default_factory=dict[type[Struct], int])
     _topics: dict[tuple[str, str], _Topic] = field(default_factory=dict[tuple[str, str], _Topic])
@@ -433,10 +434,10 @@ class _Sink:
         stamp, topic = Time.of(now), f"/camera/{camera.name}"
         quality = self.options.jpeg_quality if self.options.image_format == "jpeg" else None
         metadata = {"mode": str(camera.view.mode)}
-        self._add(topic, picture_message(item, stamp, quality), now, item.wall_ns, metadata)
+        memory = self.cameras.setdefault(camera.name, PictureMemory())
+        self._add(topic, picture_message(item, stamp, quality, memory), now, item.wall_ns, metadata)
         self._add(f"{topic}/calibration", calibration(camera, stamp), now, item.wall_ns, {})
         self.frames += 1
-        self.cameras.add(camera.name)
 
     def _use(self, scene: SceneMessages) -> None:
         self._scene = scene

@@ -64,6 +64,7 @@ class Engine:
         on_substep: Called under the lock after each integration step and each puppet push.
         on_tick: Called under the lock after each live iteration (also while paused) and each direct request, and about
             ten times a second while a stepped mode idles. A hook of either list that raises is logged and removed.
+        step_wanted: Tells after a direct request whether `on_tick` is to be called for it; always, by default.
         seed: The last `reset` seed, or None; MuJoCo has no use for it.
         variation: What varies from reset to reset, if anything does.
     """
@@ -97,6 +98,7 @@ class Engine:
         self._call = MujocoCall(step_timeout_s)
         self.lock: DataLock = DataLock(step_timeout_s, self._call)
         self.on_tick: list[Hook] = []
+        self.step_wanted: Callable[[], bool] = lambda: True
         self.seed: int | None = None
         self._model = scene.model
         self._data = scene.data
@@ -436,7 +438,7 @@ class Engine:
     def _count(self, n_steps: int) -> None:
         self._step_count += n_steps
         self.snapshots.take()
-        self._tick_due = bool(self.on_tick)
+        self._tick_due = bool(self.on_tick) and self.step_wanted()
 
     def _push(self, request: Step) -> None:
         if self._player is not None:

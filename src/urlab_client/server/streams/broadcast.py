@@ -140,6 +140,7 @@ class Broadcast:
             self.leave()
         elif self._capture not in hooks:
             hooks.append(self._capture)
+            self._engine.step_wanted = self._wants_step
 
     def leave(self) -> None:
         """Stop listening to physics. Safe to call twice."""
@@ -230,12 +231,17 @@ class Broadcast:
 
     # On the physics thread, under the engine's lock.
 
+    def _wants_full(self) -> bool:
+        return self.full_wanted or (self._memory is not None and self._memory.wants_state())
+
+    def _wants_step(self) -> bool:
+        return self._dialect.steps_published and self._wants_full()
+
     def _capture(self) -> None:
         engine = self._engine
         live = engine.mode in _LIVE
         self._live_ticks += live
-        full = self.full_wanted or (self._memory is not None and self._memory.wants_state())
-        full = full and (live or self._dialect.steps_published)
+        full = self._wants_full() if live else self._wants_step()
         shown = full or (live and bool(self._wanted_rows))
         if not shown and not (live and self._info_wanted and self._live_ticks >= self._info_due):
             return

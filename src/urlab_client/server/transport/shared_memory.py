@@ -107,6 +107,7 @@ class SharedMemoryServer:
             self._bell = _Bell(self.directory)
             made.pop_all()
         self._unrung_at = -AT_WORK_S
+        self._unannounced = False
         self._served_at = -BRISK_S
         self._brisk = False
         self._state: RegionFile | None = None
@@ -203,6 +204,7 @@ class SharedMemoryServer:
             for region in self._cameras.values():
                 region.close()
             self._cameras = {}
+        self._pictures_at = time.monotonic()  # whoever begins play comes before readers that nobody knows of
         for key, size in resolutions.items():
             self.switch_camera(key, size, header_bytes)
 
@@ -258,10 +260,10 @@ class SharedMemoryServer:
             while not self._stopping:
                 if self._requests.sequence() == self._seen and not (self._brisk and self._follows(self._seen)):
                     rung = self._bell.wait(self._pause())
+                    self._learn(rung=rung)
                     if self._requests.sequence() == self._seen:
                         continue
-                    if not rung:
-                        self._unrung_at = time.monotonic()
+                    self._unannounced = not rung
                 self._brisk = time.monotonic() - self._served_at < BRISK_S and not crowded()
                 if not self._serve():
                     return
@@ -290,8 +292,16 @@ class SharedMemoryServer:
             time.sleep(0)  # others may have the interpreter
         return False
 
+    def _learn(self, *, rung: bool) -> None:
+        """Conclude from a wait whether the client at work has a doorbell: a ring may come after its request is seen."""
+        if rung:
+            self._unrung_at = -AT_WORK_S
+        elif self._unannounced:
+            self._unrung_at = time.monotonic()
+        self._unannounced = False
+
     def _pause(self) -> float:
-        if self._at_work(time.monotonic()):
+        if self._unannounced or self._at_work(time.monotonic()):
             return BUSY_POLL_S
         return RUNG_POLL_S if self._bell.listeners else IDLE_POLL_S
 
