@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fnmatch
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +20,8 @@ from urlab_client.aio.model.mirror import model_names
 from urlab_client.integrations.gym.batch_variation import BatchVariation
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn
 from urlab_client.integrations.gym.episode import client_defaults, compiled_prefixes, fields_of, first_camera
-from urlab_client.integrations.gym.pictures import BatchPictures, PictureScene, Visible
+from urlab_client.integrations.gym.late_cameras import LateCameras
+from urlab_client.integrations.gym.pictures import VISIBLE, BatchPictures, PictureScene, Visible
 from urlab_client.integrations.gym.spaces import (
     Field,
     Observation,
@@ -56,7 +56,6 @@ from urlab_client.sync.client import URLabClient
 
 __all__ = ["URLabBatchEnv"]
 
-_MOCAP: Final = ("mocap_pos", "mocap_quat")
 _BOUND: Final = ("qpos", "qvel", "ctrl", "act", "sensordata", "time", "xfrc_applied")
 
 
@@ -113,7 +112,7 @@ class URLabBatchEnv(Vectorized):
             render_mode: None or `rgb_array`, with which `render` draws; steps cost the same.
             render_camera: Camera that `render` shows; the first one of the scene by default.
             task: See `URLabEnv`. One object serves all environments.
-            randomise: See `URLabEnv`. Cameras that are observed cannot have a latency.
+            randomise: See `URLabEnv`. Cameras are as late as a server's; how late within the jitter is drawn otherwise.
             autoreset_mode: `NEXT_STEP`, `SAME_STEP` or `DISABLED`.
             n_threads: Threads that step, the caller's included; 0 for one per processor. Of no effect with `warp`.
             engine: What steps: `mujoco`, on processors, in float64, bit for bit as servers do; `warp`, MuJoCo Warp, in
@@ -152,7 +151,6 @@ class URLabBatchEnv(Vectorized):
         fetched = _fetch(with_model_options(address), client_defaults(client_options), settings.cameras, shown)
         model, prefixes, pictures = fetched.model, fetched.prefixes, fetched.pictures
         declared = declared_in(model) if randomise is None else Randomisation.of(randomise)
-        _refuse_late(settings.cameras, declared)
         mapping = SpaceMapping(
             model, prefixes, fields_of(settings.observations), settings.space_mode, settings.articulations
         )
@@ -188,8 +186,8 @@ class URLabBatchEnv(Vectorized):
         )
         # Bound before the first call: a derived field is computed only where somebody looks at it.
         self._arrays = {name: self._batch.bind(name) for name in _BOUND}
-        seen = ("qpos", *(_MOCAP if model.nmocap else ()))
-        self._visible = {name: self._batch.bind(name) for name in seen}
+        self._visible = [self._batch.bind(name) for name in VISIBLE]
+        self._late = LateCameras(declared, self._cameras)
         self._prefixes = prefixes
         self._target_type = np.float64 if fetched.exact_controls else np.float32
         self._keyframes = {name: i for i, name in enumerate(model_names(model, "key"))}
@@ -221,7 +219,8 @@ class URLabBatchEnv(Vectorized):
             return None
         everyone = np.arange(self.num_envs)
         mode = self._picture_scene.mode(self._rendered)
-        return tuple(to_rgb(frame, mode) for frame in self._draw([self._rendered], everyone)[self._rendered])
+        drawn = self._draw([self._rendered], everyone, self._visible_states(everyone))
+        return tuple(to_rgb(frame, mode) for frame in drawn[self._rendered])
 
     def draws(self, index: int) -> dict[str, Any] | None:
         """Return what was drawn for the episode of an environment, as `EpisodeDraws.told` has it; None for nothing."""
@@ -234,19 +233,31 @@ class URLabBatchEnv(Vectorized):
         if pictures is not None:
             pictures.close()
 
-    def _draw(self, cameras: Sequence[str], indices: Indices) -> dict[str, list[Pixels]]:
-        """Return what cameras see in some copies as they are."""
+    def _seen(self, indices: Indices) -> dict[str, NDArray[Any]]:
+        """Return what some copies observe of the cameras."""
+        states, late = self._visible_states(indices), self._late
+        drawn = self._draw([name for name in self._cameras if name not in late.names], indices, states)
+        for name in late.names:
+            times = self._arrays["time"][indices].tolist()
+            shown = [late.shown(name, *each) for each in zip(indices.tolist(), times, states, strict=True)]
+            drawn |= self._draw([name], indices, shown)
+        return {
+            name: np.stack([observed_pixels(frame, self._picture_scene.mode(name)) for frame in drawn[name]])
+            for name in self._cameras
+        }
+
+    def _visible_states(self, indices: Indices) -> list[Floats]:
+        """Return the states of some copies, as `Visible` has them."""
+        return [np.concatenate([values[i].ravel() for values in self._visible]) for i in indices.tolist()]
+
+    def _draw(self, cameras: Sequence[str], indices: Indices, states: Sequence[Floats]) -> dict[str, list[Pixels]]:
+        """Return what cameras see in some copies, given their states."""
+        if not cameras:
+            return {}
         if self._pictures is None:
             self._pictures = BatchPictures(self._picture_scene)
-        varied = self._varied
-        copies = [
-            Visible(
-                {name: values[i].copy() for name, values in self._visible.items()},
-                {} if varied is None else varied.look(i),
-            )
-            for i in indices.tolist()
-        ]
-        return self._pictures.draw(cameras, copies)
+        looks = [{} if self._varied is None else self._varied.look(i) for i in indices.tolist()]
+        return self._pictures.draw(cameras, [Visible(*each) for each in zip(states, looks, strict=True)])
 
     def _reset_and_step(self, fresh: Indices, acting: Indices, set_points: Mapping[str, Floats]) -> tuple[Found, Found]:
         nothing: Found = (None, {})
@@ -281,6 +292,10 @@ class URLabBatchEnv(Vectorized):
                 qpos[i], self._goals[i] = start.qpos, start.goal
             self._batch.forward(indices)
         self._step_count[indices] = 0
+        if self._late.names:
+            seeds = self.episode_seeds()
+            for i, state in zip(indices.tolist(), self._visible_states(indices), strict=True):
+                self._late.begin(i, int(seeds[i]), state)
         return self._observe(indices), {}
 
     def _step_some(self, indices: Indices, set_points: Mapping[str, Floats]) -> Found:
@@ -326,10 +341,7 @@ class URLabBatchEnv(Vectorized):
         if self.task is not None:
             observation = add_observed(observation, self.task, self.task.observe(self._states(indices)))
         if self._cameras:
-            observation["cameras"] = {
-                name: np.stack([observed_pixels(frame, self._picture_scene.mode(name)) for frame in frames])
-                for name, frames in self._draw(self._cameras, indices).items()
-            }
+            observation["cameras"] = self._seen(indices)
         return observation
 
     def _states(self, indices: Indices) -> States:
@@ -421,18 +433,6 @@ def _fetch(address: str, client_options: Mapping[str, Any], cameras: Sequence[st
             pictures=PictureScene.of(aio_of(client), model, [*cameras, *([rendered] if rendered else [])]),
             rendered=rendered,
         )
-
-
-def _refuse_late(cameras: Sequence[str], declared: Randomisation | None) -> None:
-    """Refuse to observe cameras with a latency.
-
-    Raises:
-        ValueError: A declaration gives one of them a latency.
-    """
-    patterns = [] if declared is None else [late.camera for late in declared.camera]
-    late = [name for name in cameras if any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)]
-    if late:
-        raise ValueError(f"a batch sees without delay, but {', '.join(late)} has a latency: use servers")
 
 
 @dataclass(frozen=True)

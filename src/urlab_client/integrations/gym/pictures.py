@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from urlab_client.aio.client import URLabClient
 from urlab_client.integrations.gym.episode import client_camera
 from urlab_client.integrations.gym.spaces import Space, camera_space
+from urlab_client.protocol.base import Floats
 from urlab_client.protocol.dialects import cleaned_name
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.errors import URLabError
@@ -30,12 +31,21 @@ from urlab_client.server.render.drawing import Stage
 from urlab_client.server.render.opengl import Backend, need_backend
 from urlab_client.server.render.tints import Tints
 
-__all__ = ["BatchPictures", "PictureScene", "Visible"]
+__all__ = ["VISIBLE", "BatchPictures", "PictureScene", "Visible"]
 
 _DEADLINE_S: Final = 30.0
 """Longest wait for one picture after the one before; the first one includes the making of a context."""
 
 _JOIN_S: Final = 1.0
+
+VISIBLE: Final = ("qpos", "mocap_pos", "mocap_quat")
+"""The part of the state of copies that pictures depend on, in MuJoCo's order."""
+
+_STATE: Final = (
+    mujoco.mjtState.mjSTATE_QPOS.value
+    | mujoco.mjtState.mjSTATE_MOCAP_POS.value
+    | mujoco.mjtState.mjSTATE_MOCAP_QUAT.value
+)
 
 
 @dataclass(frozen=True)
@@ -43,11 +53,11 @@ class Visible:
     """What pictures of one copy depend on.
 
     Attributes:
-        state: Fields of `MjData` by name: positions of joints, and of mocap bodies where there are any.
+        state: The fields `VISIBLE` of `MjData`, flat, one behind the other.
         look: Fields of the model that differ from the model as compiled, the same ones each time.
     """
 
-    state: Mapping[str, NDArray[Any]]
+    state: Floats
     look: Mapping[str, NDArray[Any]]
 
 
@@ -193,8 +203,7 @@ class _Painter:
     def paint(self, cameras: Sequence[str], visible: Visible) -> list[Pixels]:
         for name, values in visible.look.items():
             getattr(self._model, name)[...] = values
-        for name, values in visible.state.items():
-            getattr(self._data, name)[...] = values
+        mujoco.mj_setState(self._model, self._data, visible.state, _STATE)
         self._stage.prepare(self._data)
         return [self._picture(name) for name in cameras]
 
