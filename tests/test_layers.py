@@ -56,10 +56,24 @@ ALLOWED: dict[str, frozenset[str]] = {
     "_installation": frozenset(),
     "_processors": frozenset(),
     "_uninterrupted": frozenset(),
+    "_whole_files": frozenset(),
     "_windows": frozenset(),
     "": frozenset({"_installation", "sync", "enums", "protocol"}),
     "integrations": frozenset(
-        {"", "_extras", "_installation", "_mujoco", "aio", "enums", "keys", "protocol", "randomise", "server", "sync"}
+        {
+            "",
+            "_extras",
+            "_installation",
+            "_mujoco",
+            "_whole_files",
+            "aio",
+            "enums",
+            "keys",
+            "protocol",
+            "randomise",
+            "server",
+            "sync",
+        }
     ),
     "cluster": frozenset({"_installation", "integrations", "protocol", "sync"}),
     "web": frozenset({"_extras", "_installation", "aio", "integrations", "protocol"}),
@@ -70,6 +84,7 @@ ALLOWED: dict[str, frozenset[str]] = {
             "_extras",
             "_installation",
             "_mujoco",
+            "_whole_files",
             "_windows",
             "aio",
             "enums",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import signal
 import sys
 from itertools import pairwise
 from pathlib import Path
@@ -22,7 +23,7 @@ from urlab_client.cli.figures import Quantity, Trace, plot_trace
 from urlab_client.integrations._feed.quantities import component_name, quantities
 from urlab_client.integrations._feed.scene_messages import SceneLayout
 from urlab_client.integrations.gym import URLabEnv
-from urlab_client.integrations.record import RecordingError, Run, export, read_run, record
+from urlab_client.integrations.record import RecordingError, Run, export, read_run, record, table_builder
 from urlab_client.integrations.record.pixels import visible
 from urlab_client.integrations.record.transitions import transitions
 from urlab_client.server import SimulatedServer
@@ -111,6 +112,13 @@ def test_a_moment_is_what_the_table_and_the_frames_hold(recorded: Run) -> None:
         recorded.picture_at("arm/nose", 0.0)
 
 
+@pytest.fixture
+def small_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A recording of a hundred states is read in about fifteen pieces, as one of a night is."""
+    monkeypatch.setattr(table_builder, "PIECE_VALUES", 500)
+
+
+@pytest.mark.usefixtures("small_pieces")
 def test_csv_and_parquet_hold_every_value_to_the_bit(recorded: Run, tmp_path: Path) -> None:
     flat = transitions(recorded.table()).flat()
     assert export.write_csv(recorded, tmp_path / "run.csv") == 98
@@ -118,6 +126,7 @@ def test_csv_and_parquet_hold_every_value_to_the_bit(recorded: Run, tmp_path: Pa
     with (tmp_path / "run.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     table = parquet.read_table(tmp_path / "run.parquet")
+    assert parquet.ParquetFile(tmp_path / "run.parquet").num_row_groups > 5
     assert list(rows[0]) == table.column_names == list(flat)
     assert {"time", "episode", "arm/qpos/shoulder_pan", "arm/sensors/grip_position.0", "eye/ctrl/spin"} <= flat.keys()
     for name, column in flat.items():
@@ -157,6 +166,7 @@ def test_rows_pair_an_observation_with_the_action_taken_at_it(tmp_path: Path) ->
         assert np.array_equal(pictures[round(float(time), 6)], seen["cameras"]["arm/wrist"][..., :3])
 
 
+@pytest.mark.usefixtures("small_pieces")
 def test_npz_holds_arrays_names_and_pictures(recorded: Run, tmp_path: Path) -> None:
     export.write_npz(recorded, tmp_path / "run.npz", cameras=["eye/up"])
     table, pictures = recorded.table(), list(recorded.frames("eye/up"))
@@ -169,7 +179,7 @@ def test_npz_holds_arrays_names_and_pictures(recorded: Run, tmp_path: Path) -> N
         assert arrays["camera/eye/up.time"].tolist() == [picture.time for picture in pictures]
 
 
-def test_mp4_shows_each_picture_at_its_time(recorded: Run, tmp_path: Path) -> None:
+def test_mp4_shows_each_picture_at_its_time(recorded: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pictures = list(recorded.frames("eye/up"))
     assert export.write_mp4(recorded, tmp_path / "run.mp4", "eye/up") == len(pictures) > 8
     with av.open(tmp_path / "run.mp4") as container:
@@ -181,6 +191,10 @@ def test_mp4_shows_each_picture_at_its_time(recorded: Run, tmp_path: Path) -> No
         assert np.abs(shown[:21, :33].astype(int) - picture.pixels).mean() < 12
     with pytest.raises(KeyError, match="eye/up"):
         export.write_mp4(recorded, tmp_path / "none.mp4", "eye/down")
+    monkeypatch.delitem(export._CODECS, "libx264")  # the other codec writes each picture at once
+    with pytest.raises(KeyboardInterrupt):
+        export.write_mp4(recorded, tmp_path / "none.mp4", "eye/up", lambda _: signal.raise_signal(signal.SIGINT))
+    assert os.listdir(tmp_path) == ["run.mp4"]
 
 
 def test_depth_becomes_grey() -> None:

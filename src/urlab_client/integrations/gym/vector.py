@@ -68,24 +68,20 @@ class _Session:
         self._opening: asyncio.Task[None] | None = None
         self._earlier: EnvEpisode | None = None
 
-    async def reset(
-        self, rng: np.random.Generator, keyframe: str | None, seed: int | None, timeout: float
-    ) -> Observation:
-        """Start an episode. Where there is no session, one is started, which goes on when the deadline has passed."""
-        async with asyncio.timeout(timeout):
-            if self.episode is None:
-                opening = self._opening or self.reopen()
-                await asyncio.shield(opening)
-            if self.episode is None:
-                raise URLabError("The environment was closed.")
-            return await self.episode.reset(rng, keyframe, seed)
+    async def reset(self, rng: np.random.Generator, keyframe: str | None, seed: int | None) -> Observation:
+        """Start an episode. Where there is no session, one is started, which goes on when this is cancelled."""
+        if self.episode is None:
+            opening = self._opening or self.reopen()
+            await asyncio.shield(opening)
+        if self.episode is None:
+            raise URLabError("The environment was closed.")
+        return await self.episode.reset(rng, keyframe, seed)
 
-    async def step(self, set_points: Mapping[str, Floats], forces: Mapping[str, Floats], timeout: float) -> Observation:
+    async def step(self, set_points: Mapping[str, Floats], forces: Mapping[str, Floats]) -> Observation:
         """Act."""
         if self.episode is None:
             raise URLabError("The environment failed before.", hint="Reset it, which starts it afresh.")
-        async with asyncio.timeout(timeout):
-            return await self.episode.act(set_points, forces)
+        return await self.episode.act(set_points, forces)
 
     def reopen(self) -> asyncio.Task[None]:
         """Give up what there is, and begin to start a session in its place; whoever resets waits for that."""
@@ -300,22 +296,20 @@ class URLabVectorEnv(Vectorized):
         await asyncio.gather(*(session.close() for session in self._sessions), return_exceptions=True)
 
     def _reset_some(self, indices: Indices, keyframe: str | None) -> Found:
-        timeout = self._step_timeout
         calls = {
-            i: partial(self._sessions[i].reset, self._rngs[i], keyframe, self._episode_seed(i), timeout)
+            i: partial(self._sessions[i].reset, self._rngs[i], keyframe, self._episode_seed(i))
             for i in map(int, indices)
         }
         return self._found(self._portal.call(self._all, calls))
 
     def _reset_and_step(self, fresh: Indices, acting: Indices, set_points: Mapping[str, Floats]) -> tuple[Found, Found]:
-        timeout, sessions = self._step_timeout, self._sessions
+        sessions = self._sessions
         resets = {
-            i: partial(sessions[i].reset, self._rngs[i], self._keyframe, self._episode_seed(i), timeout)
-            for i in map(int, fresh)
+            i: partial(sessions[i].reset, self._rngs[i], self._keyframe, self._episode_seed(i)) for i in map(int, fresh)
         }
         forces = self._forces(acting)
         steps = {
-            i: partial(sessions[i].step, {key: of[i] for key, of in set_points.items()}, forces.get(i, {}), timeout)
+            i: partial(sessions[i].step, {key: of[i] for key, of in set_points.items()}, forces.get(i, {}))
             for i in map(int, acting)
         }
         results = self._portal.call(self._all, {**resets, **steps})
@@ -356,19 +350,29 @@ class URLabVectorEnv(Vectorized):
         return concatenate(single, rows, create_empty_array(single, len(rows))), errors
 
     async def _all(self, calls: Mapping[int, Callable[[], Coroutine[Any, Any, T]]]) -> dict[int, T | Exception]:
-        found = await asyncio.gather(*(call() for call in calls.values()), return_exceptions=True)
+        tasks = {i: asyncio.create_task(call()) for i, call in calls.items()}
+        late: set[asyncio.Task[T]] = set()
+        try:
+            # One deadline for all: one for each would be a tenth of what the client does.
+            await asyncio.wait(tasks.values(), timeout=self._step_timeout)
+        finally:
+            for task in tasks.values():
+                if not task.done():
+                    late.add(task)
+                    task.cancel()
+            if late:
+                await asyncio.wait(late)
         results: dict[int, T | Exception] = {}
-        for i, result in zip(calls, found, strict=True):
-            if isinstance(result, TimeoutError) and not isinstance(result, URLabError):
+        for i, task in tasks.items():
+            if task in late and task.cancelled():
                 what = "did not answer" if self._sessions[i].episode else "is still being started"
                 results[i] = TimeoutError(f"environment {i} {what} within {self._step_timeout:g} s")
-            elif isinstance(result, Exception):
-                result.add_note(f"environment {i} at {self._addresses[i]}")
-                results[i] = result
-            elif isinstance(result, BaseException):
-                raise result
-            else:
-                results[i] = result
+                continue
+            try:
+                results[i] = task.result()
+            except Exception as error:  # noqa: BLE001 - reported in `infos`
+                error.add_note(f"environment {i} at {self._addresses[i]}")
+                results[i] = error
         for i, result in results.items():
             if isinstance(result, Exception):
                 self._sessions[i].reopen()

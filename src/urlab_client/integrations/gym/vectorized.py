@@ -153,9 +153,9 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
             raise gymnasium.error.ResetNeeded("call reset() before step()")
         set_points = self._set_points(actions)  # refuses before anything moves
         next_step = self.autoreset_mode is AutoresetMode.NEXT_STEP
-        fresh = np.flatnonzero(self._ended) if next_step else np.zeros(0, dtype=np.intp)
-        acting = np.setdiff1d(np.arange(self.num_envs), fresh)
-        before = self._copied()
+        resetting = self._ended if next_step else np.zeros(self.num_envs, dtype=bool)
+        fresh, acting = np.flatnonzero(resetting), np.flatnonzero(~resetting)
+        before = None if self.reward_fn is None else self._copied()
         self._begin(fresh)
         delayed = self._delayed(acting, actions)
         if delayed is not actions:
@@ -214,7 +214,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
     def _judge(self, before: Observation, actions: Any, stepped: Bools, infos: dict[str, Any]) -> tuple[Floats, Bools]:
         rewards = np.zeros(self.num_envs)
         terminated = np.zeros(self.num_envs, dtype=bool)
-        after = self._copied()
+        after = None if self.reward_fn is None and self.termination_fn is None else self._copied()
         failed = infos.get("_error", np.zeros(self.num_envs, dtype=bool))
         if self.task is not None and not failed.all():  # else there may be no state at all
             states = self._states(np.arange(self.num_envs))

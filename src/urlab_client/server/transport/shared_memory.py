@@ -204,6 +204,7 @@ class SharedMemoryServer:
             for region in self._cameras.values():
                 region.close()
             self._cameras = {}
+        self._pictures_at = time.monotonic()  # whoever begins play comes before readers that nobody knows of
         for key, size in resolutions.items():
             self.switch_camera(key, size, header_bytes)
 
