@@ -47,13 +47,6 @@ class OnnxNetwork:
                     f"{path}: it needs one {kind}, float32 of shape [n] or [batch, n]; it has: {_told(found)}."
                 )
         self.path = path
-        ends = {"input": self._session.get_inputs(), "output": self._session.get_outputs()}
-        for kind, found in ends.items():
-            if len(found) != 1 or found[0].type != "tensor(float)" or not 1 <= len(found[0].shape) <= 2:
-                there = ", ".join(f"{end.name} {end.type} {end.shape}" for end in found)
-                raise PolicyFileError(
-                    f"{path}: it needs one {kind}, float32 of shape [n] or [batch, n]; it has: {there}."
-                )
         self._input = ends["input"][0].name
         self._batched = len(ends["input"][0].shape) == 2
         self.inputs: int | None = _width(ends["input"][0].shape)
