@@ -11,7 +11,12 @@ from collections.abc import Callable, Generator
 import uvicorn
 from starlette.types import ASGIApp
 
+from urlab_client.cli._requests import RunningRequests
+
 __all__ = ["bound", "ending_well", "serve"]
+
+_FINISHING_S = 0.2  # for what is nearly done, after which it is broken off
+_GRACE_S = 10.0  # for what was broken off to clear up
 
 
 @contextlib.contextmanager
@@ -54,7 +59,7 @@ async def serve(
     *,
     lifespan: bool = True,
 ) -> None:
-    """Serve until SIGINT or SIGTERM.
+    """Serve until SIGINT or SIGTERM. What takes longer is broken off then, and a warning says what it was.
 
     Args:
         application: What to serve.
@@ -63,13 +68,14 @@ async def serve(
         ended: Ends it, too.
         lifespan: Whether the application's lifespan is that of the server; else it is the caller's.
     """
+    requests = RunningRequests(application)
     config = uvicorn.Config(
-        application,
+        requests,
         log_config=None,
         access_log=False,
         ws="websockets-sansio",
         ws_max_size=1024 * 1024,
-        timeout_graceful_shutdown=1,
+        timeout_graceful_shutdown=round(_FINISHING_S + _GRACE_S),
         proxy_headers=False,
         server_header=False,
         lifespan="on" if lifespan else "off",
@@ -80,6 +86,15 @@ async def serve(
             await super().startup(sockets)
             if self.started:
                 started()
+
+        async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+            breaking_off = asyncio.get_running_loop().call_later(
+                _FINISHING_S, requests.break_off, self.server_state.connections
+            )
+            try:
+                await super().shutdown(sockets)
+            finally:
+                breaking_off.cancel()
 
     server = Server(config)
 

@@ -14,7 +14,7 @@ from starlette.responses import Response
 
 from urlab_client.protocol.errors import RPC_ERRORS
 from urlab_client.web.ops import encode
-from urlab_client.web.route_group import Handler, RouteGroup
+from urlab_client.web.route_group import JOB, Handler, RouteGroup
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabClient
@@ -35,6 +35,7 @@ class ModelRoutes(RouteGroup):
 
     async def _take(self, request: Request) -> Response:
         viewer, name = self._viewer(request), request.path_params["name"]
+        request.scope[JOB] = f"the import of {name}"
         async with self._console.lease.hold(viewer):  # large models take longer than the controls are kept
             made = await take_model(self._console.client, name, request.stream())
         self._console.note("call", viewer.name, "import model", name)

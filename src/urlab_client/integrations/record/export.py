@@ -116,7 +116,9 @@ def write_parquet(run: Run, path: Path, progress: Progress | None = None, *, epi
         for piece in pieces:
             group = pa.table(piece.flat())
             if writer is None:
-                writer = stack.enter_context(parquet.ParquetWriter(temporary, group.schema, compression="zstd"))
+                # Without dictionaries: hardly a number comes twice, and in a group of this size all would get one.
+                options = {"compression": "zstd", "use_dictionary": False}
+                writer = stack.enter_context(parquet.ParquetWriter(temporary, group.schema, **options))
             if len(piece):
                 writer.write_table(group)
             count += len(piece)
