@@ -10,7 +10,6 @@ from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
-from urllib.parse import urlencode
 
 import msgspec
 
@@ -193,8 +192,7 @@ async def _on_robot(
     policy = load(arguments.policy, arguments.declaration)
     model = arguments.robot or policy.spec.robot
     actor = Path(model).stem
-    options = {"controller": f"{actor}=pd"} if policy.spec.action.via == "controller" else {}
-    address = with_model_options(f"sim://{model}{'?' if options else ''}{urlencode(options)}")
+    address = with_model_options(policy.spec.simulated(model, actor))
     if declared is None:
         logger.warning("nothing varies, so all episodes are the same; --randomise varies the robot")
     else:

@@ -27,7 +27,6 @@ from urlab_client.integrations.gym.spaces import (
     Observation,
     SpaceMapping,
     SpaceMode,
-    observed_pixels,
     with_cameras,
 )
 from urlab_client.integrations.gym.starts import ResetNoise
@@ -47,7 +46,7 @@ from urlab_client.integrations.gym.warp_batch import WarpBatch
 from urlab_client.protocol.enums import ControllerKind
 from urlab_client.protocol.errors import UnknownKeyframe, URLabError
 from urlab_client.protocol.names import compiled_names
-from urlab_client.protocol.pixels import Pixels, to_rgb
+from urlab_client.protocol.pixels import Pixels, observed_pixels, to_rgb
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.randomise.variation import declared_in
 from urlab_client.server.physics.controllers import Controller, ControllerConfig, PassthroughController, PDController

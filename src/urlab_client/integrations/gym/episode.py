@@ -23,7 +23,6 @@ from urlab_client.integrations.gym.spaces import (
     Space,
     SpaceMapping,
     camera_space,
-    observed_pixels,
     with_cameras,
 )
 from urlab_client.integrations.gym.task import EpisodeSettings, Start, States, Task, TaskScene, add_observed, with_task
@@ -33,7 +32,7 @@ from urlab_client.protocol.enums import CameraMode, ObservationLevel, StepMode
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.cameras import CameraDelay
 from urlab_client.protocol.messages.session import StepOk
-from urlab_client.protocol.pixels import Pixels, to_rgb
+from urlab_client.protocol.pixels import Pixels, observed_pixels, to_rgb
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.randomise.variation import EpisodeDraws, declared_in
 from urlab_client.sync.client import URLabClient as BlockingClient

@@ -13,7 +13,6 @@ from gymnasium import spaces
 from urlab_client.aio.model.layout import ArticulationLayout, articulation_layouts
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.enums import CameraMode
-from urlab_client.protocol.pixels import Pixels, without_alpha
 
 if TYPE_CHECKING:
     import mujoco
@@ -28,7 +27,6 @@ __all__ = [
     "SpaceMode",
     "camera_space",
     "dict_space",
-    "observed_pixels",
     "with_cameras",
 ]
 
@@ -257,8 +255,3 @@ def camera_space(mode: CameraMode | str, resolution: tuple[int, int]) -> Space:
     if mode == CameraMode.DEPTH:
         return spaces.Box(0.0, np.inf, (height, width), dtype=np.float32)
     return spaces.Box(0, 255, (height, width, 3 if mode == CameraMode.REAL else 4), dtype=np.uint8)
-
-
-def observed_pixels(pixels: Pixels, mode: CameraMode | str) -> Pixels:
-    """Return a picture as it is observed, from what `URLabCameraView.latest_frame` has."""
-    return without_alpha(pixels) if mode == CameraMode.REAL else pixels
