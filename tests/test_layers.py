@@ -62,6 +62,7 @@ ALLOWED: dict[str, frozenset[str]] = {
     "integrations": frozenset(
         {
             "",
+            "_children",
             "_extras",
             "_installation",
             "_mujoco",

@@ -5,8 +5,10 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shutil
 import signal
 import sys
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -23,8 +25,16 @@ from urlab_client.cli.figures import Quantity, Trace, plot_trace
 from urlab_client.integrations._feed.quantities import component_name, quantities
 from urlab_client.integrations._feed.scene_messages import SceneLayout
 from urlab_client.integrations.gym import URLabEnv
-from urlab_client.integrations.record import RecordingError, Run, export, read_run, record, table_builder
-from urlab_client.integrations.record.pixels import visible
+from urlab_client.integrations.record import (
+    RecordingError,
+    Run,
+    export,
+    lerobot_writer,
+    read_run,
+    record,
+    table_builder,
+)
+from urlab_client.integrations.record.pixels import even, visible
 from urlab_client.integrations.record.transitions import transitions
 from urlab_client.server import SimulatedServer
 
@@ -41,18 +51,19 @@ class LeRobotDataset:
         made = cls()
         made.root, made.frames, made.log = Path(root), [], {"fps": fps, "repo_id": repo_id, "episodes": []}
         made.log |= {"robot_type": robot_type, "use_videos": use_videos}
+        made.root.mkdir()
         made.log["features"] = {k: [v["dtype"], list(v["shape"]), v["names"]] for k, v in features.items()}
         return made
     def add_frame(self, frame):
         for name, (dtype, shape, _) in self.log["features"].items():
             assert list(frame[name].shape) == shape
             assert str(frame[name].dtype) == ("uint8" if dtype in ("image", "video") else dtype)
-        self.frames.append({k: v if isinstance(v, str) else v.ravel()[:20].tolist() for k, v in frame.items()})
+        shown = {k: v if isinstance(v, str) else v.ravel()[:: max(1, v.size // 99)].tolist() for k, v in frame.items()}
+        self.frames.append(shown)
     def save_episode(self):
         self.log["episodes"].append(self.frames)
         self.frames = []
     def finalize(self):
-        self.root.mkdir()
         (self.root / "log.json").write_text(json.dumps(self.log))
 """
 
@@ -116,6 +127,7 @@ def test_a_moment_is_what_the_table_and_the_frames_hold(recorded: Run) -> None:
 def small_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     """A recording of a hundred states is read in about fifteen pieces, as one of a night is."""
     monkeypatch.setattr(table_builder, "PIECE_VALUES", 500)
+    monkeypatch.setattr(lerobot_writer, "_TOGETHER", 3)
 
 
 @pytest.mark.usefixtures("small_pieces")
@@ -214,6 +226,7 @@ def lerobot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     return sys.executable
 
 
+@pytest.mark.usefixtures("small_pieces")
 def test_a_lerobot_dataset_is_written_by_the_other_interpreter(recorded: Run, tmp_path: Path, lerobot: str) -> None:
     written = export.write_lerobot(
         recorded, tmp_path / "spins", python=lerobot, fps=25, task="spin", max_picture_age=0.05
@@ -236,8 +249,34 @@ def test_a_lerobot_dataset_is_written_by_the_other_interpreter(recorded: Run, tm
     assert frame["observation.state"] == state.astype(np.float32).tolist()
     action = np.concatenate([table.columns[f"{key}/set_points"].values[row + 1] for key in ("arm", "eye")])
     assert frame["action"] == action.astype(np.float32).tolist()
+    pictures = list(recorded.frames("eye/up"))
+    for start, frames in zip((0, 61), log["episodes"], strict=True):
+        for i, frame in enumerate(frames):
+            when = table.time[start + (10 * i if start else 0)] + (0.0 if start else 0.04 * i) + 1e-6
+            newest = [picture for picture in pictures if picture.time <= when][-1]
+            assert frame["observation.images.eye.up"] == even(visible(newest.pixels, 1.0)).ravel()[::22].tolist()
     with pytest.raises(FileExistsError):
         export.write_lerobot(recorded, tmp_path / "spins", python=lerobot, fps=50, task="spin")
+
+
+@pytest.mark.usefixtures("small_pieces")
+def test_a_lerobot_dataset_is_whole_or_not_there(recorded: Run, tmp_path: Path, lerobot: str) -> None:
+    stand_in = next(tmp_path.rglob("lerobot_dataset.py"))
+    written = partial(
+        export.write_lerobot, recorded, tmp_path / "spins", python=lerobot, fps=25, task="spin", max_picture_age=0.05
+    )
+    told: list[int] = []
+    written(progress=told.append)
+    assert told == sorted(told)
+    shutil.rmtree(tmp_path / "spins")
+    presses = iter([lambda: None] * (len(told) - 1))
+    with pytest.raises(KeyboardInterrupt):
+        written(progress=lambda _: next(presses, lambda: signal.raise_signal(signal.SIGINT))())
+    assert os.listdir(tmp_path) == ["site"]
+    stand_in.write_text(LEROBOT.replace("self.frames = []\n    def", "raise OSError('disk full')\n    def"), "utf-8")
+    with pytest.raises(RecordingError, match="LeRobot failed: OSError: disk full"):
+        written()
+    assert os.listdir(tmp_path) == ["site"]
 
 
 def test_a_lerobot_dataset_holds_what_kept_episodes_were_about(tmp_path: Path, lerobot: str) -> None:
