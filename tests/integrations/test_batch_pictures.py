@@ -7,10 +7,12 @@ import sys
 from collections.abc import Iterator
 from typing import Any, Literal
 
+import mujoco
 import numpy as np
 import pytest
 
 from urlab_client.integrations.gym import URLabBatchEnv, URLabVectorEnv
+from urlab_client.integrations.gym.threaded_batch import ThreadedBatch
 from urlab_client.protocol.enums import CameraMode
 from urlab_client.randomise import Randomisation, Vary
 from urlab_client.server import SimulatedServer
@@ -80,6 +82,19 @@ def test_a_batch_refuses_cameras_that_it_cannot_show(made: list[Any]) -> None:
         batch = URLabBatchEnv(address, 1)
         made.append(batch)
         assert batch.render() is None
+
+
+def test_what_follows_from_a_varied_camera_is_known_before_mujoco_has_batches() -> None:
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body pos='1 0 0'><freejoint/><geom size='0.1'/>"
+        "<camera mode='trackcom' pos='0 0 2'/></body></worldbody></mujoco>"
+    )
+    batch = ThreadedBatch(model, 2)
+    local, derived = batch.expand("cam_pos"), batch.expand("cam_poscom0")
+    local[1] = [[0.0, 0.0, 3.0]]
+    batch.set_const(np.array([1]))
+    assert derived.tolist() == [[[0.0, 0.0, 2.0]], [[0.0, 0.0, 3.0]]]
+    assert batch.expand("cam_pos")[1].tolist() == [[0.0, 0.0, 3.0]]
 
 
 @pytest.mark.long
