@@ -14,7 +14,9 @@ import numpy as np
 import pytest
 from made_recordings import Robot, write_recording
 
-from urlab_client.integrations.record import export, read_run, table_builder
+from urlab_client._whole_files import replaced
+from urlab_client.cli import main
+from urlab_client.integrations.record import Run, export, read_run, table_builder
 from urlab_client.integrations.record.transitions import transition_pieces, transitions_of
 
 
@@ -112,3 +114,21 @@ def interrupting(limit: int) -> Any:
             signal.raise_signal(signal.SIGINT)
 
     return progress
+
+
+def test_a_conversion_that_is_terminated_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_recording(tmp_path / "run.mcap", steady(10))
+
+    def half(_run: Run, path: Path, *_: Any, **__: Any) -> int:
+        with replaced(path) as temporary:
+            temporary.write_text("half", encoding="utf-8")
+            signal.raise_signal(signal.SIGTERM)
+        return 0
+
+    monkeypatch.setattr(export, "write_csv", half)
+    before = signal.signal(signal.SIGTERM, signal.SIG_IGN)  # where it is not heeded the file is made
+    try:
+        assert main(["convert", str(tmp_path / "run.mcap"), str(tmp_path / "run.csv")]) == 130
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert os.listdir(tmp_path) == ["run.mcap"]

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import logging
 import os
+import tempfile
 import threading
 from collections.abc import AsyncGenerator, Callable
 from pathlib import Path
@@ -18,7 +19,7 @@ from urlab_client.aio import URLabClient
 from urlab_client.cli._pages import bound, serve
 from urlab_client.integrations.record import Run, export
 from urlab_client.server import SimulatedServer
-from urlab_client.web import Access, app
+from urlab_client.web import Access, app, model_upload
 
 LONG = "long.mcap"
 
@@ -63,6 +64,22 @@ def converting(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
 
 
 @pytest.fixture
+def unpacking(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A model's archive that takes as long to unpack; return the folder for temporary files."""
+
+    def unpack(_archive: Path, folder: Path, progress: Callable[[int], None]) -> Path:
+        folder.mkdir()
+        while True:
+            progress(0)
+            (folder / "part").touch()
+
+    monkeypatch.setattr(model_upload, "_unpacked", unpack)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path.parent / f"{tmp_path.name}-temporary"))
+    Path(tempfile.gettempdir()).mkdir()
+    return Path(tempfile.gettempdir())
+
+
+@pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """A recording, and a file too large for what sockets hold."""
     write_recording(tmp_path / "short.mcap", [({"arm": Robot([0.0])}, {})])
@@ -72,26 +89,30 @@ def folder(tmp_path: Path) -> Path:
 
 
 async def test_ending_breaks_off_what_takes_long_without_a_trace(
-    folder: Path, converting: threading.Event, caplog: pytest.LogCaptureFixture
+    folder: Path, converting: threading.Event, unpacking: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     ended = asyncio.Event()
     with caplog.at_level(logging.WARNING):
         async with console(folder, ended) as (port, key):
+            importing = await ask(port, key, "PUT /api/models/robot.zip", b"P" * 1000)
             uploading = await ask(port, key, "PUT /api/recordings/other.mcap", b"some")
+            again = await ask(port, key, "PUT /api/recordings/other.mcap", b"more")
             conversion = await ask(port, key, "GET /api/recordings/short.mcap?as=csv")
             download = await ask(port, key, f"GET /api/recordings/{LONG}")
             assert await download[0].readline() == b"HTTP/1.1 200 OK\r\n"
-            await until(lambda: converting.is_set() and len(os.listdir(folder)) == 4)
+            await until(lambda: converting.is_set() and len(os.listdir(folder)) == 5 and any(unpacking.rglob("part")))
             ended.set()
-            for reader, _ in (conversion, uploading):
+            for reader, _ in (conversion, uploading, again, importing):
                 assert await reader.readline() == b"HTTP/1.1 503 Service Unavailable\r\n"
     assert sorted(record.getMessage() for record in caplog.records) == [
         "the conversion of short.mcap to csv was broken off",
         f"the download of {LONG} was broken off",
-        "the upload of other.mcap was broken off",
+        "the import of robot.zip was broken off",
+        *["the upload of other.mcap was broken off"] * 2,
     ]
     assert sorted(os.listdir(folder)) == [LONG, "short.mcap"]
-    for _, writer in (uploading, conversion, download):
+    assert [name for name in os.listdir(unpacking) if name.startswith("urlab-model-")] == []
+    for _, writer in (importing, uploading, again, conversion, download):
         writer.close()
 
 

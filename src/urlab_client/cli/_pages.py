@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import signal
 import socket
 from collections.abc import Callable, Generator
 
 import uvicorn
 from starlette.types import ASGIApp
 
+from urlab_client.cli._ending import sigterm_interrupts
 from urlab_client.cli._requests import RunningRequests
 
 __all__ = ["bound", "ending_well", "serve"]
@@ -22,12 +22,9 @@ _GRACE_S = 10.0  # for what was broken off to clear up
 @contextlib.contextmanager
 def ending_well() -> Generator[None]:
     """Let SIGTERM end the body as SIGINT does, and take that for its end."""
-    before = signal.signal(signal.SIGTERM, lambda _number, _frame: signal.raise_signal(signal.SIGINT))
-    try:
-        with contextlib.suppress(KeyboardInterrupt):  # in the moment before uvicorn listens for it
-            yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    # KeyboardInterrupt comes in the moment before uvicorn listens for it.
+    with contextlib.suppress(KeyboardInterrupt), sigterm_interrupts():
+        yield
 
 
 def bound(host: str, number: int) -> socket.socket:

@@ -8,18 +8,18 @@ import os
 import re
 import secrets
 import tempfile
-import threading
 import time
-from collections.abc import AsyncGenerator, AsyncIterator, Callable
+from collections.abc import AsyncGenerator, AsyncIterator
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import anyio.to_thread
 from msgspec import Struct
 
 from urlab_client._extras import MissingExtra, need
 from urlab_client.protocol.errors import URLabError
+from urlab_client.web.stoppable import Progress, stoppable
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabClient
@@ -35,9 +35,6 @@ KINDS = ("csv", "mp4", "npz")
 _NAME = re.compile(r"[\w][\w .()+-]{0,100}\.(mcap|json)", re.ASCII)
 _LARGEST_FILE = 4 << 30
 
-Progress: TypeAlias = Callable[[int], None]
-
-_T = TypeVar("_T")
 _CAMERA_HZ = 30.0
 
 
@@ -250,7 +247,7 @@ class Recordings:
 
             self.conversions.append(conversion)
             try:
-                await _stoppable(lambda told: _convert(file, target, kind, camera, told), progress)
+                await stoppable(lambda told: _convert(file, target, kind, camera, told), progress)
             finally:
                 self.conversions.remove(conversion)
             yield target
@@ -277,7 +274,7 @@ class Recordings:
                     if size > _LARGEST_FILE:
                         raise ValueError(f"a recording is at most {_LARGEST_FILE} bytes")
                     await anyio.to_thread.run_sync(file.write, chunk)
-            await _stoppable(lambda told: _described(partial, told))
+            await stoppable(lambda told: _described(partial, told))
             if target.exists():  # by now
                 raise ValueError(f"there is a recording {name!r} already")
             partial.rename(target)
@@ -306,29 +303,6 @@ def open_run(file: Path) -> Run:
     from urlab_client.integrations.record import read_run  # noqa: PLC0415
 
     return read_run(file)
-
-
-async def _stoppable(job: Callable[[Progress], _T], progress: Progress = lambda _: None) -> _T:
-    """Run a job in a thread. Cancelled, it ends when it next says how far it is, and this does not end before it."""
-    stopped = threading.Event()
-
-    def told(count: int) -> None:
-        if stopped.is_set():
-            raise _Stopped
-        progress(count)
-
-    running = asyncio.ensure_future(anyio.to_thread.run_sync(job, told))
-    try:
-        return await asyncio.shield(running)
-    except asyncio.CancelledError:
-        stopped.set()
-        running.add_done_callback(lambda done: done.cancelled() or done.exception())
-        await asyncio.wait((running,))
-        raise
-
-
-class _Stopped(Exception):
-    """A job was told to stop."""
 
 
 def _described(file: Path, progress: Progress | None = None) -> dict[str, Any]:
