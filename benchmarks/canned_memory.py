@@ -64,7 +64,7 @@ def memory_server(
 def _region(path: Path, stride: int) -> shm.Region:
     with path.open("w+b") as file:
         file.truncate(shm.region_size(stride))
-        return shm.create(mmap.mmap(file.fileno(), shm.region_size(stride)), stride, fence=shm.no_fence)
+        return shm.create(memoryview(mmap.mmap(file.fileno(), shm.region_size(stride))), stride, fence=shm.no_fence)
 
 
 def _answer_zmq(answers: Mapping[bytes, bytes], rep: zmq.Socket[bytes]) -> None:

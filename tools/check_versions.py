@@ -9,7 +9,7 @@ environments. Then a client there drives a server of this interpreter's, which s
 way round. Exit code 1 says that something failed.
 
 With --quick, for CI, which runs the whole suite with the newest MuJoCo: `lowest`, whose MuJoCo is the oldest, and of
-the release between what has MuJoCo in it.
+the release between what drives a simulation from end to end.
 
 Asyncio's debug mode is on here, as nowhere else: it costs time, and nothing in it depends on a version.
 """
@@ -31,12 +31,12 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 DRIVE = ROOT / "tools" / "drive_other_release.py"
 
-SIMULATING = (
-    *("tests/test_mujoco_releases.py", "tests/server", "tests/conformance"),
+FROM_END_TO_END = (
+    *("tests/test_mujoco_releases.py", "tests/conformance"),
     *("tests/integrations/test_gym.py", "tests/integrations/test_vector_env.py"),
 )
-CORE = (*SIMULATING, "tests/protocol", "tests/aio", "tests/sync")
-QUICK = {"lowest": CORE, "mujoco-3.11": SIMULATING}
+CORE = (*FROM_END_TO_END, "tests/server", "tests/protocol", "tests/aio", "tests/sync")
+QUICK = {"lowest": CORE, "mujoco-3.11": FROM_END_TO_END}
 
 # What the core's tests use of the extra `test`; the rest is for integrations, and takes long to install.
 TESTS_NEED = {"coacd", "gymnasium", "hypothesis", "pillow", "trio", "uvloop"}

@@ -20,7 +20,7 @@ from urlab_client import aio
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.live.publishers import Publishers
 from urlab_client.protocol.messages.session import CameraInfo
-from urlab_client.protocol.messages.streams import StateSnapshot
+from urlab_client.protocol.messages.streams import CameraSample, StateSnapshot
 from urlab_client.protocol.topics import STATE_FULL, camera_filter
 
 __all__ = ["ROWS"]
@@ -164,7 +164,7 @@ def _pictures(mode: str, width: int, height: int) -> Iterator[Pair]:
         runner.run(_close(publishers))
 
 
-async def _open(stream: aio.Stream[object]) -> None:
+async def _open(stream: aio.Stream[CameraSample]) -> None:
     await stream.__aenter__()
 
 

@@ -104,7 +104,11 @@ def arm() -> Iterator[URLabClient]:
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("hz = 2.0", "hz = 2.0\nherz = 1", r"observation\[0\]: .*`herz`. Its keys are term, scale, offset, clip, hz"),
+        (
+            "hz = 2.0",
+            "hz = 2.0\nherz = 1",
+            r"observation\[0\]: .*`herz`. Its keys are term, scale, offset, clip, input, hz",
+        ),
         ("hz = 2.0", 'hz = "2"', r"observation\[0\].hz: Expected `float`, got `str`"),
         ("hz = 2.0", "", r"observation\[0\]: .*missing required field `hz`"),
         ('"clock"', '"clok"', r"observation\[0\].term: .*'clok'. Terms are .*gravity, .*clock"),

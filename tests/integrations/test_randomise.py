@@ -310,8 +310,9 @@ def test_pictures_vary_and_come_late_by_the_simulations_clock(made: list[Any]) -
     )
     options: Any = {"observations": ["qpos"], "space_mode": "dict", "cameras": ["arm/overview"], "n_substeps": 10}
     with SimulatedServer("arm", play=True, randomise=look, dialect="beta", camera_size=(64, 48)) as server:
+        batch = URLabBatchEnv(where(server), 1, **options)
         env = URLabEnv.connect(where(server), **options)
-        made.append(env)
+        made += [env, batch]
 
         def pictures(seed: int) -> list[Any]:
             seen = [env.reset(seed=seed)[0]]
@@ -323,3 +324,7 @@ def test_pictures_vary_and_come_late_by_the_simulations_clock(made: list[Any]) -
         assert not np.array_equal(one[0], other[0])
         assert np.array_equal(one[0], one[2]), "two actions of 0.02 s late"
         assert not np.array_equal(one[2], one[5])
+        seen = [batch.reset(seed=1)[0]]
+        seen += [batch.step({"arm": np.full((1, 7), 0.5, dtype=np.float32)})[0] for _ in range(5)]
+        ours = [each["cameras"]["arm/overview"][0] for each in seen]
+        assert all(np.array_equal(a, b) for a, b in zip(one, ours, strict=True)), "a batch is as late"

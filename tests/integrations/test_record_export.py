@@ -5,7 +5,10 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shutil
+import signal
 import sys
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -22,8 +25,16 @@ from urlab_client.cli.figures import Quantity, Trace, plot_trace
 from urlab_client.integrations._feed.quantities import component_name, quantities
 from urlab_client.integrations._feed.scene_messages import SceneLayout
 from urlab_client.integrations.gym import URLabEnv
-from urlab_client.integrations.record import RecordingError, Run, export, read_run, record
-from urlab_client.integrations.record.pixels import visible
+from urlab_client.integrations.record import (
+    RecordingError,
+    Run,
+    export,
+    lerobot_writer,
+    read_run,
+    record,
+    table_builder,
+)
+from urlab_client.integrations.record.pixels import even, visible
 from urlab_client.integrations.record.transitions import transitions
 from urlab_client.server import SimulatedServer
 
@@ -40,18 +51,19 @@ class LeRobotDataset:
         made = cls()
         made.root, made.frames, made.log = Path(root), [], {"fps": fps, "repo_id": repo_id, "episodes": []}
         made.log |= {"robot_type": robot_type, "use_videos": use_videos}
+        made.root.mkdir()
         made.log["features"] = {k: [v["dtype"], list(v["shape"]), v["names"]] for k, v in features.items()}
         return made
     def add_frame(self, frame):
         for name, (dtype, shape, _) in self.log["features"].items():
             assert list(frame[name].shape) == shape
             assert str(frame[name].dtype) == ("uint8" if dtype in ("image", "video") else dtype)
-        self.frames.append({k: v if isinstance(v, str) else v.ravel()[:20].tolist() for k, v in frame.items()})
+        shown = {k: v if isinstance(v, str) else v.ravel()[:: max(1, v.size // 99)].tolist() for k, v in frame.items()}
+        self.frames.append(shown)
     def save_episode(self):
         self.log["episodes"].append(self.frames)
         self.frames = []
     def finalize(self):
-        self.root.mkdir()
         (self.root / "log.json").write_text(json.dumps(self.log))
 """
 
@@ -111,6 +123,14 @@ def test_a_moment_is_what_the_table_and_the_frames_hold(recorded: Run) -> None:
         recorded.picture_at("arm/nose", 0.0)
 
 
+@pytest.fixture
+def small_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A recording of a hundred states is read in about fifteen pieces, as one of a night is."""
+    monkeypatch.setattr(table_builder, "PIECE_VALUES", 500)
+    monkeypatch.setattr(lerobot_writer, "_TOGETHER", 3)
+
+
+@pytest.mark.usefixtures("small_pieces")
 def test_csv_and_parquet_hold_every_value_to_the_bit(recorded: Run, tmp_path: Path) -> None:
     flat = transitions(recorded.table()).flat()
     assert export.write_csv(recorded, tmp_path / "run.csv") == 98
@@ -118,6 +138,7 @@ def test_csv_and_parquet_hold_every_value_to_the_bit(recorded: Run, tmp_path: Pa
     with (tmp_path / "run.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     table = parquet.read_table(tmp_path / "run.parquet")
+    assert parquet.ParquetFile(tmp_path / "run.parquet").num_row_groups > 5
     assert list(rows[0]) == table.column_names == list(flat)
     assert {"time", "episode", "arm/qpos/shoulder_pan", "arm/sensors/grip_position.0", "eye/ctrl/spin"} <= flat.keys()
     for name, column in flat.items():
@@ -157,6 +178,7 @@ def test_rows_pair_an_observation_with_the_action_taken_at_it(tmp_path: Path) ->
         assert np.array_equal(pictures[round(float(time), 6)], seen["cameras"]["arm/wrist"][..., :3])
 
 
+@pytest.mark.usefixtures("small_pieces")
 def test_npz_holds_arrays_names_and_pictures(recorded: Run, tmp_path: Path) -> None:
     export.write_npz(recorded, tmp_path / "run.npz", cameras=["eye/up"])
     table, pictures = recorded.table(), list(recorded.frames("eye/up"))
@@ -169,7 +191,7 @@ def test_npz_holds_arrays_names_and_pictures(recorded: Run, tmp_path: Path) -> N
         assert arrays["camera/eye/up.time"].tolist() == [picture.time for picture in pictures]
 
 
-def test_mp4_shows_each_picture_at_its_time(recorded: Run, tmp_path: Path) -> None:
+def test_mp4_shows_each_picture_at_its_time(recorded: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pictures = list(recorded.frames("eye/up"))
     assert export.write_mp4(recorded, tmp_path / "run.mp4", "eye/up") == len(pictures) > 8
     with av.open(tmp_path / "run.mp4") as container:
@@ -181,6 +203,10 @@ def test_mp4_shows_each_picture_at_its_time(recorded: Run, tmp_path: Path) -> No
         assert np.abs(shown[:21, :33].astype(int) - picture.pixels).mean() < 12
     with pytest.raises(KeyError, match="eye/up"):
         export.write_mp4(recorded, tmp_path / "none.mp4", "eye/down")
+    monkeypatch.delitem(export._CODECS, "libx264")  # the other codec writes each picture at once
+    with pytest.raises(KeyboardInterrupt):
+        export.write_mp4(recorded, tmp_path / "none.mp4", "eye/up", lambda _: signal.raise_signal(signal.SIGINT))
+    assert os.listdir(tmp_path) == ["run.mp4"]
 
 
 def test_depth_becomes_grey() -> None:
@@ -200,6 +226,7 @@ def lerobot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     return sys.executable
 
 
+@pytest.mark.usefixtures("small_pieces")
 def test_a_lerobot_dataset_is_written_by_the_other_interpreter(recorded: Run, tmp_path: Path, lerobot: str) -> None:
     written = export.write_lerobot(
         recorded, tmp_path / "spins", python=lerobot, fps=25, task="spin", max_picture_age=0.05
@@ -222,8 +249,34 @@ def test_a_lerobot_dataset_is_written_by_the_other_interpreter(recorded: Run, tm
     assert frame["observation.state"] == state.astype(np.float32).tolist()
     action = np.concatenate([table.columns[f"{key}/set_points"].values[row + 1] for key in ("arm", "eye")])
     assert frame["action"] == action.astype(np.float32).tolist()
+    pictures = list(recorded.frames("eye/up"))
+    for start, frames in zip((0, 61), log["episodes"], strict=True):
+        for i, frame in enumerate(frames):
+            when = table.time[start + (10 * i if start else 0)] + (0.0 if start else 0.04 * i) + 1e-6
+            newest = [picture for picture in pictures if picture.time <= when][-1]
+            assert frame["observation.images.eye.up"] == even(visible(newest.pixels, 1.0)).ravel()[::22].tolist()
     with pytest.raises(FileExistsError):
         export.write_lerobot(recorded, tmp_path / "spins", python=lerobot, fps=50, task="spin")
+
+
+@pytest.mark.usefixtures("small_pieces")
+def test_a_lerobot_dataset_is_whole_or_not_there(recorded: Run, tmp_path: Path, lerobot: str) -> None:
+    stand_in = next(tmp_path.rglob("lerobot_dataset.py"))
+    written = partial(
+        export.write_lerobot, recorded, tmp_path / "spins", python=lerobot, fps=25, task="spin", max_picture_age=0.05
+    )
+    told: list[int] = []
+    written(progress=told.append)
+    assert told == sorted(told)
+    shutil.rmtree(tmp_path / "spins")
+    presses = iter([lambda: None] * (len(told) - 1))
+    with pytest.raises(KeyboardInterrupt):
+        written(progress=lambda _: next(presses, lambda: signal.raise_signal(signal.SIGINT))())
+    assert os.listdir(tmp_path) == ["site"]
+    stand_in.write_text(LEROBOT.replace("self.frames = []\n    def", "raise OSError('disk full')\n    def"), "utf-8")
+    with pytest.raises(RecordingError, match="LeRobot failed: OSError: disk full"):
+        written()
+    assert os.listdir(tmp_path) == ["site"]
 
 
 def test_a_lerobot_dataset_holds_what_kept_episodes_were_about(tmp_path: Path, lerobot: str) -> None:

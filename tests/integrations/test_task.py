@@ -264,8 +264,9 @@ def test_a_block_is_pushed_to_its_target_and_seen_in_pictures_alone(pushers: lis
     assert picture.shape == (72, 96, 3)
     orange = (picture[..., 0] > 150) & (picture[..., 2] < 80)
     assert 3 < orange.sum() < 300
-    with pytest.raises(ValueError, match=r"a batch observes no cameras \(arm/overview\): use servers"):
-        URLabBatchEnv(pushers[0], 1, task=PushPictures())
+    in_batch = URLabBatchEnv(pushers[1], 1, task=AheadByEye())
+    made.append(in_batch)
+    assert np.array_equal(in_batch.reset(seed=0)[0]["cameras"]["arm/overview"][0], picture)
     with pytest.raises(ValueError, match="'block' is not observed"):
         env.mapping.field(observation, "block", "qpos")
 

@@ -334,10 +334,7 @@ def test_servers_and_batch_render_each_environment(servers: list[str], made: lis
         assert [picture.shape for picture in (*first, *second)] == [(480, 640, 3)] * 4
         assert len({picture.tobytes() for picture in first}) == 2
         assert all(np.ptp(picture) > 100 for picture in first)
-    drawn, again = (env.render()[0].astype(int) for env in (wire, batch))
-    assert np.abs(drawn - again).mean() < 20, "the same robot in the same pose, with and without shadows"
-    with pytest.raises(ValueError, match="no camera is called 'arm/nose'"):
-        URLabBatchEnv("sim://arm", 1, render_mode="rgb_array", render_camera="arm/nose").render()
+    assert all(np.array_equal(*pictures) for pictures in zip(wire.render(), batch.render(), strict=True))
     for env in (URLabVectorEnv, URLabBatchEnv):
         with pytest.raises(ValueError, match="render_mode"):
             env("sim://arm", 1, render_mode="human")

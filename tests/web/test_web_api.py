@@ -352,6 +352,7 @@ def test_a_recording_is_made_converted_replayed_in_seconds_and_removed(
         name = http.post("/api/recording", json={"cameras": True}).json()["name"]
         assert http.post("/api/recording", json={}).status_code == 400, "one at a time"
         assert http.get("/api/status").json()["recording"]["name"] == name
+        assert "is being recorded" in http.delete(f"/api/recordings/{name}").json()["error"]["message"]
         http.post("/api/ctrl", json={"arm": {"elbow": -0.4}})
         for _ in range(10):
             http.post("/api/step", json={"n_steps": 100})

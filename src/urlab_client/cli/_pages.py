@@ -4,25 +4,27 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import signal
 import socket
 from collections.abc import Callable, Generator
 
 import uvicorn
 from starlette.types import ASGIApp
 
+from urlab_client.cli._ending import sigterm_interrupts
+from urlab_client.cli._requests import RunningRequests
+
 __all__ = ["bound", "ending_well", "serve"]
+
+_FINISHING_S = 0.2  # for what is nearly done, after which it is broken off
+_GRACE_S = 10.0  # for what was broken off to clear up
 
 
 @contextlib.contextmanager
 def ending_well() -> Generator[None]:
     """Let SIGTERM end the body as SIGINT does, and take that for its end."""
-    before = signal.signal(signal.SIGTERM, lambda _number, _frame: signal.raise_signal(signal.SIGINT))
-    try:
-        with contextlib.suppress(KeyboardInterrupt):  # in the moment before uvicorn listens for it
-            yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    # KeyboardInterrupt comes in the moment before uvicorn listens for it.
+    with contextlib.suppress(KeyboardInterrupt), sigterm_interrupts():
+        yield
 
 
 def bound(host: str, number: int) -> socket.socket:
@@ -54,7 +56,7 @@ async def serve(
     *,
     lifespan: bool = True,
 ) -> None:
-    """Serve until SIGINT or SIGTERM.
+    """Serve until SIGINT or SIGTERM. What takes longer is broken off then, and a warning says what it was.
 
     Args:
         application: What to serve.
@@ -63,13 +65,14 @@ async def serve(
         ended: Ends it, too.
         lifespan: Whether the application's lifespan is that of the server; else it is the caller's.
     """
+    requests = RunningRequests(application)
     config = uvicorn.Config(
-        application,
+        requests,
         log_config=None,
         access_log=False,
         ws="websockets-sansio",
         ws_max_size=1024 * 1024,
-        timeout_graceful_shutdown=1,
+        timeout_graceful_shutdown=round(_FINISHING_S + _GRACE_S),
         proxy_headers=False,
         server_header=False,
         lifespan="on" if lifespan else "off",
@@ -80,6 +83,15 @@ async def serve(
             await super().startup(sockets)
             if self.started:
                 started()
+
+        async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+            breaking_off = asyncio.get_running_loop().call_later(
+                _FINISHING_S, requests.break_off, self.server_state.connections
+            )
+            try:
+                await super().shutdown(sockets)
+            finally:
+                breaking_off.cancel()
 
     server = Server(config)
 

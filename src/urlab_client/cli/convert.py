@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from urlab_client.cli._arguments import Commands, count, seconds
+from urlab_client.cli._ending import sigterm_interrupts
 from urlab_client.cli._failure import CommandError
-from urlab_client.cli._files import replaced
 from urlab_client.cli._output import progress_bar
 
 if TYPE_CHECKING:
@@ -113,12 +113,9 @@ def run(arguments: ConvertArguments) -> int:
 
         recording = read_run(arguments.recording)
         write, what = _writer(kind, recording, arguments)
-        with progress_bar(f"{arguments.recording.name} → {kind}", recording.path.stat().st_size) as progress:
-            if kind == "lerobot":
-                written = write(arguments.output, progress=progress)
-            else:
-                with replaced(arguments.output) as temporary:
-                    written = write(temporary, progress=progress)
+        shown = progress_bar(f"{arguments.recording.name} → {kind}", recording.path.stat().st_size)
+        with sigterm_interrupts(), shown as progress:
+            written = write(arguments.output, progress=progress)
     except KeyError as error:
         raise CommandError(str(error.args[0])) from None
     print(f"{arguments.output}  {written} {what}")

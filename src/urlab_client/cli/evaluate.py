@@ -10,7 +10,6 @@ from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
-from urllib.parse import urlencode
 
 import msgspec
 
@@ -32,9 +31,6 @@ logger: logging.Logger = logging.getLogger("urlab_client.cli")
 
 _MODEST: Final = ""
 _MOST_COPIES: Final = 64
-_MOST_SERVERS: Final = 4
-_FIRST_PICTURE_S: Final = 60.0
-"""How long a server may take for a step: the first picture takes seconds where a busy processor draws it."""
 
 
 class EvaluateArguments(argparse.Namespace):
@@ -152,7 +148,7 @@ def _in_task(
             raise CommandError(f"--{name} does not go with --task, which settles it")
     from gymnasium.vector import AutoresetMode  # noqa: PLC0415
 
-    from urlab_client.integrations.gym import TASKS, URLabBatchEnv, URLabVectorEnv  # noqa: PLC0415
+    from urlab_client.integrations.gym import TASKS, URLabBatchEnv  # noqa: PLC0415
     from urlab_client.integrations.policy import (  # noqa: PLC0415
         OnnxDictNetwork,
         OnnxNetwork,
@@ -171,16 +167,14 @@ def _in_task(
         on_episode=show,
     )
     options: dict[str, Any] = {"task": kind(), "randomise": declared, "autoreset_mode": AutoresetMode.DISABLED}
-    if kind.cameras:
-        servers = min(arguments.episodes, _MOST_SERVERS)
-        env = URLabVectorEnv(kind.scene_address, servers, step_timeout=_FIRST_PICTURE_S, **options)
-        with closing(env):
-            ((_, box),) = cast("dict[str, Any]", env.single_action_space).items()
-            return evaluated(env, OnnxDictNetwork(arguments.policy, env.single_observation_space, len(box.low)))
-    network = OnnxNetwork(arguments.policy)
     env = URLabBatchEnv(kind.scene_address, min(arguments.episodes, _MOST_COPIES), **options)
     with closing(env):
-        wanted = {"inputs": env.single_observation_space.shape, "outputs": env.single_action_space.shape}
+        space = env.single_observation_space
+        if kind.cameras:
+            ((_, box),) = cast("dict[str, Any]", env.single_action_space).items()
+            return evaluated(env, OnnxDictNetwork(arguments.policy, space, len(box.low)))
+        network = OnnxNetwork(arguments.policy)
+        wanted = {"inputs": space.shape, "outputs": env.single_action_space.shape}
         for name, shape in wanted.items():
             if getattr(network, name) not in (None, (shape or (0,))[0]):
                 raise PolicyFileError(
@@ -198,8 +192,7 @@ async def _on_robot(
     policy = load(arguments.policy, arguments.declaration)
     model = arguments.robot or policy.spec.robot
     actor = Path(model).stem
-    options = {"controller": f"{actor}=pd"} if policy.spec.action.via == "controller" else {}
-    address = with_model_options(f"sim://{model}{'?' if options else ''}{urlencode(options)}")
+    address = with_model_options(policy.spec.simulated(model, actor))
     if declared is None:
         logger.warning("nothing varies, so all episodes are the same; --randomise varies the robot")
     else:

@@ -8,7 +8,6 @@ import sys
 from collections.abc import AsyncGenerator, Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
-from urllib.parse import urlencode
 
 import msgspec
 import numpy as np
@@ -205,8 +204,7 @@ def _where(arguments: RunPolicyArguments, policy: Policy) -> tuple[str, str | No
         return arguments.address, arguments.robot
     model = arguments.robot or policy.spec.robot
     actor = Path(model).stem  # what a server calls the actor of a file
-    options = {"controller": f"{actor}=pd"} if policy.spec.action.via == "controller" else {}
-    return with_model_options(f"sim://{model}{'?' if options else ''}{urlencode(options)}"), actor
+    return with_model_options(policy.spec.simulated(model, actor)), actor
 
 
 def _others(policy: Policy) -> dict[str, Policy]:
@@ -217,10 +215,10 @@ def _others(policy: Policy) -> dict[str, Policy]:
     size = len(policy.spec.action.joints)
     rng = np.random.default_rng(_SEED)
 
-    def zero(observation: Floats) -> Floats:
+    def zero(observation: object) -> Floats:
         return np.zeros(size)
 
-    def random(observation: Floats) -> Floats:
+    def random(observation: object) -> Floats:
         return rng.uniform(low, high, size)
 
     others = {name: Policy(policy.spec, network, source=name) for name, network in (("zero", zero), ("random", random))}

@@ -23,6 +23,7 @@ __all__ = [
     "decode_camera",
     "encode_camera",
     "grey",
+    "observed_pixels",
     "picture_stamp",
     "to_rgb",
     "without_alpha",
@@ -198,6 +199,16 @@ def without_alpha(pixels: Pixels) -> NDArray[np.uint8]:
     for channel in range(3):  # a slice of three is copied pixel by pixel, which takes four times as long
         opaque[..., channel] = pixels[..., channel]
     return opaque
+
+
+def observed_pixels(pixels: Pixels, mode: CameraMode | str) -> Pixels:
+    """Return a picture as policies see it: colours as RGB, shape (H, W, 3); the others as they are.
+
+    Args:
+        pixels: As in `CameraSample`.
+        mode: What they mean.
+    """
+    return without_alpha(pixels) if mode == CameraMode.REAL else pixels
 
 
 def grey(depth: Pixels) -> NDArray[np.uint8]:

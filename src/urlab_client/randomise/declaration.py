@@ -255,7 +255,7 @@ class Delay(_Declared, frozen=True, kw_only=True):
 
 
 class CameraLatency(_Declared, frozen=True, kw_only=True):
-    """How late pictures come, by the simulation's clock. For servers with the op `set_camera_delay`.
+    """How late pictures come, by the simulation's clock. For batches, and servers with the op `set_camera_delay`.
 
     Attributes:
         camera: The camera, `ARTICULATION/CAMERA` with `*` and `?`.

@@ -15,10 +15,20 @@ from urlab_client.protocol.base import Floats
 from urlab_client.randomise.declaration import MODEL_TEXT, Randomisation, Range, Vary
 from urlab_client.randomise.quantities import DERIVED_FROM, FIELDS, START, Elements, Fields, elements_of, write
 
-__all__ = ["EpisodeDraws", "Variation", "declared_in", "draw_range", "field_of", "stream"]
+__all__ = ["EpisodeDraws", "Variation", "declared_in", "draw_range", "field_of", "model_text", "stream"]
 
 MODEL_STREAM: Final = 0
 """First number of the streams of random numbers that `Vary` draws from; other parts have others."""
+
+_VISIBLE: Final = {
+    "light_diffuse": (),
+    "geom_rgba": (),
+    "cam_fovy": (),
+    "light_pos": ("light_pos0", "light_poscom0"),
+    "cam_pos": ("cam_pos0", "cam_poscom0"),
+    "cam_quat": ("cam_mat0",),
+}
+"""Fields that pictures depend on, with what `mj_setConst` computes from them."""
 
 
 def stream(seed: int, *path: int) -> np.random.Generator:
@@ -36,11 +46,17 @@ def draw_range(rng: np.random.Generator, given: Range, shape: tuple[int, ...], *
 
 def declared_in(model: mujoco.MjModel) -> Randomisation | None:
     """Return what the server of a compiled scene varies, None for nothing."""
-    for i in range(model.ntext):
-        if mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_TEXT, i) == MODEL_TEXT:
-            start, size = int(model.text_adr[i]), int(model.text_size[i])
-            return Randomisation.from_json(bytes(model.text_data)[start : start + size].rstrip(b"\0"))
-    return None
+    text = model_text(model, MODEL_TEXT)
+    return None if text is None else Randomisation.from_json(text)
+
+
+def model_text(model: mujoco.MjModel, name: str) -> bytes | None:
+    """Return a custom text element of a compiled model, None without it."""
+    found = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_TEXT, name)
+    if found < 0:
+        return None
+    start, size = int(model.text_adr[found]), int(model.text_size[found])
+    return bytes(model.text_data[start : start + size]).rstrip(b"\0")
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +119,11 @@ class Variation:
         self.fields: tuple[str, ...] = tuple(sorted({name for vary in model_entries for name in FIELDS[vary.what]}))
         self.derives: bool = not DERIVED_FROM.isdisjoint(self.fields)
         self._nominal = {name: np.array(field_of(model, name)) for name in self.fields}
+
+    @property
+    def visible_fields(self) -> tuple[str, ...]:
+        """Varied fields of the model that pictures depend on, and what is computed from them."""
+        return tuple(name for field, derived in _VISIBLE.items() if field in self.fields for name in (field, *derived))
 
     def draw(self, seed: int) -> EpisodeDraws:
         """Return the numbers of the episode with a seed."""

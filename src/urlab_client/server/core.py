@@ -10,7 +10,7 @@ import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import mujoco
 
@@ -39,8 +39,8 @@ from urlab_client.server.physics.engine import Engine
 from urlab_client.server.physics.observe import Observer
 from urlab_client.server.physics.play import Play, Running
 from urlab_client.server.physics.replay import recordings, replay_folder
+from urlab_client.server.render.appearance import Appearance, RenderQuality
 from urlab_client.server.render.camera_renderer import CameraRenderer
-from urlab_client.server.render.drawing import RenderQuality
 from urlab_client.server.session import ServerSession
 from urlab_client.server.system.allocator import trim
 from urlab_client.server.system.health import Health
@@ -48,6 +48,8 @@ from urlab_client.server.system.health import Health
 __all__ = ["PhysicsConfig", "ServerCore"]
 
 logger: logging.Logger = logging.getLogger("urlab_client.server")
+
+_SEGMENTATIONS: Final = (CameraMode.SEMANTIC, CameraMode.INSTANCE)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,7 +176,7 @@ class ServerCore:
                 actors,
                 options=self._options,
                 camera_size=physics.camera_size,
-                texts={} if physics.randomise is None else {MODEL_TEXT: physics.randomise.to_json()},
+                texts=self._texts(actors),
                 limits=self.limits,
             )
             self.compiled = _Compiled(actors, scene, copy.copy(scene.model.opt))
@@ -271,17 +273,26 @@ class ServerCore:
         names: Mapping[str, str],
         varied: Sequence[str] = (),
     ) -> CameraRenderer:
-        classes = {actor.name: _kind(actor) for actor in actors}
         return CameraRenderer(
             scene,
             modes,
-            classes,
-            self.physics.render_quality,
+            self._appearance(actors),
             self.health,
             names=names,
             varied=varied,
             dialect=self.dialect,
         )
+
+    def _appearance(self, actors: Sequence[Actor]) -> Appearance:
+        return Appearance(quality=self.physics.render_quality, classes={actor.name: _kind(actor) for actor in actors})
+
+    def _texts(self, actors: Sequence[Actor]) -> dict[str, str]:
+        """Return what the compiled model tells clients of this server, as far as they cannot know it."""
+        physics, appearance = self.physics, self._appearance(actors)
+        if not any(mode in _SEGMENTATIONS for mode in physics.camera_modes.values()):
+            appearance = Appearance(quality=appearance.quality)
+        varied = {} if physics.randomise is None else {MODEL_TEXT: physics.randomise.to_json()}
+        return varied | appearance.texts()
 
     def stop_play(self) -> None:
         """End play, if it runs."""

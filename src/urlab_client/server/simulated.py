@@ -28,7 +28,7 @@ from urlab_client.server.limits import Limits
 from urlab_client.server.open_server import OpenServer, ServerConfig, ServerPorts
 from urlab_client.server.physics.channels import channel_problem
 from urlab_client.server.physics.controllers import ControllerConfig
-from urlab_client.server.render.drawing import RenderQuality
+from urlab_client.server.render.appearance import RenderQuality
 from urlab_client.server.render.opengl import find_backend
 from urlab_client.server.rpc.served_request import ServedRequest
 from urlab_client.server.snapshot import LARGEST_PIXELS

@@ -16,7 +16,7 @@ import msgspec
 from msgspec import Struct
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
-from starlette.requests import HTTPConnection, Request
+from starlette.requests import ClientDisconnect, HTTPConnection, Request
 from starlette.responses import FileResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
@@ -48,6 +48,7 @@ _STATIC = Path(__file__).parent / "static"
 _LARGEST_BODY = 1024 * 1024
 _AHEAD = 2  # states or pictures on their way to a browser that has not said that they came
 _VIEWER = "x-urlab-viewer"
+_GONE = 499  # as servers note that a client closed its request
 
 
 def app(
@@ -452,6 +453,8 @@ def _answering(handler: Handler) -> Handler:
     async def answer(request: Request) -> Response:
         try:
             return await handler(request)
+        except ClientDisconnect:
+            return Response(status_code=_GONE)  # which nobody reads
         except (NotDriving, URLabError, OSError, ValueError, TypeError, KeyError, RecursionError) as error:
             status, said = explain_error(error)
             return _json(encode({"error": said}), status)

@@ -14,7 +14,8 @@ from starlette.responses import Response
 
 from urlab_client.protocol.errors import RPC_ERRORS
 from urlab_client.web.ops import encode
-from urlab_client.web.route_group import Handler, RouteGroup
+from urlab_client.web.route_group import JOB, Handler, RouteGroup
+from urlab_client.web.stoppable import Progress, stoppable
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabClient
@@ -35,6 +36,7 @@ class ModelRoutes(RouteGroup):
 
     async def _take(self, request: Request) -> Response:
         viewer, name = self._viewer(request), request.path_params["name"]
+        request.scope[JOB] = f"the import of {name}"
         async with self._console.lease.hold(viewer):  # large models take longer than the controls are kept
             made = await take_model(self._console.client, name, request.stream())
         self._console.note("call", viewer.name, "import model", name)
@@ -68,14 +70,15 @@ async def take_model(client: URLabClient, name: str, chunks: AsyncIterator[bytes
                     raise ValueError(f"a model is at most {_LARGEST_FILE} bytes")
                 await anyio.to_thread.run_sync(target.write, chunk)
         if ending == ".zip":
-            file = await anyio.to_thread.run_sync(_unpacked, file, Path(folder) / "content")
+            archive, content = file, Path(folder) / "content"
+            file = await stoppable(lambda told: _unpacked(archive, content, told))
         try:
             return await client.scene.upload_model(file)
         except RPC_ERRORS["unknown_op"]:
             return await client.scene.import_xml(str(file))
 
 
-def _unpacked(archive: Path, folder: Path) -> Path:
+def _unpacked(archive: Path, folder: Path, progress: Progress) -> Path:
     """Unpack an archive and return its MJCF file: the one at the top, of several the one called like it."""
     try:
         with zipfile.ZipFile(archive) as packed:
@@ -84,7 +87,9 @@ def _unpacked(archive: Path, folder: Path) -> Path:
                 raise ValueError(f"{archive.name} has files outside its own folder")
             if sum(info.file_size for info in packed.infolist()) > _LARGEST_CONTENT:
                 raise ValueError(f"{archive.name} unpacks to more than {_LARGEST_CONTENT} bytes")
-            packed.extractall(folder)
+            for number, info in enumerate(packed.infolist()):
+                progress(number)
+                packed.extract(info, folder)
     except zipfile.BadZipFile as error:
         raise ValueError(f"{archive.name} is not a ZIP archive: {error}") from None
     found = sorted(folder.rglob("*.xml"), key=lambda file: len(file.parts))

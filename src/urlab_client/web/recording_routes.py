@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+from collections.abc import Coroutine
+from pathlib import Path
+from typing import Any, TypeVar
+
 import msgspec
 from msgspec import Struct
-from starlette.background import BackgroundTask
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, Response
+from starlette.types import Receive, Scope, Send
 
 from urlab_client.integrations._feed.messages import EpisodeOutcome
 from urlab_client.web.ops import encode
-from urlab_client.web.route_group import Handler, RouteGroup
+from urlab_client.web.route_group import JOB, Handler, RouteGroup
 from urlab_client.web.state_message import state_message
 
 __all__ = ["RecordingRoutes"]
+
+_T = TypeVar("_T")
 
 
 class _RecordRequest(Struct):
@@ -82,6 +90,7 @@ class RecordingRoutes(RouteGroup):
                 recordings.remove(name)
                 self._console.note("call", viewer.name, "delete recording", name)
                 return _json({})
+            request.scope[JOB] = f"the upload of {name}"
             found = await recordings.take_in(name, request.stream())
             self._console.note("call", viewer.name, "upload recording", name)
             return _json(found)
@@ -89,14 +98,13 @@ class RecordingRoutes(RouteGroup):
         if wanted == "about":
             return _json(await recordings.describe(name))
         if not wanted:
+            request.scope[JOB] = f"the download of {name}"
             return FileResponse(recordings.path(name), filename=name, media_type="application/octet-stream")
-        making = recordings.converted(name, wanted, request.query_params.get("camera", ""))
-        path = await making.__aenter__()
-
-        async def drop() -> None:
-            await making.__aexit__(None, None, None)
-
-        return FileResponse(path, filename=path.name, background=BackgroundTask(drop))
+        request.scope[JOB] = f"the conversion of {name} to {wanted}"
+        async with contextlib.AsyncExitStack() as stack:
+            making = recordings.converted(name, wanted, request.query_params.get("camera", ""))
+            path = await _while_present(request, stack.enter_async_context(making))
+            return _Converted(path, stack.pop_all())
 
     async def _replay(self, request: Request) -> Response:
         viewer, console = self._viewer(request), self._console
@@ -113,6 +121,41 @@ class RecordingRoutes(RouteGroup):
     async def _past(self, request: Request) -> Response:
         states = await self._console.replay.past(float(request.query_params.get("seconds", 8.0)))
         return _json({"states": [state_message(n, state, {}) for n, state in enumerate(states)]})
+
+
+class _Converted(FileResponse):
+    """A converted recording, which goes away with the answer, sent or not."""
+
+    def __init__(self, path: Path, made: contextlib.AsyncExitStack) -> None:
+        super().__init__(path, filename=path.name)
+        self._made = made
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        async with self._made:
+            await super().__call__(scope, receive, send)
+
+
+async def _while_present(request: Request, job: Coroutine[Any, Any, _T]) -> _T:
+    """Return what a job does, and break it off when nobody waits for its answer any more.
+
+    Raises:
+        ClientDisconnect: Nobody does.
+    """
+
+    async def leaving() -> None:
+        while (await request.receive())["type"] != "http.disconnect":
+            pass
+
+    tasks = asyncio.ensure_future(job), asyncio.ensure_future(leaving())
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        if not tasks[0].done():
+            raise ClientDisconnect
+        return tasks[0].result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.wait(tasks)
 
 
 def _json(value: object) -> Response:

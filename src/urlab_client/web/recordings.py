@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import re
+import secrets
 import tempfile
 import time
-from collections.abc import AsyncGenerator, AsyncIterator, Callable
+from collections.abc import AsyncGenerator, AsyncIterator
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +19,7 @@ from msgspec import Struct
 
 from urlab_client._extras import MissingExtra, need
 from urlab_client.protocol.errors import URLabError
+from urlab_client.web.stoppable import Progress, stoppable
 
 if TYPE_CHECKING:
     from urlab_client.aio import URLabClient
@@ -31,6 +34,7 @@ KINDS = ("csv", "mp4", "npz")
 
 _NAME = re.compile(r"[\w][\w .()+-]{0,100}\.(mcap|json)", re.ASCII)
 _LARGEST_FILE = 4 << 30
+
 _CAMERA_HZ = 30.0
 
 
@@ -164,20 +168,26 @@ class Recordings:
             ValueError: None is under way.
             URLabError: It could not be written.
         """
-        task, recorder = self._task, self._recorder
-        if task is None or recorder is None:
+        recorder = self._recorder
+        if recorder is None:
             raise ValueError("no recording runs")
-        self._stop.set()
-        try:
-            await asyncio.shield(task)
-        finally:
-            self._task = None
+        await self._finish()
         return await self.describe(recorder.path.name)
+
+    async def _finish(self) -> None:
+        task = self._task
+        self._stop.set()
+        if task is not None:
+            try:
+                await asyncio.shield(task)
+            finally:
+                self._task = None
 
     async def end(self) -> None:
         """End a recording that is under way, so that its file is whole."""
-        with contextlib.suppress(ValueError, URLabError):
-            await self.stop()
+        if self._task is not None:
+            with contextlib.suppress(URLabError):  # which the recorder has logged
+                await self._finish()
 
     def list(self) -> list[RecordingView]:
         """Return the recordings of the folder, the newest first."""
@@ -227,7 +237,9 @@ class Recordings:
         file = self.path(name)
         if kind not in KINDS:
             raise ValueError(f"a recording is converted to {', '.join(KINDS)}, not {kind!r}")
-        with tempfile.TemporaryDirectory(prefix="urlab-", ignore_cleanup_errors=True) as folder:
+        # Beside the recordings: where the system keeps temporary files there may be no room for those of a night.
+        beside = self.folder if os.access(self.folder, os.W_OK) else None
+        with tempfile.TemporaryDirectory(prefix=".urlab-", dir=beside, ignore_cleanup_errors=True) as folder:
             target = Path(folder) / f"{file.stem}.{kind}"
             size, conversion = max(1, file.stat().st_size), Conversion(name, kind, camera)
 
@@ -236,7 +248,7 @@ class Recordings:
 
             self.conversions.append(conversion)
             try:
-                await anyio.to_thread.run_sync(_convert, file, target, kind, camera, progress)
+                await stoppable(lambda told: _convert(file, target, kind, camera, told), progress)
             finally:
                 self.conversions.remove(conversion)
             yield target
@@ -254,16 +266,18 @@ class Recordings:
         target = self.folder / name
         if target.exists():
             raise ValueError(f"there is a recording {name!r} already")
-        partial = target.with_name(f".{name}.part")
+        partial = target.with_name(f".{name}.{secrets.token_hex(4)}.part")  # several may send one name
         try:
             size = 0
-            with partial.open("wb") as file:
+            with partial.open("xb") as file:
                 async for chunk in chunks:
                     size += len(chunk)
                     if size > _LARGEST_FILE:
                         raise ValueError(f"a recording is at most {_LARGEST_FILE} bytes")
                     await anyio.to_thread.run_sync(file.write, chunk)
-            await anyio.to_thread.run_sync(_described, partial)
+            await stoppable(lambda told: _described(partial, told))
+            if target.exists():  # by now
+                raise ValueError(f"there is a recording {name!r} already")
             partial.rename(target)
         finally:
             partial.unlink(missing_ok=True)
@@ -274,7 +288,10 @@ class Recordings:
 
         Raises:
             KeyError: There is none of that name.
+            ValueError: It is under way.
         """
+        if self._recorder is not None and self._recorder.path.name == name:
+            raise ValueError(f"{name} is being recorded: stop that first")
         self.path(name).unlink()
         self._described.pop(name, None)
 
@@ -290,8 +307,8 @@ def open_run(file: Path) -> Run:
     return read_run(file)
 
 
-def _described(file: Path) -> dict[str, Any]:
-    summary = open_run(file).summary()
+def _described(file: Path, progress: Progress | None = None) -> dict[str, Any]:
+    summary = open_run(file).summary(progress)
     cameras = [name.removeprefix("/camera/") for name in summary.topics if name.startswith("/camera/")]
     return {
         "name": file.name,
@@ -314,7 +331,7 @@ def _unavailable() -> dict[str, str]:
     return {}
 
 
-def _convert(file: Path, target: Path, kind: str, camera: str, progress: Callable[[int], None]) -> None:
+def _convert(file: Path, target: Path, kind: str, camera: str, progress: Progress) -> None:
     from urlab_client.integrations.record import export  # noqa: PLC0415
 
     run = open_run(file)

@@ -11,7 +11,10 @@ from starlette.responses import Response
 from urlab_client.web.console_session import ConsoleSession
 from urlab_client.web.driving_lease import Viewer
 
-__all__ = ["Handler", "RouteGroup"]
+__all__ = ["JOB", "Handler", "RouteGroup"]
+
+JOB = "urlab_job"
+"""In the scope of a request that may take long: what it does, in words, for who ends the server meanwhile."""
 
 Handler: TypeAlias = Callable[[Request], Awaitable[Response]]
 

@@ -19,9 +19,16 @@ from urlab_client.aio.model.layout import ArticulationLayout
 from urlab_client.aio.model.mirror import model_names
 from urlab_client.integrations.gym.batch_variation import BatchVariation
 from urlab_client.integrations.gym.env import RewardFn, TerminationFn
-from urlab_client.integrations.gym.episode import client_defaults, compiled_prefixes, fields_of
-from urlab_client.integrations.gym.pictures import BatchPictures
-from urlab_client.integrations.gym.spaces import Field, Observation, SpaceMapping, SpaceMode
+from urlab_client.integrations.gym.episode import client_defaults, compiled_prefixes, fields_of, first_camera
+from urlab_client.integrations.gym.late_cameras import LateCameras
+from urlab_client.integrations.gym.pictures import VISIBLE, BatchPictures, PictureScene, Visible
+from urlab_client.integrations.gym.spaces import (
+    Field,
+    Observation,
+    SpaceMapping,
+    SpaceMode,
+    with_cameras,
+)
 from urlab_client.integrations.gym.starts import ResetNoise
 from urlab_client.integrations.gym.task import (
     EpisodeSettings,
@@ -39,9 +46,11 @@ from urlab_client.integrations.gym.warp_batch import WarpBatch
 from urlab_client.protocol.enums import ControllerKind
 from urlab_client.protocol.errors import UnknownKeyframe, URLabError
 from urlab_client.protocol.names import compiled_names
+from urlab_client.protocol.pixels import Pixels, observed_pixels, to_rgb
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.randomise.variation import declared_in
 from urlab_client.server.physics.controllers import Controller, ControllerConfig, PassthroughController, PDController
+from urlab_client.sync._facade import aio_of
 from urlab_client.sync.client import URLabClient
 
 __all__ = ["URLabBatchEnv"]
@@ -56,8 +65,9 @@ class URLabBatchEnv(Vectorized):
 
     The scene is what a server compiles: it is fetched once, and the server is not needed any more. Observations,
     rewards and autoreset are those of `URLabVectorEnv`, bit for bit for the same seeds and actions, as long as no
-    wrench is applied; there are no cameras to observe. Controllers act before each physics step, as they do on the
-    server, with the parameters they had when the scene was fetched.
+    wrench is applied. So are pictures where the same driver draws: this process draws them with the code and the
+    settings of a simulated server. Controllers act before each physics step, as they do on the server, with the
+    parameters they had when the scene was fetched.
     """
 
     def __init__(
@@ -70,6 +80,7 @@ class URLabBatchEnv(Vectorized):
         reward_fn: RewardFn | None = None,
         termination_fn: TerminationFn | None = None,
         max_episode_steps: int | None = None,
+        cameras: Sequence[str] | None = None,
         n_substeps: int | None = None,
         reset_noise: float | ResetNoise | None = None,
         keyframe: str | None = None,
@@ -93,13 +104,14 @@ class URLabBatchEnv(Vectorized):
             reward_fn: See `URLabVectorEnv`.
             termination_fn: See `URLabVectorEnv`.
             max_episode_steps: See `URLabEnv`.
+            cameras: See `URLabEnv`. Every step draws them, in this process.
             n_substeps: See `URLabEnv`.
             reset_noise: See `URLabEnv`.
             keyframe: See `URLabEnv`.
             render_mode: None or `rgb_array`, with which `render` draws; steps cost the same.
-            render_camera: Camera that `render` shows, `ARTICULATION/CAMERA`; the first one of the scene by default.
+            render_camera: Camera that `render` shows; the first one of the scene by default.
             task: See `URLabEnv`. One object serves all environments.
-            randomise: See `URLabEnv`. Latency of cameras is without effect: a batch observes none.
+            randomise: See `URLabEnv`. Cameras are as late as a server's; how late within the jitter is drawn otherwise.
             autoreset_mode: `NEXT_STEP`, `SAME_STEP` or `DISABLED`.
             n_threads: Threads that step, the caller's included; 0 for one per processor. Of no effect with `warp`.
             engine: What steps: `mujoco`, on processors, in float64, bit for bit as servers do; `warp`, MuJoCo Warp, in
@@ -110,8 +122,11 @@ class URLabBatchEnv(Vectorized):
 
         Raises:
             URLabError: The scene cannot be fetched, or MuJoCo Warp has not what it uses.
+            RenderingUnavailable: Cameras are observed, and nothing here can draw.
             MissingExtra: `engine` needs an extra that is not installed.
-            ValueError: An option out of range, or a model that varies, with `warp`.
+            KeyError: An unknown camera.
+            ValueError: An option out of range, a model that varies, with `warp`, or rendering of a scene without a
+                camera.
         """
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, not {num_envs}")
@@ -129,11 +144,11 @@ class URLabBatchEnv(Vectorized):
             keyframe=keyframe,
             reset_noise=reset_noise,
             space_mode=space_mode,
+            cameras=cameras,
         )
-        if settings.cameras:
-            raise ValueError(f"a batch observes no cameras ({', '.join(settings.cameras)}): use servers")
-        scene = _fetch(with_model_options(address), client_defaults(client_options))
-        model, prefixes, controllers, exact = scene
+        shown = None if render_mode is None else _Shown(render_camera)
+        fetched = _fetch(with_model_options(address), client_defaults(client_options), settings.cameras, shown)
+        model, prefixes, pictures = fetched.model, fetched.prefixes, fetched.pictures
         declared = declared_in(model) if randomise is None else Randomisation.of(randomise)
         mapping = SpaceMapping(
             model, prefixes, fields_of(settings.observations), settings.space_mode, settings.articulations
@@ -141,7 +156,9 @@ class URLabBatchEnv(Vectorized):
         super().__init__(
             num_envs=num_envs,
             mapping=mapping,
-            observation_space=with_task(mapping.observation_space, task),
+            observation_space=with_task(
+                with_cameras(mapping, {name: pictures.space(name) for name in settings.cameras}), task
+            ),
             reward_fn=reward_fn,
             termination_fn=termination_fn,
             max_episode_steps=settings.max_episode_steps,
@@ -157,8 +174,10 @@ class URLabBatchEnv(Vectorized):
         self._noise = settings.reset_noise
         self._start_keyframe = settings.keyframe
         self.render_mode = render_mode
-        self._render_camera = render_camera
-        self._pictures: BatchPictures | None = None
+        self._cameras = tuple(settings.cameras)
+        self._rendered = fetched.rendered
+        self._picture_scene = pictures
+        self._pictures = BatchPictures(pictures) if self._cameras else None
         self._batch: Any = (
             WarpBatch(model, num_envs, **engine_options)
             if engine == "warp"
@@ -166,8 +185,10 @@ class URLabBatchEnv(Vectorized):
         )
         # Bound before the first call: a derived field is computed only where somebody looks at it.
         self._arrays = {name: self._batch.bind(name) for name in _BOUND}
+        self._visible = [self._batch.bind(name) for name in VISIBLE]
+        self._late = LateCameras(declared, self._cameras)
         self._prefixes = prefixes
-        self._target_type = np.float64 if exact else np.float32
+        self._target_type = np.float64 if fetched.exact_controls else np.float32
         self._keyframes = {name: i for i, name in enumerate(model_names(model, "key"))}
         self._noisy = {
             key: np.array([mapping.layout(key).joints[name] for name in mapping.joint_names(key, model)], dtype=np.intp)
@@ -175,7 +196,8 @@ class URLabBatchEnv(Vectorized):
         }
         self._sensors = {key: _sensor_addresses(model, mapping.layout(key)) for key in mapping.keys}
         self._controllers = {
-            key: _controller(model, mapping.layout(key), kind, params) for key, (kind, params) in controllers.items()
+            key: _controller(model, mapping.layout(key), kind, params)
+            for key, (kind, params) in fetched.controllers.items()
         }
         self._varied = None
         if declared is not None and declared.vary:
@@ -188,20 +210,16 @@ class URLabBatchEnv(Vectorized):
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Return a picture of each copy as it is, shape (H, W, 3), RGB; None without a render mode.
 
-        All calls belong on one thread.
-
         Raises:
-            ValueError: There is no such camera.
-            ImportError: Nothing here can draw.
+            RenderingUnavailable: Nothing here can draw.
+            TimeoutError: Drawing took too long.
         """
-        if self.render_mode is None:
+        if self._rendered is None:
             return None
-        if self._pictures is None:
-            self._pictures = BatchPictures(self.model, self._render_camera)
-        pictures, varied = self._pictures, self._varied
-        return tuple(
-            pictures.draw(qpos, {} if varied is None else varied.look(i)) for i, qpos in enumerate(self._arrays["qpos"])
-        )
+        everyone = np.arange(self.num_envs)
+        mode = self._picture_scene.mode(self._rendered)
+        drawn = self._draw([self._rendered], everyone, self._visible_states(everyone))
+        return tuple(to_rgb(frame, mode) for frame in drawn[self._rendered])
 
     def draws(self, index: int) -> dict[str, Any] | None:
         """Return what was drawn for the episode of an environment, as `EpisodeDraws.told` has it; None for nothing."""
@@ -213,6 +231,32 @@ class URLabBatchEnv(Vectorized):
         pictures, self._pictures = self._pictures, None
         if pictures is not None:
             pictures.close()
+
+    def _seen(self, indices: Indices) -> dict[str, NDArray[Any]]:
+        """Return what some copies observe of the cameras."""
+        states, late = self._visible_states(indices), self._late
+        drawn = self._draw([name for name in self._cameras if name not in late.names], indices, states)
+        for name in late.names:
+            times = self._arrays["time"][indices].tolist()
+            shown = [late.shown(name, *each) for each in zip(indices.tolist(), times, states, strict=True)]
+            drawn |= self._draw([name], indices, shown)
+        return {
+            name: np.stack([observed_pixels(frame, self._picture_scene.mode(name)) for frame in drawn[name]])
+            for name in self._cameras
+        }
+
+    def _visible_states(self, indices: Indices) -> list[Floats]:
+        """Return the states of some copies, as `Visible` has them."""
+        return [np.concatenate([values[i].ravel() for values in self._visible]) for i in indices.tolist()]
+
+    def _draw(self, cameras: Sequence[str], indices: Indices, states: Sequence[Floats]) -> dict[str, list[Pixels]]:
+        """Return what cameras see in some copies, given their states."""
+        if not cameras:
+            return {}
+        if self._pictures is None:
+            self._pictures = BatchPictures(self._picture_scene)
+        looks = [{} if self._varied is None else self._varied.look(i) for i in indices.tolist()]
+        return self._pictures.draw(cameras, [Visible(*each) for each in zip(states, looks, strict=True)])
 
     def _reset_and_step(self, fresh: Indices, acting: Indices, set_points: Mapping[str, Floats]) -> tuple[Found, Found]:
         nothing: Found = (None, {})
@@ -247,6 +291,10 @@ class URLabBatchEnv(Vectorized):
                 qpos[i], self._goals[i] = start.qpos, start.goal
             self._batch.forward(indices)
         self._step_count[indices] = 0
+        if self._late.names:
+            seeds = self.episode_seeds()
+            for i, state in zip(indices.tolist(), self._visible_states(indices), strict=True):
+                self._late.begin(i, int(seeds[i]), state)
         return self._observe(indices), {}
 
     def _step_some(self, indices: Indices, set_points: Mapping[str, Floats]) -> Found:
@@ -289,9 +337,11 @@ class URLabBatchEnv(Vectorized):
             return self._read(self.mapping.layout(key), self._sensors[key], field)[indices]
 
         observation = self.mapping.observe(read)
-        if self.task is None:
-            return observation
-        return add_observed(observation, self.task, self.task.observe(self._states(indices)))
+        if self.task is not None:
+            observation = add_observed(observation, self.task, self.task.observe(self._states(indices)))
+        if self._cameras:
+            observation["cameras"] = self._seen(indices)
+        return observation
 
     def _states(self, indices: Indices) -> States:
         if self.task is None:
@@ -331,11 +381,41 @@ class URLabBatchEnv(Vectorized):
         return self._keyframes[found[0]]
 
 
-def _fetch(
-    address: str, client_options: Mapping[str, Any]
-) -> tuple[mujoco.MjModel, dict[str, str], dict[str, tuple[str, dict[str, Any]]], bool]:
-    """Return a scene's model, its articulations with the prefixes of their names in it, the kind and parameters of
-    those controllers that there are, and whether those take set-points as they are.
+@dataclass(frozen=True)
+class _Shown:
+    """That pictures are rendered, and of which camera; the first one for None."""
+
+    camera: str | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Fetched:
+    """What a batch knows of a server's scene.
+
+    Attributes:
+        model: The compiled scene.
+        prefixes: What the names of articulations' elements begin with, by key.
+        controllers: Kind and parameters of those controllers that there are, by key.
+        exact_controls: Whether those take set-points as they are.
+        pictures: What is needed to draw it.
+        rendered: Camera that `render` shows, if any.
+    """
+
+    model: mujoco.MjModel
+    prefixes: Mapping[str, str]
+    controllers: Mapping[str, tuple[str, Mapping[str, Any]]]
+    exact_controls: bool
+    pictures: PictureScene
+    rendered: str | None
+
+
+def _fetch(address: str, client_options: Mapping[str, Any], cameras: Sequence[str], shown: _Shown | None) -> _Fetched:
+    """Fetch a scene.
+
+    Raises:
+        URLabError: It cannot be had, or there is no articulation in it.
+        KeyError: An unknown camera.
+        ValueError: A camera is to be rendered, and there is none.
     """
     with URLabClient(address, **client_options) as client:
         client.discover()
@@ -343,8 +423,15 @@ def _fetch(
         if model is None or not client.articulations:
             raise URLabError(f"There is no articulation at {address}.", hint="Start play first.")
         attached = {key: articulation.controller for key, articulation in client.articulations.items()}
-        controllers = {key: (str(found.kind), dict(found.params)) for key, found in attached.items() if found}
-        return model, compiled_prefixes(client), controllers, client.server.features.exact_controls
+        rendered = None if shown is None else shown.camera or first_camera(aio_of(client))
+        return _Fetched(
+            model=model,
+            prefixes=compiled_prefixes(client),
+            controllers={key: (str(found.kind), dict(found.params)) for key, found in attached.items() if found},
+            exact_controls=client.server.features.exact_controls,
+            pictures=PictureScene.of(aio_of(client), model, [*cameras, *([rendered] if rendered else [])]),
+            rendered=rendered,
+        )
 
 
 @dataclass(frozen=True)

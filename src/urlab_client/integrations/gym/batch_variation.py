@@ -46,6 +46,7 @@ class BatchVariation:
         self._variation = Variation(declaration, model, controlled)
         self._batch = batch
         self._fields: dict[str, NDArray[Any]] = {name: batch.expand(name) for name in self._variation.fields}
+        self._visible: dict[str, NDArray[Any]] = {name: batch.expand(name) for name in self._variation.visible_fields}
         self._factors: dict[str, dict[str, NDArray[np.float32]]] = {}
         for key, found in self._pd.items():
             shape = (nsim, len(found.bound_actuators))
@@ -85,5 +86,5 @@ class BatchVariation:
             found.factors = {name: factors[indices] for name, factors in self._factors[key].items()}
 
     def look(self, i: int) -> dict[str, NDArray[Any]]:
-        """Return the fields of a copy's model that vary, by name, without options."""
-        return {name: values[i] for name, values in self._fields.items() if not name.startswith("opt.")}
+        """Return the fields of a copy's model that vary and that pictures depend on, by name."""
+        return {name: values[i].copy() for name, values in self._visible.items()}

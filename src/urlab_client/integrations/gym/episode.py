@@ -6,18 +6,25 @@ import contextlib
 import fnmatch
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, cast
+from typing import Any
 
 import mujoco
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
 from urlab_client.aio.articulation import URLabArticulation
 from urlab_client.aio.cameras import URLabCameraView
 from urlab_client.aio.client import URLabClient
 from urlab_client.integrations._varied import variation_of
-from urlab_client.integrations.gym.spaces import LEVELS, Field, Observation, Space, SpaceMapping, dict_space
+from urlab_client.integrations.gym.spaces import (
+    LEVELS,
+    Field,
+    Observation,
+    Space,
+    SpaceMapping,
+    camera_space,
+    with_cameras,
+)
 from urlab_client.integrations.gym.task import EpisodeSettings, Start, States, Task, TaskScene, add_observed, with_task
 from urlab_client.integrations.gym.wire_variation import WireVariation
 from urlab_client.protocol.base import Floats
@@ -25,12 +32,12 @@ from urlab_client.protocol.enums import CameraMode, ObservationLevel, StepMode
 from urlab_client.protocol.errors import URLabError
 from urlab_client.protocol.messages.cameras import CameraDelay
 from urlab_client.protocol.messages.session import StepOk
-from urlab_client.protocol.pixels import Pixels, to_rgb, without_alpha
+from urlab_client.protocol.pixels import Pixels, observed_pixels, to_rgb
 from urlab_client.randomise.declaration import Randomisation
 from urlab_client.randomise.variation import EpisodeDraws, declared_in
 from urlab_client.sync.client import URLabClient as BlockingClient
 
-__all__ = ["EnvEpisode", "client_defaults", "compiled_prefixes", "fields_of", "first_camera"]
+__all__ = ["EnvEpisode", "client_camera", "client_defaults", "compiled_prefixes", "fields_of", "first_camera"]
 
 
 def client_defaults(options: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -115,10 +122,11 @@ class EnvEpisode:
         cameras = settings.cameras
         self._sensors = {key: [*self.mapping.layout(key).sensors] for key in self.mapping.keys}
         minimal = set(fields) <= set(LEVELS["minimal"])
-        self.observation_space: Space = self._with_cameras(cameras)
         self._observed_cameras = tuple(cameras)
         self._level = ObservationLevel.MINIMAL if minimal else ObservationLevel.STANDARD
         self._cameras = {name: client_camera(client, name) for name in (*cameras, *rendered)}
+        images = {name: camera_space(self._cameras[name].mode, self._cameras[name].resolution) for name in cameras}
+        self.observation_space: Space = with_cameras(self.mapping, images)
         self._n_substeps = settings.n_substeps
         self._noise = settings.reset_noise
         self._keyframe = settings.keyframe
@@ -352,31 +360,15 @@ class EnvEpisode:
         if self._task is not None:
             observation = add_observed(observation, self._task, self._task.observe(self.states())[0])
         if self._observed_cameras:
-            observation["cameras"] = {name: self._shown(name) for name in self._observed_cameras}
+            observation["cameras"] = {
+                name: observed_pixels(self.frames[name], self._cameras[name].mode) for name in self._observed_cameras
+            }
         return observation
 
     def rendered(self, name: str) -> NDArray[np.uint8] | None:
         """Return what `render` shows of a camera, shape (H, W, 3), RGB; None without a picture of it."""
         frame = self.frames.get(name)
         return None if frame is None else to_rgb(frame, self._cameras[name].mode)
-
-    def _shown(self, name: str) -> Pixels:
-        frame = self.frames[name]
-        if self._cameras[name].mode != CameraMode.REAL:
-            return frame
-        return without_alpha(frame)
-
-    def _with_cameras(self, cameras: Sequence[str]) -> Space:
-        mapping = self.mapping
-        if not cameras:
-            return mapping.observation_space
-        if mapping.mode != "dict":
-            raise ValueError("images do not fit into a flat observation: use space_mode='dict' with cameras")
-        if "cameras" in mapping.keys:
-            raise ValueError("an articulation is called 'cameras', which is where images go: give it another actor id")
-        images = {name: camera_space(client_camera(self.client, name)) for name in cameras}
-        observed = cast("Mapping[str, Space]", mapping.observation_space)
-        return dict_space({**observed, "cameras": dict_space(images)})
 
     def _read(self, key: str, field: Field) -> Floats:
         articulation = self.client.articulations[key]
@@ -443,11 +435,3 @@ def first_camera(client: URLabClient) -> str:
         if view.mode == CameraMode.REAL:
             return name
     raise ValueError("the scene has no colour camera to render: add one to its MJCF, or use render_mode=None")
-
-
-def camera_space(view: URLabCameraView) -> Space:
-    """Return the space of a camera's pictures: depths in metres, RGB as `render` has it, RGBA of segmentations."""
-    width, height = view.resolution
-    if view.mode == CameraMode.DEPTH:
-        return spaces.Box(0.0, np.inf, (height, width), dtype=np.float32)
-    return spaces.Box(0, 255, (height, width, 3 if view.mode == CameraMode.REAL else 4), dtype=np.uint8)

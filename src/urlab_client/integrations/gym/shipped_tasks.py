@@ -145,7 +145,7 @@ class Push(Task):
 
 
 class PushPictures(Push):
-    """`Push` by sight: the block is seen in pictures of the camera `arm/overview` alone. For servers."""
+    """`Push` by sight: the block is seen in pictures of the camera `arm/overview` alone."""
 
     scene_address: ClassVar[str] = f"{Push.scene_address}&camera-size=96x72"
     space_mode: ClassVar[SpaceMode] = "dict"

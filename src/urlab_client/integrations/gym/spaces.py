@@ -5,18 +5,30 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Literal, get_args
+from typing import TYPE_CHECKING, Any, Final, Literal, cast, get_args
 
 import numpy as np
 from gymnasium import spaces
 
 from urlab_client.aio.model.layout import ArticulationLayout, articulation_layouts
 from urlab_client.protocol.base import Floats
+from urlab_client.protocol.enums import CameraMode
 
 if TYPE_CHECKING:
     import mujoco
 
-__all__ = ["FIELDS", "LEVELS", "Field", "Observation", "Space", "SpaceMapping", "SpaceMode", "dict_space"]
+__all__ = [
+    "FIELDS",
+    "LEVELS",
+    "Field",
+    "Observation",
+    "Space",
+    "SpaceMapping",
+    "SpaceMode",
+    "camera_space",
+    "dict_space",
+    "with_cameras",
+]
 
 SpaceMode = Literal["flat", "dict"]
 Field = Literal["qpos", "qvel", "ctrl", "act", "sensors"]
@@ -214,3 +226,32 @@ def _unbounded(n: int) -> Space:
 def dict_space(entries: Mapping[str, Space]) -> Space:
     """Return the `Dict` of some spaces, in their order."""
     return spaces.Dict(dict(entries))
+
+
+def with_cameras(mapping: SpaceMapping, cameras: Mapping[str, Space]) -> Space:
+    """Return a mapping's observation space with pictures, by camera, as its entry `cameras`.
+
+    Raises:
+        ValueError: They have no room in it.
+    """
+    if not cameras:
+        return mapping.observation_space
+    if mapping.mode != "dict":
+        raise ValueError("images do not fit into a flat observation: use space_mode='dict' with cameras")
+    if "cameras" in mapping.keys:
+        raise ValueError("an articulation is called 'cameras', which is where images go: give it another actor id")
+    observed = cast("Mapping[str, Space]", mapping.observation_space)
+    return dict_space({**observed, "cameras": dict_space(cameras)})
+
+
+def camera_space(mode: CameraMode | str, resolution: tuple[int, int]) -> Space:
+    """Return the space of `observed_pixels`: depths in metres, RGB as `render` has it, BGRA of segmentations.
+
+    Args:
+        mode: What the pixels mean.
+        resolution: Width and height.
+    """
+    width, height = resolution
+    if mode == CameraMode.DEPTH:
+        return spaces.Box(0.0, np.inf, (height, width), dtype=np.float32)
+    return spaces.Box(0, 255, (height, width, 3 if mode == CameraMode.REAL else 4), dtype=np.uint8)

@@ -347,7 +347,7 @@ class Task:
         keyframe: Where episodes start before `reset` changes that; the initial state for None.
         reset_noise: Largest deviation of joints from there, before `reset` changes that; see `URLabEnv`.
         space_mode: `flat` or `dict`.
-        cameras: Cameras whose pictures are observed, which takes servers and `dict`.
+        cameras: Cameras whose pictures are observed, which takes `dict`.
         articulations: Articulations whose fields are observed; all for None.
         scene: The scene, from `setup` on.
     """

@@ -66,6 +66,8 @@ class ThreadedBatch:
         for i in map(int, ids):
             model = self._varied(i)
             mujoco.mj_setConst(model, mujoco.MjData(model))
+            for name, values in self._expanded.items():
+                values[i] = field_of(model, name)
 
     def reset(self, ids: Indices, keyframe: int = -1) -> None:
         """Reset some simulations to the model's defaults or a keyframe, and compute what follows from that."""

@@ -20,7 +20,17 @@ __all__ = ["WarpBatch"]
 
 Indices = NDArray[np.intp]
 
-_STATE: Final = ("qpos", "qvel", "act", "ctrl", "xfrc_applied", "time", "qacc_warmstart")
+_STATE: Final = (
+    "qpos",
+    "qvel",
+    "act",
+    "ctrl",
+    "xfrc_applied",
+    "mocap_pos",
+    "mocap_quat",
+    "time",
+    "qacc_warmstart",
+)
 _TAKEN: Final = ("qpos", "qvel", "act", "time", "qacc_warmstart", "sensordata")
 
 

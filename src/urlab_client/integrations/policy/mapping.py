@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from urlab_client.aio.controllers import URLabController as AsyncController
 from urlab_client.aio.model.elements import Actuator, Joint, Sensor
-from urlab_client.integrations.policy.spec import (
+from urlab_client.integrations.policy.robot import PolicyRobot, RobotState
+from urlab_client.integrations.policy.spec import PolicySpec
+from urlab_client.integrations.policy.terms import (
     AngularVelocity,
     BaseHeight,
     CommandTerm,
@@ -26,17 +27,17 @@ from urlab_client.integrations.policy.spec import (
     LastAction,
     LinearVelocity,
     Numbers,
+    NumberTerm,
     PhaseClock,
-    PolicySpec,
+    PictureTerm,
     SensorTerm,
-    Term,
 )
 from urlab_client.protocol.base import Floats
-from urlab_client.protocol.enums import ControlMode
+from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.errors import URLabError
-from urlab_client.sync.controllers import URLabController
+from urlab_client.protocol.pixels import observed_pixels
 
-__all__ = ["PolicyMapping", "PolicyMismatch", "PolicyRobot", "RobotState"]
+__all__ = ["Input", "PolicyMapping", "PolicyMismatch"]
 
 _SCALAR_JOINTS: Final = (2, 3)  # slide, hinge
 _COMMAND: Final = 3
@@ -46,106 +47,16 @@ class PolicyMismatch(URLabError):
     """A policy does not fit the robot or the session; says what is there, what it requires, and how to get it."""
 
 
-class PolicyRobot(Protocol):
-    """What a policy uses of an articulation of either flavour."""
-
-    @property
-    def prefix(self) -> str:
-        """Articulation key."""
-        ...
-
-    @property
-    def joints(self) -> Mapping[str, Joint]:
-        """Joints by name."""
-        ...
-
-    @property
-    def actuators(self) -> Mapping[str, Actuator]:
-        """Actuators by name."""
-        ...
-
-    @property
-    def sensors(self) -> Mapping[str, Sensor]:
-        """Sensors by name."""
-        ...
-
-    @property
-    def controller(self) -> AsyncController | URLabController | None:
-        """The controller, or None."""
-        ...
-
-    @property
-    def control_mode(self) -> ControlMode:
-        """Whether the controller is in force."""
-        ...
-
-    @property
-    def has_free_base(self) -> bool:
-        """Whether the root has a free joint."""
-        ...
-
-    @property
-    def ctrl_array(self) -> Floats:
-        """Set-points, to be written in place."""
-        ...
-
-    @property
-    def qpos_array(self) -> Floats:
-        """Joint positions."""
-        ...
-
-    @property
-    def qvel_array(self) -> Floats:
-        """Joint velocities."""
-        ...
-
-    def get_sensors(self) -> dict[str, Floats]:
-        """Readings by sensor name."""
-        ...
-
-
-class RobotState(NamedTuple):
-    """The state of a robot, or of a batch of them.
+class Input(NamedTuple):
+    """What one input of the network holds.
 
     Attributes:
-        qpos: Joint positions in the order of `qpos_array`, shape (…, nq).
-        qvel: Joint velocities in the order of `qvel_array`, shape (…, nv).
-        sensors: Readings by sensor name, shape (…, dim).
+        shape: Its shape.
+        dtype: uint8 for colours; other pictures and numbers are float32.
     """
 
-    qpos: Floats
-    qvel: Floats
-    sensors: Mapping[str, Floats] = {}
-
-    @classmethod
-    def of(cls, robot: PolicyRobot) -> RobotState:
-        """Return the state that an articulation has now."""
-        return cls(robot.qpos_array, robot.qvel_array, robot.get_sensors())
-
-    @property
-    def gravity(self) -> Floats:
-        """Direction of gravity in the base frame, shape (…, 3)."""
-        return -self._rotation()[..., 2, :]
-
-    @property
-    def linear_velocity(self) -> Floats:
-        """Velocity of the base, m/s, base frame, shape (…, 3)."""
-        return np.einsum("...ij,...i->...j", self._rotation(), self.qvel[..., :3])
-
-    @property
-    def angular_velocity(self) -> Floats:
-        """Angular velocity of the base, rad/s, base frame, shape (…, 3)."""
-        return self.qvel[..., 3:6]
-
-    def _rotation(self) -> Floats:
-        """Return what turns vectors of the base frame into the world frame, shape (…, 3, 3)."""
-        w, x, y, z = np.moveaxis(self.qpos[..., 3:7], -1, 0)
-        rows = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-        return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
 
 
 class _Moment(NamedTuple):
@@ -166,7 +77,7 @@ class PolicyMapping:
 
     Attributes:
         spec: The declaration.
-        observation_size: Numbers in one observation.
+        observation_size: Numbers in one observation, without pictures.
         action_size: Outputs of the network.
         joints: Joint of each output.
         actuators: Actuator of each output.
@@ -182,7 +93,7 @@ class PolicyMapping:
             source: Names the declaration in errors, usually its file.
 
         Raises:
-            PolicyMismatch: The robot lacks a joint, an actuator, a sensor or a free base.
+            PolicyMismatch: The robot lacks a joint, an actuator, a sensor, a camera or a free base.
         """
         self.spec = spec
         self._source = source
@@ -202,16 +113,22 @@ class PolicyMapping:
         self._qpos, self._qvel = _offsets(self.joints)
         self._scale, self._offset = _array(spec.action.scale), _array(spec.action.offset)
         self._sensor_names: dict[str, str] = {}
-        self._terms: list[tuple[_Read, Term]] = []
+        self._terms: list[tuple[_Read, NumberTerm]] = []
+        self._columns: dict[str, list[int]] = {}
         self.observation_size: int = 0
         for index, term in enumerate(spec.observation):
             where = f"observation[{index}]"
+            if isinstance(term, PictureTerm):
+                self._check_picture(robot, term, where)
+                continue
             size, read = self._term(robot, term, where)
             for name in ("scale", "offset"):
                 value: Numbers = getattr(term, name)
                 if isinstance(value, list) and len(value) != size:
                     raise self._misfit(f"{where}.{name}", f"has {len(value)} numbers; it takes one, or {size}")
             self._terms.append((read, term))
+            columns = range(self.observation_size, self.observation_size + size)
+            self._columns.setdefault(term.input, []).extend(columns)
             self.observation_size += size
         if (spec.fall or spec.reward) and not self._has_base:
             raise self._misfit("fall" if spec.fall else "reward", f"needs a free base; {self._robot!r} has none")
@@ -237,6 +154,39 @@ class PolicyMapping:
             parts.append(part if term.clip is None else np.clip(part, *term.clip))
         leading = state.qpos.shape[:-1]
         return np.concatenate([np.broadcast_to(part, (*leading, part.shape[-1])) for part in parts], axis=-1)
+
+    def named(self, observations: Sequence[Floats], robot: PolicyRobot) -> dict[str, NDArray[Any]]:
+        """Return what the network's inputs hold, by name.
+
+        Args:
+            observations: As `observe` returns them, as many as the history has.
+            robot: The articulation, whose cameras show the same moment as the last of them.
+
+        Raises:
+            PolicyMismatch: A camera has no picture.
+        """
+        inputs: dict[str, NDArray[Any]] = {
+            name: np.concatenate([observation[columns] for observation in observations])
+            for name, columns in self._columns.items()
+        }
+        for term in self.spec.pictures:
+            frame = robot.cameras[term.camera].latest_frame
+            if frame is None:
+                raise PolicyMismatch(
+                    f"{self._source}: there is no picture of camera {term.camera!r} of {robot.prefix!r} yet.",
+                    hint=f"Step with include_cameras={{'{robot.prefix}/{term.camera}': 'sync'}}, or capture() one.",
+                )
+            inputs[term.input] = observed_pixels(frame, term.mode)
+        return inputs
+
+    @property
+    def inputs(self) -> dict[str, Input]:
+        """What the network's inputs hold, by name, where the declaration tells them apart."""
+        numbers = {
+            name: Input((len(columns) * self.spec.history,), np.dtype(np.float32))
+            for name, columns in self._columns.items()
+        }
+        return numbers | {term.input: _picture(term) for term in self.spec.pictures}
 
     def clipped(self, output: Floats) -> Floats:
         """Return the network's outputs within their limits."""
@@ -304,7 +254,17 @@ class PolicyMapping:
         )
         return np.where(self.fallen(state), 0.0, gain - cost)
 
-    def _term(self, robot: PolicyRobot, term: Term, where: str) -> tuple[int, _Read]:
+    def _check_picture(self, robot: PolicyRobot, term: PictureTerm, where: str) -> None:
+        camera = robot.cameras.get(term.camera)
+        if camera is None:
+            raise self._misfit(f"{where}.camera", _unknown("camera", term.camera, robot.prefix, robot.cameras))
+        if camera.mode != term.mode:
+            raise self._misfit(f"{where}.mode", f"{term.camera!r} shows {str(camera.mode)!r}, not {str(term.mode)!r}")
+        if tuple(camera.resolution) != term.size:
+            there, wanted = ("x".join(map(str, size)) for size in (camera.resolution, term.size))
+            raise self._misfit(f"{where}.size", f"{term.camera!r} has {there} pixels, not {wanted}")
+
+    def _term(self, robot: PolicyRobot, term: NumberTerm, where: str) -> tuple[int, _Read]:
         """Return how many numbers a term has, and how to read them."""
         match term:
             case JointPosition():
@@ -364,6 +324,13 @@ def _free_term(term: PhaseClock | CommandTerm | LastAction, action_size: int) ->
         return _COMMAND, lambda moment: moment.command
     rate = 2 * math.pi * term.hz
     return 2, lambda moment: np.array([math.sin(rate * moment.time), math.cos(rate * moment.time)])
+
+
+def _picture(term: PictureTerm) -> Input:
+    width, height = term.size
+    if term.mode is CameraMode.DEPTH:
+        return Input((height, width), np.dtype(np.float32))
+    return Input((height, width, 3 if term.mode is CameraMode.REAL else 4), np.dtype(np.uint8))
 
 
 def _base_term(term: BaseHeight | Gravity | LinearVelocity | AngularVelocity) -> tuple[int, _Read]:

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from urlab_client._extras import need
 from urlab_client.integrations.policy.spec import PolicyFileError
 from urlab_client.protocol.base import Floats
 
-__all__ = ["Network", "OnnxDictNetwork", "OnnxNetwork"]
+__all__ = ["Entry", "Network", "OnnxDictNetwork", "OnnxInputs", "OnnxNetwork", "PicturesNetwork"]
+
+
+_BYTES: Final = "tensor(uint8)"
 
 
 class Network(Protocol):
@@ -20,6 +25,28 @@ class Network(Protocol):
 
     def __call__(self, observation: Floats, /) -> Floats:
         """Return the outputs, shape (n_outputs,), for an observation, shape (n_inputs,)."""
+        ...
+
+
+class PicturesNetwork(Protocol):
+    """What turns inputs with names, pictures among them, into outputs; any callable of this kind will do."""
+
+    def __call__(self, inputs: Mapping[str, NDArray[Any]], /) -> Floats:
+        """Return the outputs, shape (n_outputs,), for the inputs of a declaration by name."""
+        ...
+
+
+class Entry(Protocol):
+    """What an input is to hold: a space of Gymnasium's is one."""
+
+    @property
+    def shape(self) -> tuple[int, ...] | None:
+        """Its shape."""
+        ...
+
+    @property
+    def dtype(self) -> np.dtype[Any] | None:
+        """Its type; numbers of any width are fed as float32."""
         ...
 
 
@@ -44,16 +71,10 @@ class OnnxNetwork:
         for kind, found in ends.items():
             if len(found) != 1 or found[0].type != "tensor(float)" or not 1 <= len(found[0].shape) <= 2:
                 raise PolicyFileError(
-                    f"{path}: it needs one {kind}, float32 of shape [n] or [batch, n]; it has: {_told(found)}."
+                    f"{path}: it needs one {kind}, float32 of shape [n] or [batch, n]; it has: {_told(found)}.",
+                    hint="A declaration for a network with several inputs names the `input` of each term.",
                 )
         self.path = path
-        ends = {"input": self._session.get_inputs(), "output": self._session.get_outputs()}
-        for kind, found in ends.items():
-            if len(found) != 1 or found[0].type != "tensor(float)" or not 1 <= len(found[0].shape) <= 2:
-                there = ", ".join(f"{end.name} {end.type} {end.shape}" for end in found)
-                raise PolicyFileError(
-                    f"{path}: it needs one {kind}, float32 of shape [n] or [batch, n]; it has: {there}."
-                )
         self._input = ends["input"][0].name
         self._batched = len(ends["input"][0].shape) == 2
         self.inputs: int | None = _width(ends["input"][0].shape)
@@ -64,6 +85,61 @@ class OnnxNetwork:
         fed = np.asarray(observation, dtype=np.float32)
         (outputs,) = self._session.run(None, {self._input: fed[None] if self._batched else fed})
         return np.asarray(outputs, dtype=np.float64).reshape(-1)
+
+
+class OnnxInputs:
+    """A network in an ONNX file whose inputs are told apart by name, run by ONNX Runtime on one thread.
+
+    Each input has the shape of what it sees behind an axis for the batch; pictures are uint8, numbers float32.
+
+    Attributes:
+        path: The file.
+        inputs: Names of its inputs.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Load a file.
+
+        Raises:
+            PolicyFileError: It is missing, or no ONNX file.
+            ImportError: The extra `onnx` is not installed.
+        """
+        self._session = _session(path)
+        self.path = path
+        self._types = {one.name: np.uint8 if one.type == _BYTES else np.float32 for one in self._session.get_inputs()}
+        self.inputs: tuple[str, ...] = tuple(self._types)
+
+    def require(self, entries: Mapping[str, Entry], outputs: int) -> None:
+        """Check that it sees some of the entries, and returns so many numbers.
+
+        Raises:
+            PolicyFileError: It does not.
+        """
+        made = self._session.get_outputs()
+        for one in self._session.get_inputs():
+            entry = entries.get(one.name)
+            if entry is None:
+                raise PolicyFileError(
+                    f"{self.path}: its input {one.name!r} is not an entry of the observation; there are: "
+                    f"{', '.join(entries)}."
+                )
+            wanted = _BYTES if entry.dtype == np.uint8 else "tensor(float)"
+            sizes = list(entry.shape or ())
+            if one.type != wanted or len(one.shape) != 1 + len(sizes) or not _fits(one.shape[1:], sizes):
+                raise PolicyFileError(
+                    f"{self.path}: its input {one.name!r} must be {wanted} of shape {['batch', *sizes]}, "
+                    f"not {one.type} {one.shape}."
+                )
+        if len(made) != 1 or made[0].type != "tensor(float)" or not _fits(made[0].shape[1:], [outputs]):
+            raise PolicyFileError(
+                f"{self.path}: it needs one output, float32 of shape ['batch', {outputs}]; it has: {_told(made)}."
+            )
+
+    def __call__(self, inputs: Mapping[str, NDArray[Any]], /) -> Floats:
+        """See `PicturesNetwork`; further entries are not used."""
+        fed = {name: np.asarray(inputs[name], dtype)[None] for name, dtype in self._types.items()}
+        (outputs,) = self._session.run(None, fed)
+        return np.asarray(outputs[0], dtype=np.float64)
 
 
 class OnnxDictNetwork:
@@ -90,38 +166,14 @@ class OnnxDictNetwork:
             PolicyFileError: The file is missing, no ONNX file, or does not fit.
             ImportError: The extra `onnx` is not installed.
         """
-        self._session = _session(path)
-        entries = _entries(observation_space)
-        given, made = self._session.get_inputs(), self._session.get_outputs()
-        for one in given:
-            space = entries.get(one.name)
-            if space is None:
-                raise PolicyFileError(
-                    f"{path}: its input {one.name!r} is not an entry of the observation; there are: "
-                    f"{', '.join(entries)}."
-                )
-            wanted = "tensor(uint8)" if space.dtype == np.uint8 else "tensor(float)"
-            sizes = list(space.shape)
-            if one.type != wanted or len(one.shape) != 1 + len(sizes) or not _fits(one.shape[1:], sizes):
-                raise PolicyFileError(
-                    f"{path}: its input {one.name!r} must be {wanted} of shape {['batch', *sizes]}, "
-                    f"not {one.type} {one.shape}."
-                )
-        if len(made) != 1 or made[0].type != "tensor(float)" or not _fits(made[0].shape[1:], [outputs]):
-            raise PolicyFileError(
-                f"{path}: it needs one output, float32 of shape ['batch', {outputs}]; it has: {_told(made)}."
-            )
+        self._network = OnnxInputs(path)
+        self._network.require(_entries(observation_space), outputs)
         self.path = path
-        self.inputs: tuple[str, ...] = tuple(one.name for one in given)
-        self._types = {name: np.uint8 if entries[name].dtype == np.uint8 else np.float32 for name in self.inputs}
+        self.inputs: tuple[str, ...] = self._network.inputs
 
     def __call__(self, observation: Any, /) -> Floats:
         """Return the action, shape (n,), for the observation of one environment."""
-        seen = _entries(observation)
-        (outputs,) = self._session.run(
-            None, {name: np.asarray(seen[name], dtype)[None] for name, dtype in self._types.items()}
-        )
-        return np.asarray(outputs[0], dtype=np.float64)
+        return self._network(_entries(observation))
 
 
 def _session(path: Path) -> Any:

@@ -6,11 +6,13 @@ import math
 from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
+from typing import Any, overload
 
 import numpy as np
 
-from urlab_client.integrations.policy.mapping import PolicyMapping, PolicyMismatch, PolicyRobot, RobotState
-from urlab_client.integrations.policy.network import Network, OnnxNetwork
+from urlab_client.integrations.policy.mapping import PolicyMapping, PolicyMismatch
+from urlab_client.integrations.policy.network import Network, OnnxInputs, OnnxNetwork, PicturesNetwork
+from urlab_client.integrations.policy.robot import PolicyRobot, RobotState
 from urlab_client.integrations.policy.spec import PolicyFileError, PolicySpec, read_spec
 from urlab_client.protocol.base import Floats
 
@@ -27,17 +29,24 @@ class Policy:
         source: What errors call the declaration, usually its file.
     """
 
-    def __init__(self, spec: PolicySpec, network: Network, *, source: str = "policy") -> None:
+    # Two signatures rather than a union, from which type checkers cannot tell what a lambda takes.
+    @overload
+    def __init__(self, spec: PolicySpec, network: Network, *, source: str = "policy") -> None: ...
+
+    @overload
+    def __init__(self, spec: PolicySpec, network: PicturesNetwork, *, source: str = "policy") -> None: ...
+
+    def __init__(self, spec: PolicySpec, network: Network | PicturesNetwork, *, source: str = "policy") -> None:
         """Make a policy of a declaration and any callable that maps observations to outputs.
 
         Args:
             spec: The declaration.
-            network: The network; `load` makes one from a file.
+            network: The network; `load` makes one from a file. A `PicturesNetwork` where terms name their `input`.
             source: What errors call the declaration.
         """
         self.spec = spec
         self.source = source
-        self._network = network
+        self._network: Any = network
         self._command: Floats = np.zeros(3) if spec.command is None else np.array(spec.command.default)
         self._goal: Floats = np.zeros(0) if spec.goal is None else np.array(spec.goal.default)
         self._robot: PolicyRobot | None = None
@@ -113,6 +122,13 @@ class Policy:
                     raise PolicyFileError(
                         f"{network.path} has {there} {kind}, but {self.source} declares {declared} ({key})."
                     )
+        elif isinstance(network, OnnxInputs):
+            network.require(mapping.inputs, mapping.action_size)
+            if unseen := mapping.inputs.keys() - set(network.inputs):
+                raise PolicyFileError(
+                    f"{network.path} has no input {min(unseen)!r}, which {self.source} declares; it has: "
+                    f"{', '.join(network.inputs)}."
+                )
         self._robot, self._mapping = robot, mapping
         return mapping
 
@@ -143,7 +159,8 @@ class Policy:
         observation = mapping.observe(RobotState.of(robot), self._command, self._action, now, self._goal)
         kept = self._history or [observation] * self.spec.history
         self._history = [*kept[1:], observation]
-        output = self._network(np.concatenate(self._history))
+        seen = mapping.named(self._history, robot) if self.spec.named else np.concatenate(self._history)
+        output = self._network(seen)
         if output.shape != (mapping.action_size,):
             raise PolicyFileError(
                 f"The network returned {output.size} numbers, but {self.source} declares {mapping.action_size} "
@@ -191,4 +208,4 @@ def load(onnx: str | PathLike[str], toml: str | PathLike[str] | None = None) -> 
     path = Path(onnx)
     declared = path.with_suffix(".toml") if toml is None else Path(toml)
     spec = read_spec(declared)
-    return Policy(spec, OnnxNetwork(path), source=str(declared))
+    return Policy(spec, OnnxInputs(path) if spec.named else OnnxNetwork(path), source=str(declared))

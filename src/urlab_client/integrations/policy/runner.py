@@ -13,8 +13,9 @@ from msgspec import Struct
 from urlab_client.aio.articulation import URLabArticulation
 from urlab_client.aio.client import URLabClient as AsyncClient
 from urlab_client.aio.deadline import DEFAULT
-from urlab_client.integrations.policy.mapping import PolicyMapping, PolicyMismatch, RobotState
+from urlab_client.integrations.policy.mapping import PolicyMapping, PolicyMismatch
 from urlab_client.integrations.policy.policy import Policy
+from urlab_client.integrations.policy.robot import RobotState
 from urlab_client.protocol.base import Floats
 from urlab_client.protocol.enums import ActuatorType, ControllerKind, ControlMode, StepMode
 from urlab_client.protocol.errors import URLabError
@@ -221,6 +222,8 @@ class _PolicyLoop:
         self._mapping = policy.bind(robot)
         self._on_action = on_action
         self._live = client.step_mode is StepMode.LIVE
+        self._cameras = [f"{robot.prefix}/{term.camera}" for term in policy.spec.pictures]
+        self._look = dict.fromkeys(self._cameras, "latest" if self._live else "sync") or False
         self._result = PolicyRun(articulation=robot.prefix, step_mode=client.step_mode)
         self._rewards = 0.0
         self._squared_error = 0.0
@@ -257,6 +260,8 @@ class _PolicyLoop:
         """Put the simulation at its start; the policy forgets."""
         self._travelled = (self._result.distance, self._result.forward)
         await self._client.reset(self._policy.spec.keyframe, seed)
+        if self._cameras:
+            await self._client.capture(self._cameras)
         self._policy.reset()
         self._velocity = np.zeros(2)
         self._last_time = self._began = self._client.sim_time
@@ -270,12 +275,13 @@ class _PolicyLoop:
         client, policy, spec = self._client, self._policy, self._policy.spec
         policy.act(self._robot)
         if spec.action.via != "client":
-            await client.step(spec.decimation)
+            await client.step(spec.decimation, include_cameras=self._look)
         else:
             for _ in range(spec.decimation - 1):
                 await client.step()
                 policy.hold(self._robot)
-            await client.step()
+            await client.step(include_cameras=self._look)
+        self._require_pictures()
         self._result.steps += spec.decimation
 
     async def _live_action(self) -> None:
@@ -293,10 +299,19 @@ class _PolicyLoop:
                     hint="Something paused it: client.runtime.set_paused(False), or `urlab doctor`.",
                 )
             await asyncio.sleep(missing)
-            await client.step()
+            await client.step(include_cameras=self._look)
         if missing < -period:
             self._result.late += 1
             self._due = client.sim_time
+
+    def _require_pictures(self) -> None:
+        """Refuse to go on with pictures of earlier states."""
+        for term in self._policy.spec.pictures:
+            if not self._robot.cameras[term.camera].delivered:
+                raise URLabError(
+                    f"The server sent no picture of camera {term.camera!r} of {self._robot.prefix!r}.",
+                    hint="`urlab doctor` says whether the server can draw.",
+                )
 
     def _count(self, last_action: Floats, wall_time: float) -> None:
         result, policy, state = self._result, self._policy, RobotState.of(self._robot)

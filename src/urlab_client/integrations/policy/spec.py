@@ -10,156 +10,41 @@ import math
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, get_args
+from urllib.parse import urlencode
 
 import msgspec
 from msgspec import Meta, Struct
 
+from urlab_client.integrations.policy.terms import (
+    CommandTerm,
+    GoalTerm,
+    Numbers,
+    PictureTerm,
+    Positive,
+    Term,
+    check_clip,
+    check_numbers,
+    listed,
+)
 from urlab_client.protocol.enums import StepMode
 from urlab_client.protocol.errors import URLabError
 
 __all__ = [
     "Action",
-    "AngularVelocity",
-    "BaseHeight",
     "Command",
-    "CommandTerm",
     "Fall",
     "Gains",
     "Goal",
-    "GoalTerm",
-    "Gravity",
-    "JointPosition",
-    "JointVelocity",
-    "LastAction",
-    "LinearVelocity",
-    "Numbers",
-    "PhaseClock",
     "PolicyFileError",
     "PolicySpec",
-    "SensorTerm",
-    "Term",
     "TrackingReward",
     "parse_spec",
     "read_spec",
 ]
 
-Numbers = float | list[float]
-"""One number for all, or one for each."""
-
-_Positive = Annotated[float, Meta(gt=0)]
-_Weight = Annotated[float, Meta(ge=0)]
-
 
 class PolicyFileError(URLabError, ValueError):
     """A policy's files cannot be used; says which file, where in it, and what would be right."""
-
-
-class _Term(Struct, tag_field="term", kw_only=True, forbid_unknown_fields=True, frozen=True):
-    """One part of an observation: `clip((value - offset) * scale)`.
-
-    Attributes:
-        scale: Factor, one or one for each number.
-        offset: What is subtracted before, one or one for each number.
-        clip: Lowest and highest result.
-    """
-
-    scale: Numbers = 1.0
-    offset: Numbers = 0.0
-    clip: tuple[float, float] | None = None
-
-    def __post_init__(self) -> None:
-        _check_numbers("scale", self.scale)
-        _check_numbers("offset", self.offset)
-        _check_clip(self.clip)
-
-
-class BaseHeight(_Term, tag="base_height", kw_only=True, forbid_unknown_fields=True, frozen=True):
-    """Height of the free base, metres, world frame; 1 number."""
-
-
-class Gravity(_Term, tag="gravity", kw_only=True, forbid_unknown_fields=True, frozen=True):
-    """Direction of gravity, a unit vector in the base frame; 3 numbers."""
-
-
-class LinearVelocity(_Term, tag="linear_velocity", kw_only=True, forbid_unknown_fields=True, frozen=True):
-    """Velocity of the free base, m/s, base frame; 3 numbers."""
-
-
-class AngularVelocity(_Term, tag="angular_velocity", kw_only=True, forbid_unknown_fields=True, frozen=True):
-    """Angular velocity of the free base, rad/s, base frame; 3 numbers."""
-
-
-class JointPosition(_Term, tag="joint_position", kw_only=True, forbid_unknown_fields=True, frozen=True):
-    """Positions of hinge and slide joints, rad or m; one number each.
-
-    Attributes:
-        joints: Joint names; those of the action if empty.
-    """
-
-    joints: list[str] = []
-
-
-class JointVelocity(_Term, tag="joint_velocity", kw_only=True, forbid_unknown_fields=True, frozen=True):
-    """Velocities of hinge and slide joints, rad/s or m/s; one number each.
-
-    Attributes:
-        joints: Joint names; those of the action if empty.
-    """
-
-    joints: list[str] = []
-
-
-class SensorTerm(_Term, tag="sensor", kw_only=True, forbid_unknown_fields=True, frozen=True):
-    """The reading of a sensor, in its own units and frame.
-
-    Attributes:
-        sensor: Its name.
-    """
-
-    sensor: str
-
-
-class CommandTerm(_Term, tag="command", kw_only=True, forbid_unknown_fields=True, frozen=True):
-    """The command (vx, vy, yaw rate), m/s and rad/s, base frame; 3 numbers. Needs the table `command`."""
-
-
-class GoalTerm(_Term, tag="goal", kw_only=True, forbid_unknown_fields=True, frozen=True):
-    """What the policy is to reach, such as a place in the world; as many numbers as the table `goal` has.
-
-    Attributes:
-        relative_to: Sensor whose reading is subtracted, so that the term is the way that is left; none if empty.
-    """
-
-    relative_to: str = ""
-
-
-class LastAction(_Term, tag="last_action", kw_only=True, forbid_unknown_fields=True, frozen=True):
-    """The network's last output after clipping, zeros at the start; one number for each joint of the action."""
-
-
-class PhaseClock(_Term, tag="clock", kw_only=True, forbid_unknown_fields=True, frozen=True):
-    """Sine and cosine of a phase that goes on by itself; 2 numbers.
-
-    Attributes:
-        hz: Cycles per second.
-    """
-
-    hz: _Positive
-
-
-Term = (
-    BaseHeight
-    | Gravity
-    | LinearVelocity
-    | AngularVelocity
-    | JointPosition
-    | JointVelocity
-    | SensorTerm
-    | CommandTerm
-    | GoalTerm
-    | LastAction
-    | PhaseClock
-)
 
 
 class Action(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
@@ -186,9 +71,9 @@ class Action(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
     def __post_init__(self) -> None:
         if len(set(self.joints)) != len(self.joints):
             raise ValueError("joints names a joint twice")
-        _check_numbers("scale", self.scale, len(self.joints))
-        _check_numbers("offset", self.offset, len(self.joints))
-        _check_clip(self.clip)
+        check_numbers("scale", self.scale, len(self.joints))
+        check_numbers("offset", self.offset, len(self.joints))
+        check_clip(self.clip)
         if self.kind == "torque" and self.via != "actuators":
             raise ValueError(f"torques go via 'actuators', not via {self.via!r}")
 
@@ -209,8 +94,8 @@ class Gains(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
     def __post_init__(self) -> None:
         for name in ("kp", "kv", "torque_limit"):
             value: Numbers = getattr(self, name)
-            _check_numbers(name, value)
-            if min(_listed(value)) < 0:
+            check_numbers(name, value)
+            if min(listed(value)) < 0:
                 raise ValueError(f"{name} is 0 or more")
 
 
@@ -264,6 +149,9 @@ class Fall(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
     upright: Annotated[float, Meta(ge=-1, le=1)] = -1.0
 
 
+_Weight = Annotated[float, Meta(ge=0)]
+
+
 class TrackingReward(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
     """How well a robot with a free base follows its command; what the network was trained on, per action.
 
@@ -287,11 +175,11 @@ class TrackingReward(Struct, kw_only=True, forbid_unknown_fields=True, frozen=Tr
 
     alive: float = 0.0
     velocity: _Weight = 1.0
-    velocity_width: _Positive = 0.1
+    velocity_width: Positive = 0.1
     yaw: _Weight = 0.0
-    yaw_width: _Positive = 0.1
+    yaw_width: Positive = 0.1
     level: _Weight = 0.0
-    level_width: _Positive = 0.1
+    level_width: Positive = 0.1
     bounce: _Weight = 0.0
     roll: _Weight = 0.0
     change: _Weight = 0.0
@@ -320,7 +208,7 @@ class PolicySpec(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
 
     robot: str
     step_modes: Annotated[list[StepMode], Meta(min_length=1)]
-    timestep: _Positive
+    timestep: Positive
     decimation: Annotated[int, Meta(ge=1)]
     keyframe: str | None = None
     history: Annotated[int, Meta(ge=1)] = 1
@@ -344,11 +232,45 @@ class PolicySpec(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
             raise ValueError(f"action.via = {self.action.via!r} {what} the table [gains]")
         if self.gains is not None:
             for name in ("kp", "kv", "torque_limit"):
-                _check_numbers(f"gains.{name}", getattr(self.gains, name), len(self.action.joints))
+                check_numbers(f"gains.{name}", getattr(self.gains, name), len(self.action.joints))
+        self._check_inputs()
         if self.command is None and (self.reward or any(isinstance(term, CommandTerm) for term in self.observation)):
             raise ValueError("the term 'command' and the table [reward] need the table [command]")
         if self.goal is None and any(isinstance(term, GoalTerm) for term in self.observation):
             raise ValueError("the term 'goal' needs the table [goal]")
+
+    def _check_inputs(self) -> None:
+        if self.named and not all(term.input for term in self.observation):
+            raise ValueError("each term of the observation needs its `input`, or none has one")
+        pictures = [term.input for term in self.pictures]
+        others = {term.input for term in self.observation if not isinstance(term, PictureTerm)}
+        if twice := [name for name in pictures if pictures.count(name) > 1 or name in others]:
+            raise ValueError(f"a picture needs an input of its own, but {twice[0]!r} is of several terms")
+        if pictures and self.history > 1:
+            raise ValueError("history must be 1 with the term 'picture'")
+
+    @property
+    def named(self) -> bool:
+        """Whether the network has several inputs, told apart by name."""
+        return any(term.input for term in self.observation)
+
+    @property
+    def pictures(self) -> list[PictureTerm]:
+        """The terms that are pictures."""
+        return [term for term in self.observation if isinstance(term, PictureTerm)]
+
+    def simulated(self, model: str, actor: str) -> str:
+        """Return the `sim://` address of a server that has what the policy needs, of one robot.
+
+        Args:
+            model: What `sim://` takes.
+            actor: What a server calls it.
+        """
+        options = [("controller", f"{actor}=pd")] if self.action.via == "controller" else []
+        sizes = {"x".join(map(str, term.size)) for term in self.pictures}
+        options += [("camera-size", size) for size in sorted(sizes)[:1]]  # more sizes are the MJCF's to say
+        options += [("camera-mode", f"{actor}/{term.camera}={term.mode}") for term in self.pictures]
+        return f"sim://{model}{'?' if options else ''}{urlencode(options)}"
 
     @property
     def period(self) -> float:
@@ -423,21 +345,3 @@ def _advice(raw: dict[str, Any], problem: str, where: str) -> str | None:
         )
     table = _TABLES.get(where)
     return None if table is None or "field" not in problem else f"Its keys are {', '.join(table.__struct_fields__)}."
-
-
-def _listed(value: Numbers) -> list[float]:
-    return value if isinstance(value, list) else [value]
-
-
-def _check_numbers(name: str, value: Numbers, length: int | None = None) -> None:
-    if not value and isinstance(value, list):
-        raise ValueError(f"{name} is empty")
-    if not all(map(math.isfinite, _listed(value))):
-        raise ValueError(f"{name} holds NaN or infinity")
-    if length is not None and isinstance(value, list) and len(value) != length:
-        raise ValueError(f"{name} has {len(value)} numbers; it takes one, or one for each of the action's {length}")
-
-
-def _check_clip(clip: tuple[float, float] | None) -> None:
-    if clip is not None and not clip[0] < clip[1]:
-        raise ValueError(f"clip is [low, high], not {list(clip)}")

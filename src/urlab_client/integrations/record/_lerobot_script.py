@@ -1,29 +1,50 @@
-"""Writes a LeRobot dataset from a prepared folder. Run by an interpreter that has LeRobot, which has none of ours.
+"""Writes a LeRobot dataset as its frames come. Run by an interpreter that has LeRobot, which has none of ours.
 
-It imports nothing of this project, and is given the folder as its only argument.
+It imports nothing of this project, and is given a folder with `plan.json` as its only argument. Each line of standard
+input names a file of frames in that folder, and whether they end an episode; each is answered with a line, once its
+frames have been taken over.
 """
 
 from __future__ import annotations
 
 import importlib
 import json
+import os
 import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 __all__ = ["main"]
 
 
 def main(work: Path) -> None:
-    """Write the dataset that `work/plan.json` describes."""
+    """Write the dataset that `work/plan.json` describes, from the frames that standard input names."""
+    with os.fdopen(os.dup(1), "w", encoding="utf-8") as replies:
+        os.dup2(2, 1)  # what libraries print is no reply
+        plan: dict[str, Any] = json.loads((work / "plan.json").read_text(encoding="utf-8"))
+        dataset: Any = None
+        for line in sys.stdin:
+            order: dict[str, Any] = json.loads(line)
+            file = work / order["file"]
+            with np.load(file, allow_pickle=False) as arrays:
+                frames: dict[str, Any] = {name: arrays[name] for name in arrays.files}
+            file.unlink()
+            if dataset is None:
+                dataset = _create(plan, frames)
+            _add(dataset, plan, frames)
+            if order["ends_episode"]:
+                dataset.save_episode()
+            replies.write("taken\n")
+            replies.flush()
+        if hasattr(dataset, "finalize"):
+            dataset.finalize()
+
+
+def _create(plan: dict[str, Any], frames: dict[str, Any]) -> Any:
     library: Any = importlib.import_module("lerobot.datasets.lerobot_dataset")
 
-    plan: dict[str, Any] = json.loads((work / "plan.json").read_text(encoding="utf-8"))
-    arrays: Any = np.load(work / "states.npz", allow_pickle=False)
-    cameras: list[str] = plan["cameras"]
     features: dict[str, Any] = {
         "observation.state": {"dtype": "float32", "shape": (len(plan["state"]),), "names": plan["state"]},
         "action": {"dtype": "float32", "shape": (len(plan["action"]),), "names": plan["action"]},
@@ -34,39 +55,34 @@ def main(work: Path) -> None:
             "shape": (len(plan["goal"]),),
             "names": plan["goal"],
         }
-    for i, name in enumerate(cameras):
-        shape = np.array(Image.open(work / str(i) / "0.png")).shape
+    for i, name in enumerate(plan["cameras"]):
         features[f"observation.images.{name}"] = {
             "dtype": "video" if plan["video"] else "image",
-            "shape": shape,
+            "shape": frames[f"pictures{i}"].shape[1:],
             "names": ["height", "width", "channels"],
         }
-    folder = Path(plan["folder"])
-    dataset: Any = library.LeRobotDataset.create(
-        repo_id=f"local/{folder.name}",
-        root=folder,
+    return library.LeRobotDataset.create(
+        repo_id=f"local/{plan['name']}",
+        root=Path(plan["folder"]),
         fps=plan["fps"],
         features=features,
         robot_type=plan["robot_type"],
         use_videos=plan["video"],
     )
-    episodes = arrays["episode"]
-    for row in range(len(episodes)):
+
+
+def _add(dataset: Any, plan: dict[str, Any], frames: dict[str, Any]) -> None:
+    for row in range(len(frames["state"])):
         frame: dict[str, Any] = {
-            "observation.state": arrays["state"][row],
-            "action": arrays["action"][row],
+            "observation.state": frames["state"][row],
+            "action": frames["action"][row],
             "task": plan["task"],
         }
         if plan["goal"]:
-            frame["observation.environment_state"] = arrays["goal"][row]
-        for i, name in enumerate(cameras):
-            picture = work / str(i) / f"{arrays[f'picture{i}'][row]}.png"
-            frame[f"observation.images.{name}"] = np.array(Image.open(picture))
+            frame["observation.environment_state"] = frames["goal"][row]
+        for i, name in enumerate(plan["cameras"]):
+            frame[f"observation.images.{name}"] = frames[f"pictures{i}"][frames[f"picture{i}"][row]]
         dataset.add_frame(frame)
-        if row + 1 == len(episodes) or episodes[row + 1] != episodes[row]:
-            dataset.save_episode()
-    if hasattr(dataset, "finalize"):
-        dataset.finalize()
 
 
 if __name__ == "__main__":

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -124,19 +125,34 @@ class Table:
     def __len__(self) -> int:
         return len(self.time)
 
-    def flat(self) -> dict[str, NDArray[Any]]:
-        """Return every value as a column of its own: `time`, …, then `ARTICULATION/FIELD/NAME`."""
-        flat: dict[str, NDArray[Any]] = {
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return all arrays by name: `time`, …, then `ARTICULATION/FIELD`, shape (n, values)."""
+        return {
             "time": self.time,
             "sim_time": self.sim_time,
             "wall_ns": self.wall_ns,
             "step": self.step,
             "episode": self.episode,
+            **{key: column.values for key, column in self.columns.items()},
         }
-        for key, column in self.columns.items():
-            for i, name in enumerate(column.names):
-                flat[f"{key}/{name}"] = column.values[:, i]
+
+    def flat(self) -> dict[str, NDArray[Any]]:
+        """Return every value as a column of its own: `time`, …, then `ARTICULATION/FIELD/NAME`."""
+        flat: dict[str, NDArray[Any]] = {}
+        for key, values in self.arrays().items():
+            column = self.columns.get(key)
+            if column is None:
+                flat[key] = values
+            else:
+                flat.update({f"{key}/{name}": values[:, i] for i, name in enumerate(column.names)})
         return flat
+
+    def with_arrays(self, arrays: Mapping[str, NDArray[Any]]) -> Table:
+        """Return a table with the same columns and other rows, from what `arrays` of it returns."""
+        columns = {key: replace(column, values=arrays[key]) for key, column in self.columns.items()}
+        return Table(
+            arrays["time"], arrays["sim_time"], arrays["wall_ns"], arrays["step"], arrays["episode"], columns=columns
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,35 +1,41 @@
-"""Recordings as files of other kinds: tables, arrays, videos, LeRobot datasets. Each writes to the path it is given.
+"""Recordings as files of other kinds: tables, arrays, videos, LeRobot datasets. Each appears whole or not at all.
 
 Tables are pairs of an observation and the action taken at it, see `transitions`; arrays are the states as recorded.
+Memory holds a piece of the recording, however long that is; a temporary file beside the output has the others while
+they are needed, 8 bytes for each value of each state. What `progress` raises breaks a conversion off.
 """
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import importlib
-from collections.abc import Callable, Sequence
+import zipfile
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from fractions import Fraction
+from itertools import islice
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client._extras import need
+from urlab_client._whole_files import replaced
+from urlab_client.integrations.record.contents import Table
 from urlab_client.integrations.record.lerobot_writer import write_lerobot
+from urlab_client.integrations.record.phases import Progress, phases
 from urlab_client.integrations.record.pixels import even, farthest, visible
 from urlab_client.integrations.record.reader import Run
-from urlab_client.integrations.record.transitions import Episodes, transitions_of
+from urlab_client.integrations.record.stored_table import StoredTable
+from urlab_client.integrations.record.transitions import Episodes, check_episodes, transition_pieces
 from urlab_client.integrations.record.writer import RecordingError
 
 __all__ = ["write_csv", "write_lerobot", "write_mp4", "write_npz", "write_parquet"]
 
-Progress = Callable[[int], None]
-
-_TICKS = 90_000  # per second, of MP4 time stamps
-_TICK = Fraction(1, _TICKS)
-_ROWS = 10_000
-_CODECS = ("libx264", "mpeg4")
+_ROWS = 1_000
+_CODECS = {"libx264": 90_000, "mpeg4": 60_000}
+"""By codec: ticks per second of MP4 time stamps, of which MPEG-4 takes at most 65,535."""
 
 
 def write_csv(run: Run, path: Path, progress: Progress | None = None, *, episodes: Episodes = "kept") -> int:
@@ -37,15 +43,24 @@ def write_csv(run: Run, path: Path, progress: Progress | None = None, *, episode
 
     Numbers read back to the same bits. See `transitions` for what is a row, and `transitions_of` for `episodes`.
     """
-    flat = transitions_of(run, only=episodes, progress=progress).flat()
-    with path.open("w", newline="", encoding="utf-8") as file:
+    count = 0
+    with (
+        replaced(path) as temporary,
+        _transitions(run, path.parent, episodes, progress) as (pieces, told),
+        temporary.open("w", newline="", encoding="utf-8") as file,
+    ):
         writer = csv.writer(file)
-        writer.writerow(flat)
-        # Python floats: those of NumPy would be written with their type. They take more room, so some at a time.
-        for start in range(0, len(flat["time"]), _ROWS):
-            rows = slice(start, start + _ROWS)
-            writer.writerows(zip(*(column[rows].tolist() for column in flat.values()), strict=True))
-    return len(flat["time"])
+        for number, piece in enumerate(pieces):
+            flat = piece.flat()
+            if not number:
+                writer.writerow(flat)
+            # Python floats: those of NumPy would be written with their type. They take more room, so some at a time.
+            for start in range(0, len(piece), _ROWS):
+                rows = slice(start, start + _ROWS)
+                writer.writerows(zip(*(column[rows].tolist() for column in flat.values()), strict=True))
+                told(count + start)
+            count += len(piece)
+    return count
 
 
 def write_npz(run: Run, path: Path, cameras: Sequence[str] = (), progress: Progress | None = None) -> int:
@@ -53,26 +68,30 @@ def write_npz(run: Run, path: Path, cameras: Sequence[str] = (), progress: Progr
 
     Arrays are called `ARTICULATION/FIELD`, and the names of their values are in `ARTICULATION/FIELD.names`.
     Pictures of the cameras that are named come as `camera/NAME`, shape (n, H, W, channels) or of depth (n, H, W), with
-    `camera/NAME.time`. They must fit in memory.
+    `camera/NAME.time`.
+
+    Raises:
+        KeyError: There are no pictures of a camera.
+        RecordingError: The pictures of a camera are not all of one size.
     """
-    table = run.table(progress)
-    arrays: dict[str, NDArray[Any]] = {
-        "time": table.time,
-        "sim_time": table.sim_time,
-        "wall_ns": table.wall_ns,
-        "step": table.step,
-        "episode": table.episode,
-    }
-    for key, column in table.columns.items():
-        arrays[key] = column.values
-        arrays[f"{key}.names"] = np.array(column.names, dtype=np.str_)
-    for name in cameras:
-        pictures = list(run.frames(name, progress))
-        arrays[f"camera/{name}"] = np.stack([picture.pixels for picture in pictures])
-        arrays[f"camera/{name}.time"] = np.array([picture.time for picture in pictures])
-    with path.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **cast("Any", arrays))
-    return len(table)
+    size = run.path.stat().st_size
+    steps = iter(phases(size, progress, 2 + 2 * len(cameras)))
+    times = {name: run.picture_times(name, next(steps)) for name in cameras}
+    with (
+        replaced(path) as temporary,
+        run.stored_table(path.parent, next(steps)) as stored,
+        zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive,
+    ):
+        writing = next(steps)
+        _save_table(archive, stored, lambda share: writing(int(share * size)))
+        for name, when in times.items():
+            pictures = (picture.pixels[None] for picture in islice(run.frames(name, next(steps)), len(when)))
+            try:
+                _save(archive, f"camera/{name}", pictures, len(when))
+            except ValueError as error:
+                raise RecordingError(f"{run.path}: the pictures of {name} do not fit one array: {error}.") from None
+            _save(archive, f"camera/{name}.time", [when], len(when))
+    return len(stored)
 
 
 def write_parquet(run: Run, path: Path, progress: Progress | None = None, *, episodes: Episodes = "kept") -> int:
@@ -87,9 +106,24 @@ def write_parquet(run: Run, path: Path, progress: Progress | None = None, *, epi
     pa: Any = importlib.import_module("pyarrow")
     parquet: Any = importlib.import_module("pyarrow.parquet")
 
-    flat = transitions_of(run, only=episodes, progress=progress).flat()
-    parquet.write_table(pa.table(flat), path, compression="zstd")
-    return len(flat["time"])
+    count = 0
+    with (
+        replaced(path) as temporary,
+        _transitions(run, path.parent, episodes, progress) as (pieces, told),
+        contextlib.ExitStack() as stack,
+    ):
+        writer: Any = None
+        for piece in pieces:
+            group = pa.table(piece.flat())
+            if writer is None:
+                # Without dictionaries: hardly a number comes twice, and in a group of this size all would get one.
+                options = {"compression": "zstd", "use_dictionary": False}
+                writer = stack.enter_context(parquet.ParquetWriter(temporary, group.schema, **options))
+            if len(piece):
+                writer.write_table(group)
+            count += len(piece)
+            told(count)
+    return count
 
 
 def write_mp4(run: Run, path: Path, camera: str, progress: Progress | None = None) -> int:
@@ -108,8 +142,8 @@ def write_mp4(run: Run, path: Path, camera: str, progress: Progress | None = Non
     codec = next((name for name in _CODECS if name in av.codecs_available), None)
     if codec is None:
         raise RecordingError(f"{path}: this PyAV has neither {' nor '.join(_CODECS)}.")
-    count, start, last, far = 0, 0.0, -1, 0.0
-    with av.open(str(path), "w", format="mp4") as container:
+    ticks, count, start, last, far = _CODECS[codec], 0, 0.0, -1, 0.0
+    with replaced(path) as temporary, av.open(str(temporary), "w", format="mp4") as container:
         stream: Any = container.add_stream(codec, options={"crf": "18"} if codec == "libx264" else {})
         for picture in run.frames(camera, progress):
             if not count:
@@ -117,11 +151,71 @@ def write_mp4(run: Run, path: Path, camera: str, progress: Progress | None = Non
                 height, width = picture.pixels.shape[:2]
                 stream.width, stream.height = width + width % 2, height + height % 2
                 stream.pix_fmt = "yuv420p"
-                stream.time_base = stream.codec_context.time_base = _TICK
+                stream.time_base = stream.codec_context.time_base = Fraction(1, ticks)
             frame: Any = av.VideoFrame.from_ndarray(even(visible(picture.pixels, far)), format="rgb24")
-            last = max(last + 1, round((picture.time - start) * _TICKS))
-            frame.pts, frame.time_base = last, _TICK
+            last = max(last + 1, round((picture.time - start) * ticks))
+            frame.pts, frame.time_base = last, Fraction(1, ticks)
             container.mux(stream.encode(frame))
             count += 1
         container.mux(stream.encode())
     return count
+
+
+class _Transitions(NamedTuple):
+    """The pairs of a recording in pieces, and what is told how many rows have been written."""
+
+    pieces: Iterator[Table]
+    told: Progress
+
+
+@contextlib.contextmanager
+def _transitions(run: Run, folder: Path, episodes: Episodes, progress: Progress | None) -> Generator[_Transitions]:
+    check_episodes(episodes)
+    size = run.path.stat().st_size
+    reading, writing = phases(size, progress, 2)
+    with run.stored_table(folder, reading) as stored:
+        rows = max(1, len(stored))
+        pieces = transition_pieces(stored.pieces(), run.outcomes(), episodes)
+
+        def told(count: int) -> None:
+            writing(size * count // rows)
+
+        yield _Transitions(pieces, told)
+
+
+def _save_table(archive: zipfile.ZipFile, stored: StoredTable, told: Callable[[float], None]) -> None:
+    arrays = stored.last.arrays()
+    for number, name in enumerate(arrays):
+        _save(archive, name, stored.parts(name), len(stored), lambda: told(number / len(arrays)))  # noqa: B023
+        column = stored.last.columns.get(name)
+        if column is not None:
+            _save(archive, f"{name}.names", [np.array(column.names, dtype=np.str_)], len(column.names))
+
+
+def _save(
+    archive: zipfile.ZipFile,
+    name: str,
+    parts: Iterable[NDArray[Any]],
+    count: int,
+    told: Callable[[], None] = lambda: None,
+) -> None:
+    """Add an array of `count` rows to an archive, as `numpy.savez` does, with no more than a part of it in memory.
+
+    Raises:
+        ValueError: The parts do not fit together, or are fewer rows.
+    """
+    rows, form = 0, None
+    with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
+        for part in parts:
+            told()
+            if form is None:
+                form = part.shape[1:], part.dtype
+                descr = np.lib.format.dtype_to_descr(part.dtype)
+                header = {"descr": descr, "fortran_order": False, "shape": (count, *part.shape[1:])}
+                np.lib.format.write_array_header_1_0(entry, header)
+            elif (part.shape[1:], part.dtype) != form:
+                raise ValueError(f"one has shape {part.shape[1:]}, another {form[0]}")
+            entry.write(part.tobytes())
+            rows += len(part)
+    if rows != count or form is None:
+        raise ValueError(f"{rows} of {count} can be read")

@@ -147,15 +147,15 @@ class RecordingIndex:
 
     def times(self, channels: Collection[int] | None = None) -> dict[int, NDArray[np.int64]]:
         """Return the times of all messages by channel, nanoseconds, without reading the messages."""
-        found: dict[int, list[NDArray[np.uint64]]] = {}
+        found: dict[int, list[NDArray[np.int64]]] = {}
         with self.path.open("rb") as file:
             for block in self._blocks:
                 if channels is None or not block.channels.isdisjoint(channels):
                     positions = self._positions(file, block)
                     for channel, rows in positions.items():
                         if channels is None or channel in channels:
-                            found.setdefault(channel, []).append(rows[:, 0])
-        return {channel: np.concatenate(parts).astype(np.int64) for channel, parts in found.items()}
+                            found.setdefault(channel, []).append(rows[:, 0].astype(np.int64))
+        return {channel: np.concatenate(parts) for channel, parts in found.items()}
 
     def messages(self, channels: Collection[int], progress: Progress | None = None) -> Iterator[RecordedMessage]:
         """Iterate over the messages of some channels in the file's order. It ends before damage, which `damage` names.
@@ -166,7 +166,7 @@ class RecordingIndex:
         """
         wanted = frozenset(channels)
         with self.path.open("rb") as file:
-            for number, block in enumerate(self._blocks):
+            for block in self._blocks:
                 if wanted.isdisjoint(block.channels):
                     continue
                 try:
@@ -177,7 +177,7 @@ class RecordingIndex:
                 except _BROKEN as error:
                     self.damage = _explained(error)
                     return
-                if progress is not None and number % _TOLD_EVERY == 0:
+                if progress is not None:
                     progress(block.start)
 
     def first(self, channel: int) -> RecordedMessage | None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+import contextlib
+from collections.abc import Callable, Collection, Generator, Iterator
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Final
 
 import numpy as np
 
+from urlab_client.integrations._feed.messages import OutcomeMessage
 from urlab_client.integrations._feed.quantities import quantities
 from urlab_client.integrations._feed.scene_messages import SceneLayout
 from urlab_client.integrations.record.contents import (
@@ -22,7 +24,9 @@ from urlab_client.integrations.record.contents import (
     describe_topic,
 )
 from urlab_client.integrations.record.reader import RecordedPicture, Run
+from urlab_client.integrations.record.stored_table import StoredTable
 from urlab_client.integrations.record.writer import RecordingError
+from urlab_client.protocol.base import Floats
 from urlab_client.server.physics.recording import Frame, decode_json
 
 __all__ = ["OWNER", "JointStatesRun", "is_joint_states"]
@@ -105,6 +109,23 @@ class JointStatesRun(Run):
             columns=columns,
         )
 
+    @contextlib.contextmanager
+    def stored_table(
+        self, folder: Path, progress: Callable[[int], None] | None = None, *, fields: Collection[str] | None = None
+    ) -> Generator[StoredTable]:
+        """Yield all states as one piece: a JSON file is read whole.
+
+        Raises:
+            RecordingError: The file is not a recording.
+        """
+        with StoredTable(folder) as stored:
+            stored.last = self.table(progress, fields=fields)
+            yield stored
+
+    def outcomes(self) -> tuple[OutcomeMessage, ...]:
+        """Return nothing: a server marks no episodes."""
+        return ()
+
     @cached_property
     def whole(self) -> Table:
         """All states, read once: a JSON file has no index."""
@@ -145,7 +166,15 @@ class JointStatesRun(Run):
         """Return nothing: the file holds no pictures."""
         return []
 
+    def picture_times(self, camera: str, progress: Callable[[int], None] | None = None) -> Floats:
+        """Raise `KeyError`: the file holds no pictures."""
+        raise self._no_pictures(camera)
+
     def frames(self, camera: str, progress: Callable[[int], None] | None = None) -> Iterator[Camera]:
+        """Raise `KeyError`: the file holds no pictures."""
+        raise self._no_pictures(camera)
+
+    def encoded_pictures(self, camera: str, progress: Callable[[int], None] | None = None) -> Iterator[RecordedPicture]:
         """Raise `KeyError`: the file holds no pictures."""
         raise self._no_pictures(camera)
 

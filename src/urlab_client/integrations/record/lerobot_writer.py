@@ -5,25 +5,27 @@ from __future__ import annotations
 import json
 import subprocess
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
+from urlab_client.integrations._feed.messages import OutcomeMessage
 from urlab_client.integrations.record.contents import Table
+from urlab_client.integrations.record.lerobot_process import LeRobot, last_line
+from urlab_client.integrations.record.phases import Progress, phases
 from urlab_client.integrations.record.pixels import even, farthest, visible
 from urlab_client.integrations.record.reader import Run
-from urlab_client.integrations.record.transitions import GOAL, Episodes, transitions_of
+from urlab_client.integrations.record.transitions import GOAL, Episodes, check_episodes, transition_pieces, with_goals
 from urlab_client.integrations.record.writer import RecordingError
+from urlab_client.protocol.base import Floats
 
 __all__ = ["write_lerobot"]
 
-_SCRIPT = Path(__file__).with_name("_lerobot_script.py")
-_DEADLINE_S = 3600.0
 _PROBE_S = 120.0
+_TOGETHER = 64  # frames that are handed over at a time
 _SLACK = 1.01  # of times that were rounded on their way
 _SLACK_S = 1e-6
 
@@ -40,7 +42,7 @@ def write_lerobot(
     video: bool = True,
     max_picture_age: float | None = None,
     episodes: Episodes = "kept",
-    progress: Callable[[int], None] | None = None,
+    progress: Progress | None = None,
 ) -> int:
     """Write a LeRobot dataset with LeRobot itself, in an interpreter that has it; return the number of frames.
 
@@ -70,46 +72,140 @@ def write_lerobot(
     """
     if folder.exists():
         raise FileExistsError(f"{folder} exists: LeRobot makes the folder itself")
+    check_episodes(episodes)
     _check(python)
-    everything = run.table(progress)
-    table = transitions_of(run, only=episodes)
     names = run.cameras() if cameras is None else list(cameras)
-    with tempfile.TemporaryDirectory(prefix="urlab-lerobot-") as temporary:
-        work = Path(temporary)
-        times = {name: _save_pictures(run, name, work / str(i), video, progress) for i, name in enumerate(names)}
+    steps = iter(phases(run.path.stat().st_size, progress, 1 + 2 * len(names)))
+    times = {name: run.picture_times(name, next(steps)) for name in names}
+    with (
+        run.stored_table(folder.parent, next(steps), fields=("qpos", "set_points")) as stored,
+        # Beside the dataset, which may be too large for where the system keeps temporary files.
+        tempfile.TemporaryDirectory(prefix=".urlab-", dir=folder.parent, ignore_cleanup_errors=True) as temporary,
+    ):
+        work, outcomes = Path(temporary), run.outcomes()
+        everything = _timeline(stored.pieces())
+        table = _timeline(transition_pieces(stored.pieces(), outcomes, episodes))
         rate = _rate(run, [*times.values()] or [everything.time]) if fps is None else fps
         rows = _resampled(table, rate, [*times.values()], _episode_starts(everything))
         if not len(rows):
             raise RecordingError(f"{run.path}: there is nothing to make a dataset of.")
+        episode, when = table.episode[rows], table.time[rows]
         limit = 1 / rate if max_picture_age is None else max_picture_age
-        pictures = [_newest(run, name, when, table.time[rows], limit) for name, when in times.items()]
-        state, action = _joined(table, "qpos"), _joined(table, "action")
-        goal = _goal(table)
-        if not np.isfinite(goal[1][rows]).all():
+        chosen = [_newest(run, name, taken, when, limit) for name, taken in times.items()]
+        if not np.isfinite(_goals_of(np.unique(episode), outcomes)).all():
             raise RecordingError(f"{run.path}: it is not known what some of its episodes were about.")
-        arrays: dict[str, Any] = {
-            "state": state[1][rows].astype(np.float32),
-            "action": action[1][rows].astype(np.float32),
-            "goal": goal[1][rows].astype(np.float32),
-            "episode": table.episode[rows],
-            **{f"picture{i}": chosen for i, chosen in enumerate(pictures)},
-        }
-        np.savez(work / "states.npz", allow_pickle=False, **arrays)
-        robots = [key.removesuffix("/action") for key in table.columns if key.endswith("/action")]
+        first = next(transition_pieces(stored.pieces(), outcomes, episodes))
+        robots = [key.removesuffix("/action") for key in first.columns if key.endswith("/action")]
         plan = {
-            "folder": str(folder.absolute()),
+            "folder": str((work / "dataset").absolute()),
+            "name": folder.name,
             "fps": rate,
             "task": task,
             "robot_type": "+".join(robots) if robot_type is None else robot_type,
-            "state": state[0],
-            "action": action[0],
-            "goal": goal[0],
+            "state": _joined(first, "qpos")[0],
+            "action": _joined(first, "action")[0],
+            "goal": _goal(first)[0],
             "cameras": [name.replace("/", ".") for name in names],
             "video": video,
         }
         (work / "plan.json").write_text(json.dumps(plan), encoding="utf-8")
-        _run(python, work)
+        pictures = [_Pictures(run, name, video, next(steps)) for name in names]
+        pieces = transition_pieces(stored.pieces(), outcomes, episodes)
+        with LeRobot(python, work) as writer:
+            for frames in _frames(pieces, rows, episode):
+                wanted = [
+                    one.take(which[frames.start : frames.stop]) for one, which in zip(pictures, chosen, strict=True)
+                ]
+                writer.add(frames.arrays | _numbered(wanted), ends_episode=frames.ends_episode)
+            writer.finish()
+        (work / "dataset").rename(folder)
     return len(rows)
+
+
+class _Timeline(NamedTuple):
+    """When states were, seconds, and in which episode; each of shape (n,)."""
+
+    time: Floats
+    episode: NDArray[np.int64]
+
+
+class _Frames(NamedTuple):
+    """Consecutive frames of one episode, and their numbers in the dataset."""
+
+    start: int
+    stop: int
+    arrays: dict[str, NDArray[Any]]
+    ends_episode: bool
+
+
+def _timeline(pieces: Iterable[Table]) -> _Timeline:
+    parts = [(piece.time, piece.episode) for piece in pieces]
+    return _Timeline(np.concatenate([time for time, _ in parts]), np.concatenate([episode for _, episode in parts]))
+
+
+def _frames(pieces: Iterable[Table], rows: NDArray[np.intp], episode: NDArray[np.int64]) -> Iterator[_Frames]:
+    """Yield the frames at some rows of a table, as many at a time as fit in memory with their pictures."""
+    ends = {*(np.flatnonzero(np.diff(episode)) + 1).tolist(), len(rows)}
+    first = start = 0
+    for piece in pieces:
+        after = int(np.searchsorted(rows, first + len(piece)))
+        values = {"state": _joined(piece, "qpos")[1], "action": _joined(piece, "action")[1], "goal": _goal(piece)[1]}
+        while start < after:
+            stop = next(i for i in range(start + 1, after + 1) if i in ends or i in {after, start + _TOGETHER})
+            own = rows[start:stop] - first
+            arrays = {name: given[own].astype(np.float32) for name, given in values.items()}
+            yield _Frames(start, stop, arrays, ends_episode=stop in ends)
+            start = stop
+        first += len(piece)
+
+
+class _Pictures:
+    """The pictures of one camera, read in their order as frames need them."""
+
+    def __init__(self, run: Run, camera: str, video: bool, progress: Progress) -> None:
+        self._run, self._camera, self._video = run, camera, video
+        self._coming = enumerate(run.encoded_pictures(camera, progress))
+        self._number = -1
+        self._far = 0.0
+        self._pixels: NDArray[np.uint8] = np.zeros((0, 0, 3), np.uint8)
+
+    def take(self, numbers: NDArray[np.intp]) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
+        """Return pictures, shape (k, H, W, 3), and which of them each of some frames shows.
+
+        Raises:
+            RecordingError: They are not all of one size, or are other ones than before.
+        """
+        wanted, places = np.unique(numbers, return_inverse=True)
+        found = [self._picture(number) for number in wanted.tolist()]
+        if any(one.shape != found[0].shape for one in found):
+            raise RecordingError(f"{self._run.path}: the pictures of {self._camera} are not all of one size.")
+        return np.stack(found), places
+
+    def _picture(self, number: int) -> NDArray[np.uint8]:
+        while self._number < number:
+            self._number, picture = next(self._coming, (number + 1, None))
+            if picture is None:
+                break
+            if self._number == number or not self._far:
+                pixels = picture.pixels()
+                self._far = self._far or farthest(pixels)
+                shown = visible(pixels, self._far)
+                self._pixels = even(shown) if self._video else shown
+        if self._number != number:
+            raise RecordingError(f"{self._run.path}: the pictures of {self._camera} are other ones than before.")
+        return self._pixels
+
+
+def _numbered(pictures: Iterable[tuple[NDArray[np.uint8], NDArray[np.intp]]]) -> dict[str, NDArray[Any]]:
+    numbered: dict[str, NDArray[Any]] = {}
+    for i, (found, places) in enumerate(pictures):
+        numbered |= {f"pictures{i}": found, f"picture{i}": places}
+    return numbered
+
+
+def _goals_of(episodes: NDArray[np.int64], outcomes: Sequence[OutcomeMessage]) -> Floats:
+    nothing = np.zeros(len(episodes))
+    return _goal(with_goals(Table(nothing, nothing, episodes, episodes, episodes, {}), outcomes))[1]
 
 
 def _check(python: str) -> None:
@@ -123,39 +219,9 @@ def _check(python: str) -> None:
         raise RecordingError(f"{python} did not import lerobot within {_PROBE_S:g} s.") from None
     if done.returncode:
         raise RecordingError(
-            f"{python} has no LeRobot: {_last_line(done.stderr)}.",
+            f"{python} has no LeRobot: {last_line(done.stderr)}.",
             hint="Make an environment for it (pip install 'lerobot[dataset]') and name its interpreter with --python.",
         )
-
-
-def _run(python: str, work: Path) -> None:
-    try:
-        done = subprocess.run(  # noqa: S603  # the user's own interpreter
-            [python, "-P", str(_SCRIPT), str(work)], capture_output=True, text=True, timeout=_DEADLINE_S, check=False
-        )
-    except subprocess.TimeoutExpired:
-        raise RecordingError(f"LeRobot did not finish within {_DEADLINE_S:g} s.") from None
-    if done.returncode:
-        raise RecordingError(f"LeRobot failed: {_last_line(done.stderr)}.")
-
-
-def _last_line(text: str) -> str:
-    lines = text.strip().splitlines()
-    return lines[-1] if lines else "it said nothing"
-
-
-def _save_pictures(
-    run: Run, camera: str, folder: Path, video: bool, progress: Callable[[int], None] | None
-) -> NDArray[np.float64]:
-    folder.mkdir()
-    times: list[float] = []
-    far = 0.0
-    for i, picture in enumerate(run.frames(camera, progress)):
-        far = far or farthest(picture.pixels)
-        pixels = visible(picture.pixels, far)
-        Image.fromarray(even(pixels) if video else pixels).save(folder / f"{i}.png", compress_level=1)
-        times.append(picture.time)
-    return np.array(times)
 
 
 def _rate(run: Run, times: list[NDArray[np.float64]]) -> int:
@@ -170,13 +236,13 @@ def _rate(run: Run, times: list[NDArray[np.float64]]) -> int:
     return round(rate)
 
 
-def _episode_starts(table: Table) -> dict[int, float]:
+def _episode_starts(table: _Timeline) -> dict[int, float]:
     episodes, first = np.unique(table.episode, return_index=True)
     return dict(zip(episodes.tolist(), table.time[first].tolist(), strict=True))
 
 
 def _resampled(
-    table: Table, fps: int, pictures: list[NDArray[np.float64]], starts: dict[int, float]
+    table: _Timeline, fps: int, pictures: list[NDArray[np.float64]], starts: dict[int, float]
 ) -> NDArray[np.intp]:
     """Return the row of the newest state at each 1/fps seconds of each episode, from its first pictures on."""
     rows: list[NDArray[np.intp]] = []
@@ -190,7 +256,7 @@ def _resampled(
             grid = first + np.arange(int((last - first) * fps + _SLACK_S) + 1) / fps
             found = np.searchsorted(table.time[own], grid + _SLACK_S, side="right") - 1
             rows.append(own[np.maximum(found, 0)])
-    return np.concatenate(rows) if rows else np.zeros(0, dtype=np.intp)
+    return np.sort(np.concatenate(rows)) if rows else np.zeros(0, dtype=np.intp)
 
 
 def _newest(

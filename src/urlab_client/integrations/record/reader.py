@@ -6,10 +6,12 @@ next to nothing of it.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import threading
-from collections.abc import Callable, Collection, Iterator, Sequence
+from array import array
+from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from pathlib import Path
 
 import msgspec
@@ -37,6 +39,7 @@ from urlab_client.integrations.record.contents import (
     describe_topic,
 )
 from urlab_client.integrations.record.index import IndexedChannel, RecordedMessage, RecordingIndex
+from urlab_client.integrations.record.stored_table import StoredTable
 from urlab_client.integrations.record.table_builder import Number, SampleTimes, TableBuilder
 from urlab_client.integrations.record.writer import RecordingError
 from urlab_client.protocol.base import Floats
@@ -141,7 +144,6 @@ class Run:
         schemas = {channel.topic: channel.schema for channel in index.channels.values()}
         states = [found for one in index.having(_STATES) if (found := index.newest(one.id)) is not None]
         gaps = [_gap(message.data) for message in self._of(index, GapMessage)]
-        outcomes = [_outcome(message.data) for message in self._of(index, OutcomeMessage)]
         ends = [time for stamps in stamps_of.values() for time in (stamps[0], stamps[-1])]
         began, ended = index.wall_span()
         return Summary(
@@ -156,7 +158,7 @@ class Run:
             dropped_frames=sum(gap.frames for gap in gaps),
             topics={topic: describe_topic(topic, schemas[topic], stamps) for topic, stamps in stamps_of.items()},
             varied=tuple(_episode(message.data) for message in self._of(index, EpisodeMessage)),
-            outcomes=tuple({outcome.episode: outcome for outcome in outcomes}.values()),
+            outcomes=self.outcomes(),
         )
 
     def table(self, progress: Callable[[int], None] | None = None, *, fields: Collection[str] | None = None) -> Table:
@@ -169,14 +171,40 @@ class Run:
         Raises:
             RecordingError: The file is not a recording, or holds two scenes, whose values do not fit one table.
         """
-        index, builder = self._index(progress), TableBuilder(fields)
-        channels = [channel.id for channel in index.having(_STATES, _ENTITIES)]
-        for message in self._messages(index, channels, progress):
-            if message.channel.schema == _STATES:
-                self._take_state(builder, message)
-            else:
-                _take_entity(builder, message)
+        builder = TableBuilder(fields)
+        self._read_states(builder, progress)
         return builder.build(broken_off=bool(self.damage))
+
+    @contextlib.contextmanager
+    def stored_table(
+        self, folder: Path, progress: Callable[[int], None] | None = None, *, fields: Collection[str] | None = None
+    ) -> Generator[StoredTable]:
+        """Yield all states in pieces, however many there are: memory holds one piece, a temporary file the others.
+
+        Args:
+            folder: Where the temporary file is: 8 bytes for each value of each state.
+            progress: Told now and then how many bytes have been read.
+            fields: Fields to return, such as `qpos`; None returns all.
+
+        Raises:
+            OSError: The temporary file cannot be written.
+            RecordingError: The file is not a recording, or holds two scenes, whose values do not fit one table.
+        """
+        with StoredTable(folder) as stored:
+            builder = TableBuilder(fields, take=stored.keep)
+            self._read_states(builder, progress)
+            stored.last = builder.build(broken_off=bool(self.damage))
+            del builder
+            yield stored
+
+    def outcomes(self) -> tuple[OutcomeMessage, ...]:
+        """Return what became of the episodes that were marked; of several marks of one episode the last.
+
+        Raises:
+            RecordingError: The file is not a recording.
+        """
+        outcomes = [_outcome(message.data) for message in self._of(self._index(), OutcomeMessage)]
+        return tuple({outcome.episode: outcome for outcome in outcomes}.values())
 
     def time_range(self) -> tuple[float, float]:
         """Return the times of the first and of the last state, seconds of the recording's clock; 0, 0 without states.
@@ -249,6 +277,17 @@ class Run:
         cameras = [channel for channel in index.having(*_PICTURES) if index.first(channel.id) is not None]
         return list(dict.fromkeys(channel.topic.removeprefix(_CAMERA) for channel in cameras))
 
+    def picture_times(self, camera: str, progress: Callable[[int], None] | None = None) -> Floats:
+        """Return the times of the pictures that `frames` would return, seconds of the recording's clock, in its order.
+
+        Raises:
+            KeyError: There are no pictures of it.
+            RecordingError: The file is not a recording.
+        """
+        channels = [channel.id for channel in self._camera(camera)]
+        times = array("q", (one.log_time for one in self._messages(self._index(progress), channels, progress)))
+        return np.array(times, dtype=np.int64) / _NS
+
     def frames(self, camera: str, progress: Callable[[int], None] | None = None) -> Iterator[Camera]:
         """Iterate over the pictures of a camera, `ARTICULATION/CAMERA` or a scene-level name.
 
@@ -256,10 +295,18 @@ class Run:
             KeyError: There are no pictures of it.
             RecordingError: The file is not a recording.
         """
-        channels = self._camera(camera)
-        for message in self._messages(self._index(progress), [channel.id for channel in channels], progress):
-            picture = _picture(message)
+        for picture in self.encoded_pictures(camera, progress):
             yield Camera(picture.time, picture.pixels())
+
+    def encoded_pictures(self, camera: str, progress: Callable[[int], None] | None = None) -> Iterator[RecordedPicture]:
+        """Iterate over the pictures of a camera as they are in the file.
+
+        Raises:
+            KeyError: There are no pictures of it.
+            RecordingError: The file is not a recording.
+        """
+        channels = [channel.id for channel in self._camera(camera)]
+        yield from map(_picture, self._messages(self._index(progress), channels, progress))
 
     def picture_at(self, camera: str, time: float) -> Camera | None:
         """Return the newest picture of a camera that is not after a time, None if there is none yet.
@@ -320,6 +367,15 @@ class Run:
 
     def _of(self, index: RecordingIndex, kind: type[msgspec.Struct]) -> Iterator[RecordedMessage]:
         return self._messages(index, [channel.id for channel in index.having(schema_name(kind))])
+
+    def _read_states(self, builder: TableBuilder, progress: Callable[[int], None] | None) -> None:
+        index = self._index(progress)
+        channels = [channel.id for channel in index.having(_STATES, _ENTITIES)]
+        for message in self._messages(index, channels, progress):
+            if message.channel.schema == _STATES:
+                self._take_state(builder, message)
+            else:
+                _take_entity(builder, message)
 
     def _take_state(self, builder: TableBuilder, message: RecordedMessage) -> None:
         state, key = _state(message.data), message.channel.topic.removeprefix(_ARTICULATION)

@@ -1,9 +1,12 @@
-"""States one after the other to a table, in arrays that grow: an overnight recording holds millions."""
+"""States one after the other to a table, in arrays that grow: an overnight recording holds millions.
+
+A table that is too large for memory is given away in pieces while it grows.
+"""
 
 from __future__ import annotations
 
 from array import array
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, TypeAlias
 
@@ -15,7 +18,10 @@ from urlab_client.integrations._feed.scene_messages import SceneLayout
 from urlab_client.integrations.record.contents import Column, Table
 from urlab_client.protocol.base import Floats
 
-__all__ = ["Number", "SampleTimes", "TableBuilder"]
+__all__ = ["PIECE_VALUES", "Number", "SampleTimes", "TableBuilder"]
+
+PIECE_VALUES = 1 << 21
+"""How many numbers a piece of a table holds, about: 16 MiB."""
 
 Number: TypeAlias = float | Literal["NaN", "Infinity", "-Infinity"]
 """A number as it is read: what JSON lacks is text."""
@@ -51,6 +57,10 @@ class _Values:
         self._fill(count * self.width)
         return np.frombuffer(self._numbers, np.float64)[: count * self.width].reshape(count, self.width)
 
+    def clear(self) -> None:
+        """Begin anew, with rows of the same width."""
+        self._numbers = array("d")
+
     def _fill(self, size: int) -> None:
         missing = size - len(self._numbers)
         if missing > 0:
@@ -80,13 +90,21 @@ class TableBuilder:
 
     Args:
         only: Fields to keep, such as `qpos`; None keeps all.
+        take: Takes each full piece of the table, which is then forgotten here; None keeps all. A later piece may have
+            more columns, and wider ones.
     """
 
-    def __init__(self, only: Collection[str] | None = None) -> None:
+    def __init__(self, only: Collection[str] | None = None, take: Callable[[Table], None] | None = None) -> None:
         self._only = only
+        self._take = take
+        self._sources: dict[str, _Source] = {}
+        self._taken_last: frozenset[str] = frozenset()
+        self._begin()
+
+    def _begin(self) -> None:
         self._samples = array("q")
         self._times: tuple[array[float], ...] = tuple(array(kind) for kind in ("q", "d", "q", "q", "q"))
-        self._sources: dict[str, _Source] = {}
+        self._size = 0
 
     def source(self, key: str, layout: SceneLayout) -> _Source:
         """Return the samples of an articulation or entity up to now."""
@@ -95,19 +113,23 @@ class TableBuilder:
     def add(self, source: _Source, sample: int, times: SampleTimes, **fields: Sequence[Number]) -> None:
         """Add a part of a sample."""
         if not self._samples or sample != self._samples[-1]:
+            if self._take is not None and self._size >= PIECE_VALUES:
+                self._give(self._take)
             self._samples.append(sample)
             for column, value in zip(self._times, times, strict=True):
                 column.append(value)
+            self._size += len(times)
         row = len(source.samples)
         source.samples.append(sample)
         for name, values in fields.items():
             if values and (self._only is None or name in self._only):
                 source.fields.setdefault(name, _Values()).put(row, values)
+                self._size += len(values)
 
     def build(self, *, broken_off: bool) -> Table:
-        """Return the table, without the last sample if that is not whole."""
+        """Return the table, or what has not been taken of it, without the last sample if that is not whole."""
         count = len(self._samples)
-        if broken_off and count > 1 and self._last_is_partial():
+        if broken_off and self._last_is_partial():
             count -= 1
         samples = np.frombuffer(self._samples, np.int64)[:count] if count else np.zeros(0, np.int64)
         log_ns, sim_time, wall_ns, step, episode = (np.array(column[:count]) for column in self._times)
@@ -127,11 +149,26 @@ class TableBuilder:
             columns=columns,
         )
 
+    def _give(self, take: Callable[[Table], None]) -> None:
+        take(self.build(broken_off=False))
+        last = self._samples[-1]
+        self._taken_last = frozenset(key for key, source in self._sources.items() if last in source.samples[-1:])
+        for source in self._sources.values():
+            source.samples = array("q")
+            for values in source.fields.values():
+                values.clear()
+        self._begin()
+
     def _last_is_partial(self) -> bool:
         """Return whether one that is in the sample before is not in the last."""
-        last, before = self._samples[-1], self._samples[-2]
-        went_on = [source.samples for source in self._sources.values() if before in source.samples[-2:]]
-        return any(samples[-1] != last for samples in went_on)
+        if not self._samples:
+            return False
+        last = self._samples[-1]
+        before = self._taken_last
+        if len(self._samples) > 1:
+            earlier = self._samples[-2]
+            before = frozenset(key for key, source in self._sources.items() if earlier in source.samples[-2:])
+        return any(self._sources[key].samples[-1:] != array("q", [last]) for key in before)
 
 
 def _column(source: _Source, name: str, rows: Floats, places: NDArray[np.intp], count: int) -> Column:

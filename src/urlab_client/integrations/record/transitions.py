@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -13,7 +13,7 @@ from urlab_client.integrations._feed.messages import OutcomeMessage
 from urlab_client.integrations.record.contents import Column, Table
 from urlab_client.integrations.record.reader import Run
 
-__all__ = ["GOAL", "Episodes", "transitions", "transitions_of"]
+__all__ = ["GOAL", "Episodes", "check_episodes", "transition_pieces", "transitions", "transitions_of", "with_goals"]
 
 Episodes = Literal["kept", "success", "all"]
 """Which episodes: those that were not discarded, successes alone, or all."""
@@ -39,18 +39,44 @@ def transitions_of(run: Run, *, only: Episodes = "kept", progress: Callable[[int
         ValueError: `only` is none of these.
         RecordingError: The file is not a recording.
     """
+    check_episodes(only)
+    table = transitions(run.table(progress))
+    return _chosen(table, run.outcomes(), only)
+
+
+def transition_pieces(pieces: Iterable[Table], outcomes: Sequence[OutcomeMessage], only: Episodes) -> Iterator[Table]:
+    """Yield what `transitions_of` returns, from consecutive pieces of a table; each has rows of one or two pieces."""
+    before: Table | None = None
+    for piece in pieces:
+        if not _acting(piece):
+            yield _chosen(piece, outcomes, only)
+            continue
+        # The last state of a piece is kept until it is known what follows it.
+        whole = piece if before is None else _one_after_the_other(before, piece)
+        yield _chosen(transitions(whole), outcomes, only)
+        before = _rows(whole, np.arange(len(whole))[-1:])
+
+
+def check_episodes(only: Episodes) -> None:
+    """Check which episodes are wanted.
+
+    Raises:
+        ValueError: `only` is none of the values that it may have.
+    """
     if only not in ("kept", "success", "all"):
         raise ValueError(f"only must be kept, success or all, not {only!r}")
-    table, outcomes = transitions(run.table(progress)), run.summary().outcomes
+
+
+def _chosen(table: Table, outcomes: Sequence[OutcomeMessage], only: Episodes) -> Table:
     if only != "all" and outcomes:
         wanted = {"success"} if only == "success" else {"success", "failure"}
         kept = [mark.episode for mark in outcomes if mark.outcome in wanted]
         table = _rows(table, np.flatnonzero(np.isin(table.episode, kept)))
-    return _with_goals(table, outcomes)
+    return with_goals(table, outcomes)
 
 
-def _with_goals(table: Table, outcomes: Iterable[OutcomeMessage]) -> Table:
-    """Add what episodes were about; NaN for those of which it is not known."""
+def with_goals(table: Table, outcomes: Iterable[OutcomeMessage]) -> Table:
+    """Return a table with what its episodes were about; NaN for those of which it is not known."""
     goals = {mark.episode: mark.goal for mark in outcomes}
     widths = {name: len(values) for goal in goals.values() for name, values in goal.items()}
     columns = dict(table.columns)
@@ -73,7 +99,7 @@ def transitions(table: Table) -> Table:
     Returns:
         A table with columns `ARTICULATION/action`, named as `ARTICULATION/set_points`, after all others.
     """
-    keys = [key.removesuffix(_SET_POINTS) for key in table.columns if key.endswith(_SET_POINTS)]
+    keys = _acting(table)
     if not keys:
         return table
     acted = np.flatnonzero((np.diff(table.episode) == 0) & (np.diff(table.sim_time) > 0))
@@ -84,13 +110,15 @@ def transitions(table: Table) -> Table:
     return found
 
 
+def _acting(table: Table) -> list[str]:
+    """Return the articulations that have set-points."""
+    return [key.removesuffix(_SET_POINTS) for key in table.columns if key.endswith(_SET_POINTS)]
+
+
 def _rows(table: Table, rows: NDArray[np.intp]) -> Table:
-    return replace(
-        table,
-        columns={key: replace(column, values=column.values[rows]) for key, column in table.columns.items()},
-        time=table.time[rows],
-        sim_time=table.sim_time[rows],
-        wall_ns=table.wall_ns[rows],
-        step=table.step[rows],
-        episode=table.episode[rows],
-    )
+    return table.with_arrays({key: values[rows] for key, values in table.arrays().items()})
+
+
+def _one_after_the_other(first: Table, second: Table) -> Table:
+    rest = second.arrays()
+    return second.with_arrays({key: np.concatenate((values, rest[key])) for key, values in first.arrays().items()})

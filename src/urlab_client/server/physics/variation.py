@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 from functools import partial
-from typing import Final
 
 import mujoco
 import numpy as np
@@ -20,16 +19,6 @@ from urlab_client.server.physics.articulations import Articulations
 from urlab_client.server.physics.controllers import PDController
 
 __all__ = ["SceneVariation"]
-
-_VISIBLE: Final = {
-    "light_diffuse": (),
-    "geom_rgba": (),
-    "cam_fovy": (),
-    "light_pos": ("light_pos0", "light_poscom0"),
-    "cam_pos": ("cam_pos0", "cam_poscom0"),
-    "cam_quat": ("cam_mat0",),
-}
-"""Fields that pictures depend on, with what `mj_setConst` computes from them."""
 
 
 class SceneVariation:
@@ -65,9 +54,7 @@ class SceneVariation:
     @property
     def visible_fields(self) -> tuple[str, ...]:
         """Varied fields of the model that pictures depend on."""
-        return tuple(
-            name for field, derived in _VISIBLE.items() if field in self._variation.fields for name in (field, *derived)
-        )
+        return self._variation.visible_fields
 
     def begin(self, seed: int | None) -> None:
         """Write the model of the next episode; the data, which are used for it, have to be reset after that.

@@ -28,7 +28,8 @@ from urlab_client.protocol.messages.cameras import CameraDelayInForce
 from urlab_client.protocol.messages.session import CameraChoice, CameraFrame
 from urlab_client.server.compile.scene import CompiledScene
 from urlab_client.server.compile.scene_index import SceneCamera
-from urlab_client.server.render.drawing import RenderQuality, Stage
+from urlab_client.server.render.appearance import Appearance, RenderQuality
+from urlab_client.server.render.drawing import Stage
 from urlab_client.server.render.latency import Instant, Latency, Past
 from urlab_client.server.render.opengl import RenderingUnavailable, need_backend, search_backend
 from urlab_client.server.render.tints import Tints
@@ -187,8 +188,7 @@ class CameraRenderer:
         self,
         scene: CompiledScene,
         modes: Mapping[tuple[str, str], CameraMode],
-        classes: Mapping[str, str],
-        quality: RenderQuality = "auto",
+        appearance: Appearance,
         health: Health | None = None,
         *,
         names: Mapping[str, str] = MappingProxyType({}),
@@ -200,8 +200,7 @@ class CameraRenderer:
         Args:
             scene: The scene.
             modes: What the pixels mean by articulation key and camera name; the others are `real`.
-            classes: By actor name, the class or mesh that the colours of `semantic` and `instance` go by.
-            quality: How well to draw.
+            appearance: What pictures depend on besides the model.
             health: Told when the thread that draws dies.
             names: What articulations are called in requests and replies, by key; that, for those not mentioned.
             varied: Fields of the model that pictures depend on, and that change from reset to reset.
@@ -209,8 +208,9 @@ class CameraRenderer:
         """
         self._scene = scene
         self._health = Health() if health is None else health
-        self._quality: RenderQuality = quality
-        self._tints = Tints(scene, classes)
+        self._quality: RenderQuality = appearance.quality
+        owners = {body: index.key for index in scene.articulations for body in index.bodies.tolist()}
+        self._tints = Tints(scene.model, appearance.classes, owners)
         self._stamped = dialect.camera_forms
         self._by_name: dict[str, _Camera] = {}
         self._bare: dict[str, _Camera] = {}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 from types import TracebackType
-from typing import Any, Final, Literal, Self, TypeAlias
+from typing import Any, Final, Self
 
 import mujoco
 import numpy as np
@@ -15,6 +15,7 @@ from urlab_client.protocol.enums import CameraMode
 from urlab_client.protocol.messages.session import CameraFrame
 from urlab_client.server.compile.scene_index import SceneCamera
 from urlab_client.server.editor.viewport import ViewMode
+from urlab_client.server.render.appearance import RenderQuality
 from urlab_client.server.render.opengl import Backend, free_context, make_context
 from urlab_client.server.render.sunlight import follow_subject, moving_geoms, shadow_clip
 from urlab_client.server.render.tints import Tints
@@ -29,13 +30,9 @@ from urlab_client.server.render.viewport_picture import (
     showing,
 )
 
-__all__ = ["NO_HIT_CM", "RenderQuality", "Stage", "simplify_textures"]
+__all__ = ["NO_HIT_CM", "Stage", "simplify_textures"]
 
 Bytes = NDArray[np.uint8]
-
-RenderQuality: TypeAlias = Literal["auto", "fast", "high"]
-"""`fast` leaves out smooth edges, shadows, reflections and blending between mipmaps, and draws round shapes a little
-coarser; `high` does not; `auto` is `fast` where the processor draws and `high` elsewhere."""
 
 
 NO_HIT_CM: Final = 1e8
@@ -106,6 +103,23 @@ class Stage:
 
     def draw(self, data: mujoco.MjData, camera: SceneCamera, mode: CameraMode) -> CameraFrame:
         """Draw what a camera sees."""
+        width, height = camera.resolution
+        pixels = self.pixels(data, camera, mode)
+        dtype = "float32" if mode is CameraMode.DEPTH else "bgra8"
+        return CameraFrame(width=width, height=height, dtype=dtype, data=pixels.tobytes())
+
+    def pixels(self, data: mujoco.MjData, camera: SceneCamera, mode: CameraMode) -> NDArray[Any]:
+        """Draw what a camera sees; return it from the top, as the wire has it.
+
+        Args:
+            data: The state, after `prepare`.
+            camera: The camera.
+            mode: What the pixels mean.
+
+        Returns:
+            Blue, green, red and alpha, shape (height, width, 4), uint8; of depth centimetres, shape (height, width),
+            float32.
+        """
         self._view.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._view.fixedcamid = camera.id
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
@@ -124,12 +138,12 @@ class Stage:
         if mode is CameraMode.DEPTH:
             depth = np.empty((height, width), np.float32)
             mujoco.mjr_readPixels(None, depth, area, self._renderer)
-            return _frame(camera, "float32", _centimetres(depth, self._scene.camera[0])[::-1])
+            return _centimetres(depth, self._scene.camera[0])[::-1]
         if mode is CameraMode.REAL:
-            return _frame(camera, "bgra8", self._read_colors(area, "BGRA"))
+            return self._read_colors(area, "BGRA")
         colors = np.empty((height, width, 3), np.uint8)
         mujoco.mjr_readPixels(colors, None, area, self._renderer)
-        return _frame(camera, "bgra8", self._segments(colors[::-1], mode))
+        return self._segments(colors[::-1], mode)
 
     def paint(self, data: mujoco.MjData, picture: ViewportPicture) -> Bytes:
         """Draw the viewport; return red, green, blue and alpha from the top, shape (height, width, 4)."""
@@ -236,8 +250,3 @@ def _centimetres(depth: NDArray[np.float32], camera: Any) -> NDArray[np.float32]
         scale = np.float32(0.5) * (far + near) / (far - near) - np.float32(0.5)
         metres = np.float32(2.0) * far * near / (far - near) * np.float32(0.5) / (depth.astype(np.float64) + scale)
     return np.where(depth > 0.0, metres * 100.0, NO_HIT_CM).astype("<f4")
-
-
-def _frame(camera: SceneCamera, dtype: str, pixels: NDArray[Any]) -> CameraFrame:
-    width, height = camera.resolution
-    return CameraFrame(width=width, height=height, dtype=dtype, data=pixels.tobytes())

@@ -14,11 +14,11 @@ import zlib
 from collections.abc import Mapping
 from functools import cached_property
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from urlab_client.protocol.enums import CameraMode
-from urlab_client.server.compile.scene import CompiledScene
 
 __all__ = ["Tints", "tint"]
 
@@ -28,9 +28,17 @@ Bytes = NDArray[np.uint8]
 class Tints:
     """Whose the geoms are, and their colours in the segmentation modes, blue, green, red."""
 
-    def __init__(self, scene: CompiledScene, classes: Mapping[str, str]) -> None:
-        self._scene = scene
+    def __init__(self, model: mujoco.MjModel, classes: Mapping[str, str], bodies: Mapping[int, str]) -> None:
+        """Prepare for a model.
+
+        Args:
+            model: The compiled scene.
+            classes: By actor name, the class or mesh that its colour goes by.
+            bodies: By body id the articulation that it is of, by its actor name; the others' names tell.
+        """
+        self._model = model
         self._classes = classes
+        self._bodies = bodies
         self._found: dict[CameraMode, Bytes] = {}
 
     def of(self, mode: CameraMode) -> Bytes:
@@ -46,17 +54,16 @@ class Tints:
     @cached_property
     def _owners(self) -> list[str]:
         """Name of the actor that a geom belongs to; empty for none."""
-        model = self._scene.model
-        bodies: dict[int, str] = {entity.body: self._owner(entity.name) for entity in self._scene.entities}
-        for index in self._scene.articulations:
-            bodies.update(dict.fromkeys(index.bodies.tolist(), index.key))
+        model = self._model
         return [
-            bodies.get(body) or self._owner(model.geom(geom).name)
+            self._bodies.get(body)
+            or (self._owner(model.body(body).name) if body else "")
+            or self._owner(model.geom(geom).name)
             for geom, body in enumerate(model.geom_bodyid.tolist())
         ]
 
     def _compute(self, mode: CameraMode) -> Bytes:
-        model = self._scene.model
+        model = self._model
         colors = np.zeros((model.ngeom, 3), np.uint8)
         for geom, (owner, body) in enumerate(zip(self._owners, model.geom_bodyid.tolist(), strict=True)):
             if owner:

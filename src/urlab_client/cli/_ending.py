@@ -1,0 +1,19 @@
+"""How a command is told to end."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+from collections.abc import Generator
+
+__all__ = ["sigterm_interrupts"]
+
+
+@contextlib.contextmanager
+def sigterm_interrupts() -> Generator[None]:
+    """Let SIGTERM end the body as SIGINT does, so that it clears up what it has begun."""
+    before = signal.signal(signal.SIGTERM, lambda _number, _frame: signal.raise_signal(signal.SIGINT))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -1,0 +1,96 @@
+"""Requests that are being answered when their server ends: each is broken off in good order, without a traceback."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from starlette.responses import JSONResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from urlab_client.web.route_group import JOB
+
+__all__ = ["RunningRequests"]
+
+log: logging.Logger = logging.getLogger("urlab_client.web")
+
+
+@dataclass(eq=False)
+class _Request:
+    task: asyncio.Task[Any]
+    scope: Scope
+    begun: bool = False
+    """Whether its answer has begun."""
+    answered: bool = False
+    """Whether it has been sent whole."""
+
+
+class RunningRequests:
+    """An ASGI application that passes everything on to another one, and knows what runs.
+
+    Args:
+        application: The other one.
+    """
+
+    def __init__(self, application: ASGIApp) -> None:
+        self._application = application
+        self._running: set[_Request] = set()
+        self._connections: Iterable[Any] | None = None
+
+    def break_off(self, connections: Iterable[Any]) -> None:
+        """Break off what runs, and warn of it.
+
+        Args:
+            connections: Those of uvicorn, to cut the ones that wait for the rest of an answer.
+        """
+        self._connections = list(connections)
+        for request in self._running:
+            request.task.cancel()
+            job = request.scope.get(JOB)
+            if job is None and request.scope["type"] == "http" and request.scope["method"] != "GET":
+                job = f"{request.scope['method']} {request.scope['path']}"
+            if job is not None and not request.answered:
+                log.warning("%s was broken off", job)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request or serve a WebSocket."""
+        task = asyncio.current_task()
+        if scope["type"] == "lifespan" or task is None:
+            await self._application(scope, receive, send)
+            return
+        request = _Request(task, scope)
+
+        async def sending(message: Message) -> None:
+            request.begun = True
+            await send(message)
+            request.answered = message["type"] == "http.response.body" and not message.get("more_body", False)
+
+        self._running.add(request)
+        try:
+            await self._application(scope, receive, sending)
+        except asyncio.CancelledError:
+            if self._connections is None:
+                raise
+            # The task has nothing left to do but what follows; what leaves it uvicorn would show as a failure.
+            task.uncancel()
+            await self._end(request, receive, send)
+        finally:
+            self._running.discard(request)
+
+    async def _end(self, request: _Request, receive: Receive, send: Send) -> None:
+        http = request.scope["type"] == "http"
+        if request.answered:
+            return
+        if http and not request.begun:
+            said = {"code": "ended", "message": "The console ended before this was done.", "hint": ""}
+            await JSONResponse({"error": said}, 503)(request.scope, receive, send)
+            return
+        for connection in self._connections or ():
+            if connection.client == request.scope["client"]:
+                connection.transport.abort()
+        # Of an answer that has begun uvicorn says that it was not completed, unless its connection has gone by then.
+        while http and (await receive())["type"] != "http.disconnect":
+            pass

@@ -1,0 +1,134 @@
+"""Recordings that need not fit in memory: tables in pieces, conversions of them, and conversions that break off."""
+
+from __future__ import annotations
+
+import os
+import signal
+import struct
+import tracemalloc
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from made_recordings import Robot, write_recording
+
+from urlab_client._whole_files import replaced
+from urlab_client.cli import main
+from urlab_client.integrations.record import Run, export, read_run, table_builder
+from urlab_client.integrations.record.transitions import transition_pieces, transitions_of
+
+
+def changing(count: int) -> Iterator[tuple[dict[str, Robot], dict[str, list[float]]]]:
+    """States of a scene in which a robot and an entity come later, and a sensor gets wider."""
+    for i in range(count):
+        readings = {"touch": [0.5] if i < 23 else [0.5, float(i)]}
+        late = {"late": Robot([i / 3, 1.0])} if i > 31 and i % 7 else {}
+        yield {"arm": Robot([i / 7], readings), **late}, {"box": [float(i), 0.0, 0.0]} if i > 41 else {}
+
+
+def steady(count: int) -> Iterator[tuple[dict[str, Robot], dict[str, list[float]]]]:
+    return (({"arm": Robot([float(i)] * 20)}, {}) for i in range(count))
+
+
+def test_pieces_make_the_whole_table_also_when_columns_come_late_or_the_end_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "run.mcap"
+    write_recording(file, changing(70), episode_length=20, chunk_size=350)
+    partial = set[bool]()
+    size = file.stat().st_size
+    (messages_end,) = struct.unpack("<Q", file.read_bytes()[-28:-20])
+    for end in (size, *range(messages_end - 50, messages_end - 1000, -200)):
+        os.truncate(file, end)
+        run = read_run(file)
+        whole, pairs = run.table(), transitions_of(run)
+        partial.add(len(whole) < run.summary().topics["/state/arm"].messages)
+        assert {"arm/sensors", "late/qpos", "box/pose"} <= whole.columns.keys()
+        for values in (1, 150):
+            monkeypatch.setattr(table_builder, "PIECE_VALUES", values)
+            with run.stored_table(tmp_path) as stored:
+                assert len(stored) == len(whole)
+                pieces = [*stored.pieces()]
+                assert len(pieces) > 5
+                found = [*transition_pieces(pieces, (), "kept")]
+                for name, expected in whole.arrays().items():
+                    assert np.concatenate([*stored.parts(name)]).tobytes() == expected.tobytes()
+                for name, expected in pairs.flat().items():
+                    assert np.concatenate([piece.flat()[name] for piece in found]).tobytes() == expected.tobytes()
+                assert [(one.names, one.quantities) for one in stored.last.columns.values()] == [
+                    (one.names, one.quantities) for one in whole.columns.values()
+                ]
+    assert partial == {False, True}, "some of the files end in the middle of a state"
+    assert os.listdir(tmp_path) == [file.name]
+
+
+@pytest.mark.parametrize("kind", ["csv", "npz", "parquet"])
+def test_a_long_recording_is_converted_in_the_memory_of_a_short_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    monkeypatch.setattr(table_builder, "PIECE_VALUES", 2000)
+    file, write = tmp_path / "run.mcap", getattr(export, f"write_{kind}")
+    peaks: list[int] = []
+    for count in (200, 200, 1600):  # the first time imports what the conversion needs
+        write_recording(file, steady(count), episode_length=10**6, chunk_size=20_000)
+        run = read_run(file)
+        tracemalloc.start()
+        try:
+            write(run, tmp_path / f"run.{kind}")
+            peaks.append(tracemalloc.get_traced_memory()[1])
+        finally:
+            tracemalloc.stop()
+    _, short, long = peaks
+    assert long - short < 1400 * 40 * 8 / 2, "half of what the values of the other states take"
+
+
+@pytest.mark.parametrize("kind", ["csv", "npz", "parquet"])
+def test_a_conversion_that_breaks_off_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    monkeypatch.setattr(table_builder, "PIECE_VALUES", 500)
+    source, folder = tmp_path / "run.mcap", tmp_path / "made"
+    folder.mkdir()
+    write_recording(source, steady(100), chunk_size=5000)
+    run, target, write = read_run(source), folder / f"run.{kind}", getattr(export, f"write_{kind}")
+    told: list[int] = []
+    write(run, target, progress=told.append)
+    assert told == sorted(told)
+    assert source.stat().st_size / 2 < max(told) <= source.stat().st_size
+    target.write_bytes(b"precious")
+    for limit in (1, (len(told) + 1) // 2, len(told)):
+        with pytest.raises(KeyboardInterrupt):
+            write(run, target, progress=interrupting(limit))
+        assert os.listdir(folder) == [target.name]
+        assert target.read_bytes() == b"precious"
+
+
+def interrupting(limit: int) -> Any:
+    """Return what presses Ctrl-C when it is told for the last of some times."""
+    left = iter(range(limit - 1))
+
+    def progress(_: int) -> None:
+        if next(left, None) is None:
+            signal.raise_signal(signal.SIGINT)
+
+    return progress
+
+
+def test_a_conversion_that_is_terminated_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_recording(tmp_path / "run.mcap", steady(10))
+
+    def half(_run: Run, path: Path, *_: Any, **__: Any) -> int:
+        with replaced(path) as temporary:
+            temporary.write_text("half", encoding="utf-8")
+            signal.raise_signal(signal.SIGTERM)
+        return 0
+
+    monkeypatch.setattr(export, "write_csv", half)
+    before = signal.signal(signal.SIGTERM, signal.SIG_IGN)  # where it is not heeded the file is made
+    try:
+        assert main(["convert", str(tmp_path / "run.mcap"), str(tmp_path / "run.csv")]) == 130
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert os.listdir(tmp_path) == ["run.mcap"]

@@ -1,0 +1,83 @@
+"""Recordings written without a simulation: long ones, and such as a scene that changes leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from mcap.writer import CompressionType, Writer
+
+from urlab_client.integrations._feed.messages import (
+    ArticulationMessage,
+    EntityMessage,
+    Time,
+    encode,
+    schema_name,
+    schema_of,
+)
+
+PERIOD_NS = 10_000_000
+
+
+class Robot:
+    """One articulation at one moment: joint positions, and readings of sensors."""
+
+    def __init__(self, qpos: list[float], sensors: Mapping[str, list[float]] | None = None) -> None:
+        self.qpos = qpos
+        self.sensors = dict(sensors or {})
+
+
+def write_recording(
+    path: Path,
+    samples: Iterable[tuple[Mapping[str, Robot], Mapping[str, list[float]]]],
+    *,
+    episode_length: int = 100,
+    chunk_size: int = 1 << 20,
+) -> None:
+    """Write samples, each of articulations by key and of positions of entities by name, 100 a second."""
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=chunk_size, compression=CompressionType.ZSTD)
+        writer.start(profile="", library="tests")
+        schemas = {
+            kind: writer.register_schema(schema_name(kind), "jsonschema", schema_of(kind))
+            for kind in (ArticulationMessage, EntityMessage)
+        }
+        channels: dict[str, int] = {}
+        for sample, (robots, entities) in enumerate(samples):
+            stamp = Time.of(sample * PERIOD_NS)
+            episode, step = divmod(sample, episode_length)
+            for key, robot in robots.items():
+                message = ArticulationMessage(
+                    timestamp=stamp,
+                    sim_time=step * PERIOD_NS / 1e9,
+                    sample=sample,
+                    step=step,
+                    episode=episode,
+                    wall_time=stamp,
+                    qpos=robot.qpos,
+                    qvel=robot.qpos,
+                    set_points=[float(sample)],
+                    ctrl=[float(sample)],
+                    act=[],
+                    sensors=robot.sensors,
+                )
+                topic = f"/state/{key}"
+                if topic not in channels:
+                    channels[topic] = writer.register_channel(topic, "json", schemas[ArticulationMessage])
+                writer.add_message(channels[topic], sample * PERIOD_NS, encode(message), 0)
+            for name, position in entities.items():
+                pose = EntityMessage(
+                    timestamp=stamp,
+                    sim_time=step * PERIOD_NS / 1e9,
+                    sample=sample,
+                    step=step,
+                    episode=episode,
+                    position=position,
+                    orientation=[1.0, 0.0, 0.0, 0.0],
+                    qvel=[],
+                )
+                topic = f"/entity/{name}"
+                if topic not in channels:
+                    channels[topic] = writer.register_channel(topic, "json", schemas[EntityMessage])
+                writer.add_message(channels[topic], sample * PERIOD_NS, encode(pose), 0)
+        writer.finish()

@@ -1,0 +1,132 @@
+"""What a console does that ends, or whose browser leaves, while it converts, takes in and hands out files."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import tempfile
+import threading
+from collections.abc import AsyncGenerator, Callable
+from pathlib import Path
+
+import pytest
+from made_recordings import Robot, write_recording
+from waiting import until
+
+from urlab_client.aio import URLabClient
+from urlab_client.cli._pages import bound, serve
+from urlab_client.integrations.record import Run, export
+from urlab_client.server import SimulatedServer
+from urlab_client.web import Access, app, model_upload
+
+LONG = "long.mcap"
+
+
+@contextlib.asynccontextmanager
+async def console(folder: Path, ended: asyncio.Event) -> AsyncGenerator[tuple[int, str]]:
+    """Serve a console as `urlab console` does, and give its port and a key; wait until it has ended."""
+    access, started = Access(), asyncio.Event()
+    with SimulatedServer("arm", play=True) as server, bound("127.0.0.1", 0) as listener:
+        port = listener.getsockname()[1]
+        async with URLabClient(**server.client_options()) as client:
+            site = app(client, access=access, recordings=folder)
+            serving = asyncio.create_task(serve(site, listener, started.set, ended))
+            await started.wait()
+            key = access.admit(access.invite())
+            assert key is not None
+            yield port, key
+            await serving
+
+
+async def ask(port: int, key: str, head: str, body: bytes = b"") -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    reader, writer = await asyncio.open_connection("127.0.0.1", port, limit=1024)
+    writer.write(f"{head} HTTP/1.1\r\nhost: localhost\r\nauthorization: Bearer {key}\r\n".encode())
+    writer.write(f"content-length: {1000 if body else 0}\r\n\r\n".encode() + body)
+    await writer.drain()
+    return reader, writer
+
+
+@pytest.fixture
+def converting(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
+    """A conversion that writes half a file, says so, and goes on until its progress breaks it off."""
+    begun = threading.Event()
+
+    def write(_run: Run, path: Path, progress: Callable[[int], None]) -> int:
+        path.write_text("half", encoding="utf-8")
+        begun.set()
+        while True:
+            progress(0)
+
+    monkeypatch.setattr(export, "write_csv", write)
+    return begun
+
+
+@pytest.fixture
+def unpacking(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A model's archive that takes as long to unpack; return the folder for temporary files."""
+
+    def unpack(_archive: Path, folder: Path, progress: Callable[[int], None]) -> Path:
+        folder.mkdir()
+        while True:
+            progress(0)
+            (folder / "part").touch()
+
+    monkeypatch.setattr(model_upload, "_unpacked", unpack)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path.parent / f"{tmp_path.name}-temporary"))
+    Path(tempfile.gettempdir()).mkdir()
+    return Path(tempfile.gettempdir())
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A recording, and a file too large for what sockets hold."""
+    write_recording(tmp_path / "short.mcap", [({"arm": Robot([0.0])}, {})])
+    (tmp_path / LONG).touch()
+    os.truncate(tmp_path / LONG, 100_000_000)
+    return tmp_path
+
+
+async def test_ending_breaks_off_what_takes_long_without_a_trace(
+    folder: Path, converting: threading.Event, unpacking: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    ended = asyncio.Event()
+    with caplog.at_level(logging.WARNING):
+        async with console(folder, ended) as (port, key):
+            importing = await ask(port, key, "PUT /api/models/robot.zip", b"P" * 1000)
+            uploading = await ask(port, key, "PUT /api/recordings/other.mcap", b"some")
+            again = await ask(port, key, "PUT /api/recordings/other.mcap", b"more")
+            conversion = await ask(port, key, "GET /api/recordings/short.mcap?as=csv")
+            download = await ask(port, key, f"GET /api/recordings/{LONG}")
+            assert await download[0].readline() == b"HTTP/1.1 200 OK\r\n"
+            await until(lambda: converting.is_set() and len(os.listdir(folder)) == 5 and any(unpacking.rglob("part")))
+            ended.set()
+            for reader, _ in (conversion, uploading, again, importing):
+                assert await reader.readline() == b"HTTP/1.1 503 Service Unavailable\r\n"
+    assert sorted(record.getMessage() for record in caplog.records) == [
+        "the conversion of short.mcap to csv was broken off",
+        f"the download of {LONG} was broken off",
+        "the import of robot.zip was broken off",
+        *["the upload of other.mcap was broken off"] * 2,
+    ]
+    assert sorted(os.listdir(folder)) == [LONG, "short.mcap"]
+    assert [name for name in os.listdir(unpacking) if name.startswith("urlab-model-")] == []
+    for _, writer in (importing, uploading, again, conversion, download):
+        writer.close()
+
+
+async def test_a_browser_that_leaves_ends_what_was_made_for_it(
+    folder: Path, converting: threading.Event, caplog: pytest.LogCaptureFixture
+) -> None:
+    ended = asyncio.Event()
+    with caplog.at_level(logging.WARNING):
+        async with console(folder, ended) as (port, key):
+            for head, body in (("GET /api/recordings/short.mcap?as=csv", b""), ("PUT /api/recordings/a.mcap", b"some")):
+                _, writer = await ask(port, key, head, body)
+                await until(lambda: len(os.listdir(folder)) == 3)
+                writer.close()
+                await until(lambda: len(os.listdir(folder)) == 2)
+            assert converting.is_set()
+            ended.set()
+    assert caplog.records == []
