@@ -144,7 +144,10 @@ async def test_a_takeover_behind_a_broken_line_is_none_of_a_restart(server: Simu
         await other.runtime.list_keyframes()
 
 
-async def test_play_that_somebody_else_starts_is_discovered(server: SimulatedServer) -> None:
+async def test_play_that_somebody_else_starts_is_discovered(
+    server: SimulatedServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session_keeper, "_LOOK_S", 0.1)
     async with keeping(server) as client:
         await client.discover()
         arm, events = client.articulations["arm"], client.events()
