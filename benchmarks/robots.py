@@ -16,7 +16,7 @@ from benchmarks.canned import Requester
 from urlab_client.protocol.base import Request
 from urlab_client.protocol.codec import decode_reply, encode_request, op_of
 from urlab_client.protocol.messages.runtime import SetMode
-from urlab_client.protocol.messages.session import Hello, HelloOk, Meta, Step
+from urlab_client.protocol.messages.session import Forward, Hello, HelloOk, Meta, Step
 from urlab_client.server import SimulatedServer
 
 __all__ = ["DIALECT", "dialect", "humanoid", "recorded", "recorded_of", "robot_mjcf"]
@@ -71,7 +71,7 @@ def dialect() -> str:
 def recorded(
     joints: int, count: int = 1, *, mode: str = "direct", terrain: int = 0, spoken: str = ""
 ) -> Mapping[str, bytes]:
-    """Return what the simulated server answers to `hello`, `meta`, `set_mode` and `step`, by op.
+    """Return what the simulated server answers to `hello`, `meta`, `set_mode`, `forward` and `step`, by op.
 
     Args:
         joints: Hinges of each robot.
@@ -95,7 +95,7 @@ def recorded_of(path: Path, count: int = 1, *, mode: str = "direct", spoken: str
     with SimulatedServer(*[path] * count, play=True, **options) as server, Requester(server.step_port) as floor:
         answers["hello"] = floor.ask(encode_request(Hello(), ""))
         hello = decode_reply(op_of(Hello), HelloOk, answers["hello"])
-        others: list[Request[Any]] = [Meta(), SetMode(mode=mode), Step()]
+        others: list[Request[Any]] = [Meta(), SetMode(mode=mode), Forward(), Step()]
         for request in others:
             answers[op_of(request).name] = floor.ask(encode_request(request, hello.session_id))
         if options:

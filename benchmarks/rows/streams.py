@@ -42,10 +42,11 @@ def _snapshots(count: int) -> list[bytes]:
 @contextlib.contextmanager
 def _state() -> Iterator[Pair]:
     """The live client takes each burst over; the floor decodes the same messages from memory."""
-    snapshots = _snapshots(_SNAPSHOTS)
+    answers = recorded(29, 3, mode="live")
+    snapshots = _snapshots(_SNAPSHOTS)  # after them: the client leaves out what was sent before the last answer
     messages = [(STATE_FULL, snapshot) for snapshot in snapshots]
     with (
-        server(recorded(29, 3, mode="live")) as port,
+        server(answers) as port,
         publisher([messages]) as source,
         asyncio.Runner() as runner,
     ):
