@@ -76,10 +76,10 @@ def main() -> int:
     if not results:
         return 1
     document = {"before": before, "after": describe(), "seconds": seconds, "rows": [_plain(r) for r in results]}
+    if options.against is not None:
+        _compare(results, options.against)  # before it may be written over
     options.json.write_bytes(msgspec.json.format(msgspec.json.encode(document), indent=1) + b"\n")
     print(f"\nwritten: {options.json}")
-    if options.against is not None:
-        _compare(results, options.against)
     return 0
 
 
