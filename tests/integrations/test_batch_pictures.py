@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterator
 from typing import Any, Literal
 
 import mujoco
@@ -31,14 +30,6 @@ LOOK = Randomisation(
         Vary(what="light_position", on="*", add=(-0.5, 0.5)),
     )
 )
-
-
-@pytest.fixture
-def made() -> Iterator[list[Any]]:
-    envs: list[Any] = []
-    yield envs
-    for env in envs:
-        env.close()
 
 
 @pytest.mark.parametrize("quality", ["fast", pytest.param("high", marks=pytest.mark.long)])

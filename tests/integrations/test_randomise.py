@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -46,14 +45,6 @@ EVERYTHING = Randomisation(
     noise=(Noise(field="qpos", std=0.01, bias=0.02), Noise(field="task", uniform=0.1)),
     delay=Delay(observation=(0, 2), action=(0, 2), drop=0.2),
 )
-
-
-@pytest.fixture
-def made() -> Iterator[list[Any]]:
-    envs: list[Any] = []
-    yield envs
-    for env in envs:
-        env.close()
 
 
 class FreeWalk(Walk):

@@ -29,14 +29,6 @@ from urlab_client.integrations.gym.spaces import FIELDS
 from urlab_client.server import ControllerConfig, SimulatedServer
 
 
-@pytest.fixture
-def made() -> Iterator[list[Any]]:
-    envs: list[Any] = []
-    yield envs
-    for env in envs:
-        env.close()
-
-
 @pytest.fixture(scope="module")
 def arms() -> Iterator[list[str]]:
     """Addresses of two servers."""

@@ -22,14 +22,6 @@ from urlab_client.server import Drop, Faults, SimulatedServer
 Make = Callable[..., Any]
 
 
-@pytest.fixture
-def made() -> Iterator[list[Any]]:
-    envs: list[Any] = []
-    yield envs
-    for env in envs:
-        env.close()
-
-
 @pytest.fixture(scope="module")
 def servers() -> Iterator[list[str]]:
     """Addresses of two servers."""

@@ -43,6 +43,12 @@ def write_recording(
             for kind in (ArticulationMessage, EntityMessage)
         }
         channels: dict[str, int] = {}
+
+        def add(topic: str, message: ArticulationMessage | EntityMessage, sample: int) -> None:
+            if topic not in channels:
+                channels[topic] = writer.register_channel(topic, "json", schemas[type(message)])
+            writer.add_message(channels[topic], sample * PERIOD_NS, encode(message), 0)
+
         for sample, (robots, entities) in enumerate(samples):
             stamp = Time.of(sample * PERIOD_NS)
             episode, step = divmod(sample, episode_length)
@@ -61,10 +67,7 @@ def write_recording(
                     act=[],
                     sensors=robot.sensors,
                 )
-                topic = f"/state/{key}"
-                if topic not in channels:
-                    channels[topic] = writer.register_channel(topic, "json", schemas[ArticulationMessage])
-                writer.add_message(channels[topic], sample * PERIOD_NS, encode(message), 0)
+                add(f"/state/{key}", message, sample)
             for name, position in entities.items():
                 pose = EntityMessage(
                     timestamp=stamp,
@@ -76,8 +79,5 @@ def write_recording(
                     orientation=[1.0, 0.0, 0.0, 0.0],
                     qvel=[],
                 )
-                topic = f"/entity/{name}"
-                if topic not in channels:
-                    channels[topic] = writer.register_channel(topic, "json", schemas[EntityMessage])
-                writer.add_message(channels[topic], sample * PERIOD_NS, encode(pose), 0)
+                add(f"/entity/{name}", pose, sample)
         writer.finish()

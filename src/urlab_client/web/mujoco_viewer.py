@@ -137,7 +137,7 @@ class MujocoViewer:
 
     @property
     def no_model(self) -> str:
-        """The reason why there is no model to show, or an empty text."""
+        """Why there is no model to show; empty when there is one."""
         if self._client.model is not None:
             return ""
         if not self._client.manager_present:

@@ -182,7 +182,7 @@ class ShmTransport:
                     return answer
         self.stats.over_zmq[detour] = self.stats.over_zmq.get(detour, 0) + 1
         answer = await self._inner.request(frame, op, deadline=deadline, connect_by=connect_by, late=late)
-        if way.state and not pictures:
+        if way.state and not pictures and _succeeded(answer, op):  # a refusal tells nothing about the state's size
             self._largest_state = max(self._largest_state, len(answer))
         return answer
 
@@ -469,6 +469,10 @@ class ShmTransport:
         return OutcomeUnknown(
             text, op=op.name, hint="Whether it was executed is unknown: call discover() and look at the state."
         )
+
+
+def _succeeded(answer: bytes, op: Op) -> bool:
+    return answer.startswith(opening_of(op), 1) or envelope_of(answer).op == op.reply_name
 
 
 def _reason(error: Exception) -> str:

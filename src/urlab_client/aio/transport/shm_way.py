@@ -42,6 +42,4 @@ def way_of(op: Op) -> Way:
         detour = "handshake" if op.needs is Needs.NOTHING else "reply may be too large"
     elif op.name in _UPLOADS:
         detour = "upload"
-    elif op.name == "forward":
-        detour = "handshake"  # after which it is sent, and may be refused: of the state's size that tells nothing
-    return Way(detour, op.name == "step", issubclass(op.reply, StateReply) and op.name != "forward")
+    return Way(detour, op.name == "step", issubclass(op.reply, StateReply))
