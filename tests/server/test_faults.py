@@ -25,8 +25,9 @@ from urlab_client.server import Corrupt, Cut, Delay, Drop, Fault, Faults, Refuse
 
 
 @pytest.fixture(scope="module")
-def server(models: Path) -> Iterator[SimulatedServer]:
-    with SimulatedServer(models / "bot.xml", play=True, faults=FAULTS) as server:
+def server(models: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimulatedServer]:
+    shm_dir = tmp_path_factory.mktemp("shm")
+    with SimulatedServer(models / "bot.xml", play=True, faults=FAULTS, shm_dir=shm_dir) as server:
         yield server
 
 
@@ -40,11 +41,15 @@ def faults(server: SimulatedServer) -> Iterator[Faults]:
 
 
 @pytest.fixture
-def client(server: SimulatedServer, faults: Faults) -> Iterator[URLabClient]:
-    with URLabClient(**server.client_options(), step_mode="direct", rcv_timeout_ms=30_000) as client:
+def client(server: SimulatedServer, faults: Faults, request: pytest.FixtureRequest) -> Iterator[URLabClient]:
+    options = server.client_options() | {"transport": getattr(request, "param", "zmq")}
+    with URLabClient(**options, step_mode="direct", rcv_timeout_ms=30_000) as client:
         client.discover()
         client.reset()
         yield client
+
+
+either_transport = pytest.mark.parametrize("client", ["zmq", "shm"], indirect=True)
 
 
 def step_in_vain(client: URLabClient, timeout: float = 0.05) -> None:
@@ -55,6 +60,7 @@ def step_in_vain(client: URLabClient, timeout: float = 0.05) -> None:
             client.step(timeout=timeout)
 
 
+@either_transport
 def test_a_late_reply_runs_into_the_timeout_and_the_next_step_works(client: URLabClient, faults: Faults) -> None:
     late = faults.add(Delay("step", seconds=60.0, after=1, times=1))
     client.step()
@@ -65,6 +71,7 @@ def test_a_late_reply_runs_into_the_timeout_and_the_next_step_works(client: URLa
     assert (late.seen, late.applied) == (2, 1)
 
 
+@either_transport
 @pytest.mark.parametrize("executed", [True, False])
 def test_a_lost_step(client: URLabClient, faults: Faults, executed: bool) -> None:
     with faults.add(Drop("step", times=1, executed=executed)) as lost:
@@ -87,6 +94,15 @@ def test_a_cut_connection(client: URLabClient, faults: Faults, executed: bool) -
     assert client.transport_stats.connects == 3
 
 
+@pytest.mark.parametrize("client", ["shm"], indirect=True)
+def test_without_a_connection_to_cut_the_reply_is_lost(client: URLabClient, faults: Faults) -> None:
+    with faults.add(Cut("step", times=1)) as cut:
+        step_in_vain(client)
+        assert cut.wait(timeout=30.0)
+    assert client.step().step == 2
+    assert client.transport_stats.connects == 1
+
+
 def test_others_keep_their_connection(server: SimulatedServer, client: URLabClient, faults: Faults) -> None:
     with URLabClient(**server.client_options(), step_mode="direct") as other:
         other.discover()
@@ -98,12 +114,14 @@ def test_others_keep_their_connection(server: SimulatedServer, client: URLabClie
         assert other.transport_stats.connects == 1
 
 
+@either_transport
 def test_a_corrupt_reply(client: URLabClient, faults: Faults) -> None:
     with faults.add(Corrupt("step", times=1)), pytest.raises(ProtocolError):
         client.step()
     assert client.step().step == 2
 
 
+@either_transport
 @pytest.mark.parametrize("executed", [True, False])
 def test_a_refusal(client: URLabClient, faults: Faults, executed: bool) -> None:
     faults.add(Refuse("step", code="step_timeout", message="too slow", executed=executed, times=1))
@@ -112,6 +130,7 @@ def test_a_refusal(client: URLabClient, faults: Faults, executed: bool) -> None:
     assert client.step().step == (2 if executed else 1)
 
 
+@either_transport
 def test_a_delay_and_a_loss_add_up(client: URLabClient, faults: Faults) -> None:
     slow, lost, never = (faults.add(fault) for fault in (Delay(seconds=0.01), Drop("step"), Cut("step")))
     step_in_vain(client)

@@ -242,7 +242,9 @@ class OpenServer:
             self._registration = Registration(registry_directory(), self._instance)
             self._registration.start()
         if memory is not None:
-            memory.start(partial(answer, transport=Transport.SHM, max_reply_bytes=MAX_REPLY_BYTES))
+            in_memory = partial(answer, transport=Transport.SHM, max_reply_bytes=MAX_REPLY_BYTES)
+            injector = self._injector
+            memory.start(in_memory if injector is None else partial(injector.answer_in_memory, answer=in_memory))
         if not is_available():
             tell = logger.info if is_loopback(self.host) else logger.warning
             tell("this system has no Landlock: files that clients' models name are checked, but not kept from MuJoCo")

@@ -127,7 +127,8 @@ class SharedMemoryServer:
         """Start the thread that serves.
 
         Args:
-            answer: Turns a request into its reply of at most `MAX_REPLY_BYTES`; must not raise.
+            answer: Turns a request into its reply of at most `MAX_REPLY_BYTES`, or into nothing, so that it stays
+                unanswered; must not raise.
         """
         self._answer = answer
         self.serving.start()
