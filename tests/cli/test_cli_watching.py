@@ -96,7 +96,7 @@ async def test_live_mode_ends_when_the_server_stays_away(monkeypatch: pytest.Mon
         going = asyncio.create_task(run_session(client, None, over=lambda: False))
         await until(lambda: client.sim_time > 0)
         await asyncio.to_thread(server.close)
-        with pytest.raises(CommandError, match=r"away for 0\.2 s|play has ended"):
+        with pytest.raises(CommandError, match=r"unreachable for 0\.2 s|play has ended"):
             await going
 
 

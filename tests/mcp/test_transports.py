@@ -130,7 +130,7 @@ async def test_over_http_a_token_is_needed_which_is_not_the_console_s() -> None:
         (["sim://arm", "--handshake", "file"], "not for sim://MODEL"),
         (["tcp://localhost"], "does not take a server over from another client. Pass --handshake FILE"),
         (["tcp://localhost", "--handshake", "file", "--allow-drive"], "leave out"),
-        (["sim://arm", "--agents", "2"], "is for --http"),
+        (["sim://arm", "--agents", "2"], "requires --http"),
         (["tcp://localhost", "--handshake", "file", "--step-mode", "live"], "the driving client chooses the mode"),
     ],
 )

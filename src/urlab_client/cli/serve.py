@@ -109,7 +109,7 @@ def add_parser(commands: Commands) -> None:
     network.add_argument(
         "--host",
         default="127.0.0.1",
-        help="interface to bind (default: %(default)s); any other than loopback needs --server-key or --insecure-no-auth",
+        help="interface to bind (default: %(default)s); all but loopback need --server-key or --insecure-no-auth",
     )
     network.add_argument(
         "--server-key",
