@@ -106,5 +106,5 @@ def test_anyios_asyncio_backend_is_a_loop_like_any_other(scripted: Any) -> None:
 
 def test_without_any_loop_it_says_so() -> None:
     client = URLabClient("tcp://127.0.0.1", step_port=1)
-    with pytest.raises(URLabError, match="but no event loop runs here"):
+    with pytest.raises(URLabError, match="but no event loop is running"):
         client.runtime.forward().send(None)  # as an event loop of somebody else's would

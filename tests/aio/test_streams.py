@@ -349,7 +349,7 @@ class TestPolicies:
                 publisher.send(STATE, snapshot(time))
             await marker.passed()
             assert states.stats.waiting == 10
-            with pytest.raises(StreamOverflow, match=r"21 messages were lost, 10 wait.*buffer=") as told:
+            with pytest.raises(StreamOverflow, match=r"21 messages were lost, 10 are buffered.*buffer=") as told:
                 await states.receive()
             assert "state_stream" in str(told.value)
             items = [await states.receive() for _ in range(10)]
