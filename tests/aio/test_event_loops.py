@@ -31,7 +31,7 @@ async def elsewhere(call: Callable[[], Awaitable[object]]) -> None:
 async def test_a_client_stays_with_its_loop(scripted: Any) -> None:
     async with URLabClient("tcp://127.0.0.1", step_port=scripted.port, local_model=False) as client:
         await client.discover()
-        with pytest.raises(URLabError, match=r"This client belongs to another event loop\. Make one per loop"):
+        with pytest.raises(URLabError, match=r"This client belongs to another event loop\. Create one per loop"):
             await elsewhere(client.discover)
 
 

@@ -630,7 +630,7 @@ class TestWaiting:
             await publisher.subscribed(STATE)
             reader = asyncio.create_task(anext(states))
             await asyncio.sleep(0)
-            with pytest.raises(ConcurrentReadError, match="already waits"):
+            with pytest.raises(ConcurrentReadError, match="already waiting"):
                 await states.receive()
             with pytest.raises(ConcurrentReadError):
                 states.receive_nowait()
