@@ -33,8 +33,9 @@ def write_recording(
     *,
     episode_length: int = 100,
     chunk_size: int = 1 << 20,
+    period_ns: int = PERIOD_NS,
 ) -> None:
-    """Write samples, each of articulations by key and of positions of entities by name, 100 a second."""
+    """Write samples, each of articulations by key and of positions of entities by name, by default 100 a second."""
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=chunk_size, compression=CompressionType.ZSTD)
         writer.start(profile="", library="tests")
@@ -47,15 +48,15 @@ def write_recording(
         def add(topic: str, message: ArticulationMessage | EntityMessage, sample: int) -> None:
             if topic not in channels:
                 channels[topic] = writer.register_channel(topic, "json", schemas[type(message)])
-            writer.add_message(channels[topic], sample * PERIOD_NS, encode(message), 0)
+            writer.add_message(channels[topic], sample * period_ns, encode(message), 0)
 
         for sample, (robots, entities) in enumerate(samples):
-            stamp = Time.of(sample * PERIOD_NS)
+            stamp = Time.of(sample * period_ns)
             episode, step = divmod(sample, episode_length)
             for key, robot in robots.items():
                 message = ArticulationMessage(
                     timestamp=stamp,
-                    sim_time=step * PERIOD_NS / 1e9,
+                    sim_time=step * period_ns / 1e9,
                     sample=sample,
                     step=step,
                     episode=episode,
@@ -71,7 +72,7 @@ def write_recording(
             for name, position in entities.items():
                 pose = EntityMessage(
                     timestamp=stamp,
-                    sim_time=step * PERIOD_NS / 1e9,
+                    sim_time=step * period_ns / 1e9,
                     sample=sample,
                     step=step,
                     episode=episode,

@@ -13,6 +13,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from made_recordings import Robot, write_recording
 from PIL import Image
 from starlette.applications import Starlette
 from starlette.routing import Mount
@@ -425,6 +426,22 @@ def test_a_recording_is_made_converted_replayed_in_seconds_and_removed(
         assert http.get("/api/recordings").json()["recordings"] == []
     finally:
         http.post("/api/ops/set_mode", json={"mode": "live"})
+
+
+def test_a_replay_that_is_at_its_end_plays_from_the_start(http: TestClient, tmp_path: Path) -> None:
+    poses = [({"arm": Robot([angle, *[0.0] * 7])}, {}) for angle in np.linspace(0.0, 1.0, 101).tolist()]
+    write_recording(tmp_path / "odd.mcap", poses, period_ns=10_000_001)  # 1.0000001 s
+    assert http.put("/api/recordings/odd.mcap", content=(tmp_path / "odd.mcap").read_bytes()).status_code == 200
+    try:
+        view = http.post("/api/replay", json={"name": "odd.mcap", "playing": False}).json()
+        http.post("/api/replay", json={"time": view["seconds"]})
+        assert http.get("/api/state").json()["articulations"]["arm"]["qpos"][0] == 1.0
+        again = http.post("/api/replay", json={"playing": True}).json()
+        assert again["playing"]
+        assert again["time"] < 0.5
+    finally:
+        http.delete("/api/replay")
+        http.delete("/api/recordings/odd.mcap")
 
 
 def test_a_model_is_taken_in_as_a_file_or_an_archive(tmp_path: Path) -> None:

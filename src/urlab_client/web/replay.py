@@ -129,7 +129,7 @@ class Replay:
         return ReplayView(
             self._run.path.name,
             round(self._at, 3),
-            round(self._seconds, 6),
+            self._seconds,  # unrounded: clients go to the end by this number
             self._playing,
             self._rate,
             self._before is not None,
