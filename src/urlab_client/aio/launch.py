@@ -301,7 +301,7 @@ class LaunchedTransport:
                 reason = (await errors.read()).decode(errors="replace").strip()
                 await process.wait()
         except TimeoutError:
-            reason = f"not ready within {self._start_s:g} s; add ?{_START_TIMEOUT}=SECONDS to the address to wait longer"
+            reason = f"not ready within {self._start_s:g} s; add ?{_START_TIMEOUT}=SECONDS to the address for more"
         raise ServerUnreachable(
             f"{op.name}: no simulated server for {self._address}: {reason or 'it exited without output'}", op=op.name
         )

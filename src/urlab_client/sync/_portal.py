@@ -139,7 +139,7 @@ class Portal:
             raise error
 
     def twin(self, aio: object, make: Callable[[], A]) -> A:
-        """Return the blocking twin of `aio`: the same object while it is referenced, otherwise a new one from `make`."""
+        """Return the blocking twin of `aio`: the same object while it is referenced, otherwise a new one."""
         found = self._twins.get(id(aio))
         if found is None:
             if os.getpid() != self._pid:
