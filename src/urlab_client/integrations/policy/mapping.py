@@ -102,7 +102,7 @@ class PolicyMapping:
         if not robot.joints:
             raise PolicyMismatch(
                 f"{source}: the joints of {self._robot!r} are not known.",
-                hint="Create the client with local_model=True and call discover() during play.",
+                hint="Make the client with local_model=True and call discover() during play.",
             )
         self.joints: list[Joint] = self._joints(robot, spec.action.joints, "action.joints")
         self.actuators: list[Actuator] = [_actuator(robot, joint, source) for joint in self.joints]
