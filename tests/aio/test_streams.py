@@ -534,7 +534,7 @@ class TestWaiting:
                 first = asyncio.ensure_future(frames.receive())
                 await turns()
                 pass_time(2.0)
-            with pytest.raises(URLabTimeoutError, match=r"nothing arrived within 1000 ms.*looks for OpenGL"):
+            with pytest.raises(URLabTimeoutError, match=r"nothing arrived within 1000 ms.*initialises OpenGL"):
                 await first
 
     async def test_the_first_picture_has_its_deadline_too(
@@ -548,7 +548,7 @@ class TestWaiting:
             pass_time(2.0)
             await turns()
             pass_time(40.0)
-            with pytest.raises(URLabTimeoutError, match=r"nothing arrived within 30000 ms.*looks for OpenGL"):
+            with pytest.raises(URLabTimeoutError, match=r"nothing arrived within 30000 ms.*initialises OpenGL"):
                 await first
             with pytest.raises(URLabTimeoutError, match="within 10 ms"):
                 await frames.receive(timeout=0.01)
