@@ -401,7 +401,7 @@ EYE = ("articulations", 0, "camera_topics", "eye")
         (("articulations", 0, "prefix"), "", "keys are not empty"),
         (("instance",), {"state_port": 70000.0}, "its state stream is on port 70000"),
         (("articulations", 0, "controller", "params", "kp"), [1.0], "kp of the controller of 'bot'"),
-        (("articulations", 0, "controller", "schema", "kp", "min"), "low", "as the least kp"),
+        (("articulations", 0, "controller", "schema", "kp", "min"), "low", "the minimum of kp"),
     ],
 )
 def test_what_is_wrong_with_a_handshake_is_said(

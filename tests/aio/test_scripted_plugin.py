@@ -336,7 +336,7 @@ async def test_defaults_rebind_every_joint(plugin: Any, connect: Any) -> None:
 @pytest.mark.parametrize(
     ("params", "problem"),
     [
-        ({"kp": {"knee": 1.0}}, "kp: no actuator 'knee'; it drives: elbow, wrist"),
+        ({"kp": {"knee": 1.0}}, "kp: no actuator 'knee'; available: elbow, wrist"),
         ({"kp": 3.0}, "kp takes a mapping"),
         ({"default_kv": -1}, "default_kv must be at least 0"),
         ({"default_kv": float("nan")}, "default_kv must be at least 0"),

@@ -349,7 +349,7 @@ class TestPolicies:
                 publisher.send(STATE, snapshot(time))
             await marker.passed()
             assert states.stats.waiting == 10
-            with pytest.raises(StreamOverflow, match=r"21 messages were lost, 10 wait.*buffer=") as told:
+            with pytest.raises(StreamOverflow, match=r"21 messages were lost, 10 are buffered.*buffer=") as told:
                 await states.receive()
             assert "state_stream" in str(told.value)
             items = [await states.receive() for _ in range(10)]
@@ -630,7 +630,7 @@ class TestWaiting:
             await publisher.subscribed(STATE)
             reader = asyncio.create_task(anext(states))
             await asyncio.sleep(0)
-            with pytest.raises(ConcurrentReadError, match="already waits"):
+            with pytest.raises(ConcurrentReadError, match="already waiting"):
                 await states.receive()
             with pytest.raises(ConcurrentReadError):
                 states.receive_nowait()

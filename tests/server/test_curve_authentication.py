@@ -124,7 +124,7 @@ def test_a_client_is_let_in_once_the_server_knows_it(keys: Path) -> None:
 
 def test_any_client_with_the_servers_key(keys: Path) -> None:
     with SimulatedServer(curve=CurveServer(server_key=keys / "server.key_secret", allow_any=True)) as server:
-        assert server.open_to == "whoever has the server's key on this machine, encrypted"
+        assert server.open_to == "everyone with the server's key on this machine, encrypted"
         with URLabClient(**server.client_options()) as client:
             client.discover()
             assert client.session_id

@@ -1,7 +1,7 @@
-"""Faults on purpose: what a `SimulatedServer` is told to do wrong, so that programs can test how they take it.
+"""Fault injection: make a `SimulatedServer` misbehave deliberately, to test how programs react.
 
-For users' tests, which add and remove faults while the server runs, and for the server, whose sockets ask the
-`Injector` what becomes of a message.
+Users' tests add and remove faults while the server runs. The server's transports pass each message through the
+`Injector`.
 """
 
 from __future__ import annotations
@@ -47,17 +47,17 @@ NEVER_USED: Final = 0xC1
 
 @dataclass(frozen=True)
 class Fault:
-    """Something that goes wrong, and which messages it happens to; one of the classes below.
+    """Base class of the faults below: what goes wrong, and which messages are affected.
 
-    A fault concerns requests: those of one op, or all. With `topic` it concerns published messages instead.
+    A fault affects requests, of one op or of all. With `topic` it affects published messages instead.
 
     Attributes:
-        op: Name of the op whose requests are concerned; None for every op.
-        topic: How the topics of the published messages start that are concerned; None for requests.
-        executed: Whether a request is executed although its reply is lost, late or an error.
-        after: How many messages pass unharmed first.
-        times: How many messages are harmed in all; None for no end.
-        probability: Share of the messages that are harmed, 0 to 1; the seed decides which.
+        op: Name of the op whose requests are affected; None for every op.
+        topic: Prefix of the topics of affected published messages; None for requests.
+        executed: Whether a request is executed even though its reply is lost, late or an error.
+        after: Number of messages that pass unharmed first.
+        times: Number of messages that are affected; None for no limit.
+        probability: Fraction of the messages that are affected, 0 to 1; the seed determines which.
     """
 
     op: str | None = None
@@ -85,20 +85,23 @@ class Fault:
             raise ValueError(f"probability must be a number from 0 to 1, not {self.probability}")
 
     def concerns_request(self, op: str) -> bool:
-        """Whether requests of this op are concerned."""
+        """Whether requests of this op are affected."""
         return self.topic is None and (self.op is None or self.op == op)
 
     def concerns_message(self, topic: bytes) -> bool:
-        """Whether published messages of this topic are concerned."""
+        """Whether published messages of this topic are affected."""
         return self.topic is not None and topic.startswith(self.topic.encode())
 
 
 @dataclass(frozen=True)
 class Delay(Fault):
-    """Answer late. Meanwhile the server answers nobody else, and with `topic` publishes nothing else on that socket.
+    """Answer late.
+
+    Until then the server answers no other request of that transport, or with `topic` publishes nothing else on that
+    socket.
 
     Attributes:
-        seconds: How late.
+        seconds: Duration of the delay.
     """
 
     seconds: float = field(kw_only=True)
@@ -111,14 +114,14 @@ class Delay(Fault):
 
 @dataclass(frozen=True)
 class Drop(Fault):
-    """Answer never, and leave the connection as it is; with `topic`, do not publish."""
+    """Never answer, and leave the connection open; with `topic`, do not publish."""
 
 
 @dataclass(frozen=True)
 class Cut(Fault):
-    """Close the connection of whoever asked, in place of the reply. It may connect again.
+    """Close the connection of the client instead of sending the reply. It may reconnect.
 
-    Shared memory has no connection: a reply that was to go there is lost, as by `Drop`.
+    Shared memory has no connection, so a reply over shared memory is lost as with `Drop`.
     """
 
     def __post_init__(self) -> None:
@@ -130,11 +133,11 @@ class Cut(Fault):
 class Corrupt(Fault):
     """Change bytes of the reply: the first, so that it cannot be decoded, and some others.
 
-    With `topic` the payload of published messages is changed. Binary rows have no checksum: a receiver may believe
-    what it gets.
+    With `topic`, changes the payload of published messages. Binary rows have no checksum, so a receiver may accept
+    them.
 
     Attributes:
-        flips: How many bytes change besides the first; the seed decides which.
+        flips: Number of changed bytes besides the first; the seed determines which.
     """
 
     flips: int = field(default=8, kw_only=True)
@@ -173,16 +176,16 @@ def _refuse_topic(fault: Fault) -> None:
 
 
 class ActiveFault:
-    """A fault that a server applies. As a context manager it is removed at the end.
+    """A fault that a server applies. Leaving it as a context manager removes it.
 
     Attributes:
-        fault: What goes wrong.
-        seen: How many messages it could have been applied to.
-        applied: How many it was applied to.
+        fault: The fault.
+        seen: Number of messages that it could have been applied to.
+        applied: Number of messages that it was applied to.
     """
 
     def __init__(self, faults: Faults, fault: Fault, seed: str) -> None:
-        """Begin to count; `Faults.add` makes these."""
+        """Start counting; created by `Faults.add`."""
         self.fault = fault
         self.seen: int = 0
         self.applied: int = 0
@@ -201,23 +204,23 @@ class ActiveFault:
         self.remove()
 
     def remove(self) -> None:
-        """Apply it no longer; a delay under way ends."""
+        """Stop applying it; a delay in progress ends."""
         self._faults.remove(self)
 
     def wait(self, times: int = 1, timeout: float = 5.0) -> bool:
-        """Wait until it was applied.
+        """Wait until it has been applied.
 
         Args:
-            times: How often.
+            times: Number of applications to wait for.
             timeout: Longest wait, seconds.
 
         Returns:
-            False when it was not applied so often in time.
+            Whether it was applied that often in time.
         """
         return self._faults.wait_for(lambda: self.applied >= times, timeout)
 
     def due(self) -> bool:
-        """Count a message and say whether it is harmed. `Faults` holds its lock."""
+        """Count a message and return whether it is affected. `Faults` holds its lock."""
         fault = self.fault
         self.seen += 1
         if self.seen <= fault.after or (fault.times is not None and self.applied >= fault.times):
@@ -229,7 +232,7 @@ class ActiveFault:
 
 
 class Faults:
-    """The faults of a server, which may change while it runs. Safe to use from several threads.
+    """The faults of a server, which may change while it runs. Thread-safe.
 
     ::
 
@@ -240,18 +243,18 @@ class Faults:
                 ...
             assert lost.applied == 1
 
-    The same messages and the same seed give the same faults.
+    The same messages and the same seed produce the same faults.
     """
 
     def __init__(self, *faults: Fault, seed: int = 0) -> None:
-        """Start with some faults.
+        """Set the faults to start with.
 
         Args:
-            faults: Applied from the start.
-            seed: Of the decisions that `probability` and `corrupt` leave open.
+            faults: Faults applied from the start.
+            seed: Seed of the random choices of `probability` and `Corrupt`.
 
         Raises:
-            TypeError: One of them is not a fault.
+            TypeError: An argument is not a fault.
         """
         self._seed = seed
         self._made = 0
@@ -262,16 +265,16 @@ class Faults:
 
     @property
     def active(self) -> tuple[ActiveFault, ...]:
-        """The faults that are applied, in the order in which they were added."""
+        """The active faults, in the order in which they were added."""
         return self._active
 
     def add(self, fault: Fault) -> ActiveFault:
         """Apply a fault from now on.
 
-        Of several that concern a message all delays are applied, and of the others the first that is due.
+        If several affect a message, all delays are applied, and the first of the others.
 
         Raises:
-            TypeError: It is not a fault.
+            TypeError: The argument is not a fault.
         """
         if not isinstance(fault, Fault):  # pyright: ignore[reportUnnecessaryIsInstance]
             raise TypeError(f"{fault!r} is not a fault: make {_KINDS}, for example Drop('step')")
@@ -282,19 +285,19 @@ class Faults:
         return added
 
     def remove(self, fault: ActiveFault) -> None:
-        """Apply a fault no longer; without effect on one that is not applied."""
+        """Stop applying a fault; no effect if it is not active."""
         with self._changed:
             self._active = tuple(other for other in self._active if other is not fault)
             self._changed.notify_all()
 
     def clear(self) -> None:
-        """Apply no fault any more; delays under way end."""
+        """Remove all faults; delays in progress end."""
         with self._changed:
             self._active = ()
             self._changed.notify_all()
 
     def reset(self) -> None:
-        """Apply the faults it was made with and no others, with counters and chance as at the start."""
+        """Restore the faults it was created with, their counters and the random state."""
         with self._changed:
             self.clear()
             self._made = 0
@@ -302,7 +305,7 @@ class Faults:
                 self.add(fault)
 
     def take(self, concerned: Callable[[Fault], bool]) -> tuple[list[ActiveFault], ActiveFault | None]:
-        """Count a message and return the delays and the other fault that are due."""
+        """Count a message and return the delays and the other fault to apply."""
         delays: list[ActiveFault] = []
         other: ActiveFault | None = None
         with self._changed:
@@ -320,24 +323,24 @@ class Faults:
     def _concerned(self, active: ActiveFault, concerned: Callable[[Fault], bool]) -> bool:
         try:
             return concerned(active.fault)
-        except Exception:  # one of a user's own classes
-            logger.exception("%r cannot tell what it concerns and is removed", active)
+        except Exception:  # from a user-defined class
+            logger.exception("%r failed to match a message and is removed", active)
             self.remove(active)
             return False
 
     def wait_for(self, condition: Callable[[], bool], timeout: float) -> bool:
-        """Wait until something that changes with the faults is true; return False if it is not in time."""
+        """Wait for a condition that depends on the faults; return whether it became true in time."""
         with self._changed:
             return self._changed.wait_for(condition, timeout)
 
     def wake(self) -> None:
-        """Have those who wait look again."""
+        """Make waiting threads check their conditions again."""
         with self._changed:
             self._changed.notify_all()
 
 
 class Loss(enum.Enum):
-    """What becomes of a request that is not answered."""
+    """How a request is left unanswered."""
 
     DROP = enum.auto()
     CUT = enum.auto()
@@ -352,30 +355,30 @@ _MSGPACK: Final = msgspec.msgpack.Decoder(_Named)
 
 
 class Injector:
-    """Applies faults to what a server's sockets receive and send."""
+    """Applies faults to what a server receives and sends."""
 
     def __init__(self, faults: Faults, refuse: Callable[[str, str], bytes]) -> None:
-        """Stand between a server and its sockets.
+        """Put the injector between a server and its transports.
 
         Args:
-            faults: What goes wrong.
-            refuse: Makes the frame of an error from its code and message.
+            faults: The faults to apply.
+            refuse: Builds the frame of an error from its code and message.
         """
         self._faults = faults
         self._refuse = refuse
         self._closed = False
 
     def close(self) -> None:
-        """End the delays under way and apply none any more."""
+        """End the delays in progress and apply no more."""
         self._closed = True
         self._faults.wake()
 
     def answer(self, frame: bytes, answer: Callable[[bytes], bytes]) -> bytes | Loss:
-        """Answer a request, or say how its reply gets lost.
+        """Answer a request, or return how its reply is lost.
 
         Args:
-            frame: The request's frame.
-            answer: Turns it into the reply's.
+            frame: Frame of the request.
+            answer: Turns it into the frame of the reply.
         """
         if not self._faults.active:
             return answer(frame)
@@ -402,12 +405,12 @@ class Injector:
                 return Loss.DROP
 
     def answer_in_memory(self, frame: bytes, answer: Callable[[bytes], bytes]) -> bytes:
-        """Answer a request that came over shared memory; nothing when its reply gets lost, however that happens."""
+        """Answer a request over shared memory; empty if the reply is lost in any way."""
         reply = self.answer(frame, answer)
         return b"" if isinstance(reply, Loss) else reply
 
     def publish(self, topic: bytes, payload: bytes) -> bytes | None:
-        """Return what becomes of a published message: its payload, after a delay maybe, or None if it is dropped."""
+        """Return the payload of a published message, possibly delayed or changed; None if it is dropped."""
         if not self._faults.active:
             return payload
         delays, other = self._faults.take(lambda fault: fault.concerns_message(topic))
@@ -420,13 +423,13 @@ class Injector:
         return None
 
     def _sleep(self, delay: ActiveFault) -> None:
-        """Wait until the delay is over, was removed, or the server closes."""
+        """Wait until the delay is over or removed, or the server closes."""
         if isinstance(delay.fault, Delay):
             self._faults.wait_for(lambda: self._closed or delay not in self._faults.active, delay.fault.seconds)
 
 
 class FaultyEndpoint(RpcEndpoint):
-    """A request socket that may leave a request unanswered, which a REP socket cannot."""
+    """A request socket that may leave a request unanswered, unlike a REP socket."""
 
     kind: ClassVar[int] = zmq.ROUTER
 
@@ -434,8 +437,9 @@ class FaultyEndpoint(RpcEndpoint):
         """Bind the socket.
 
         Args:
-            injector: Decides what goes wrong.
-            answer: See `RpcEndpoint`, as for the options.
+            injector: Selects the faults to apply.
+            answer: See `RpcEndpoint`.
+            options: See `RpcEndpoint`.
         """
         super().__init__(answer, **options)
         self._injector = injector
@@ -445,7 +449,7 @@ class FaultyEndpoint(RpcEndpoint):
         frames = self._socket.recv_multipart(copy=False)
         if self._stopping:
             return False
-        # As a REP socket does: an empty frame ends the envelope, and what has none is ignored.
+        # Like a REP socket: an empty frame ends the envelope, and messages without one are ignored.
         parts = [frame.bytes for frame in frames]
         if b"" not in parts[1:]:
             return True
@@ -469,12 +473,12 @@ class FaultyEndpoint(RpcEndpoint):
 
 
 def _shut(descriptor: int) -> None:
-    """End the connection that a frame came by; its owner, ZeroMQ, sees it end and closes the descriptor."""
+    """Shut down the connection that delivered a frame; ZeroMQ owns the descriptor and closes it."""
     connection = socket.socket(fileno=descriptor)
     try:
         connection.shutdown(socket.SHUT_RDWR)
-    except OSError as error:  # the peer was faster
-        logger.debug("the connection was gone already: %s", error)
+    except OSError as error:  # the peer closed it first
+        logger.debug("the connection was already closed: %s", error)
     finally:
         connection.detach()
 
@@ -483,7 +487,7 @@ def _op_of(frame: bytes) -> str:
     try:
         return (_JSON if frame[:1] == b"{" else _MSGPACK).decode(frame).op
     except (msgspec.DecodeError, UnicodeDecodeError):
-        return ""  # no request; the server will say so
+        return ""  # not a request; the server reports that
 
 
 def _corrupted(frame: bytes, flips: int, chance: random.Random) -> bytes:

@@ -47,19 +47,19 @@ _INTERFACES: Final = {"0.0.0.0": "every network of this machine", "::": "every n
 class SimulatedServer:
     """A URLab server without Unreal, for tests, demonstrations and offline work.
 
-    It runs in threads of its own, so a program may hold it and any number of clients::
+    It runs in its own threads, so one program may hold it and any number of clients::
 
         with SimulatedServer("arm", play=True) as server:
             client = URLabClient(**server.client_options())
 
     `async with` does the same without blocking the event loop. The server answers as the plugin does, with these
-    differences: a broken MJCF is refused instead of imported empty, positions in replies are right, entities are
-    reported, handlers of all transports run one at a time, and what has no counterpart here answers `unsupported`.
+    differences: a broken MJCF is refused instead of imported empty, positions in replies are correct, entities are
+    reported, requests of all transports are handled one at a time, and ops without a counterpart answer `unsupported`.
 
     Each MJCF becomes a blueprint and one actor whose id is the file stem, made unique with `_1`, `_2`, …. The first
-    stands at the origin, the others beside it along +y: so far that the boxes around their geoms, at their reference
-    poses, are a metre apart. Planes, being endless, do not count: a model of nothing but a floor stays at the
-    origin. The level has no name and has a manager, so play can start at once.
+    is at the origin, the others beside it along +y, with a metre between the bounding boxes of their geoms in the
+    reference pose. Planes are infinite and do not count: a model that consists of a floor stays at the origin. The
+    level has no name and contains a manager, so play can start immediately.
     """
 
     def __init__(
@@ -93,53 +93,55 @@ class SimulatedServer:
         instance_id: str = "",
         instance_index: int | None = None,
     ) -> None:
-        """Describe a server; `start`, or entering it, opens it.
+        """Configure a server; `start`, or entering the context, opens it.
 
         Args:
             models: MJCF files, names of bundled robots (see `bundled_models`), and at most one saved level (`.json`),
                 which becomes the open level.
-            play: Start a play session at once.
+            play: Start a play session immediately.
             unpaused: Let physics run from the start of each play session; the plugin starts paused.
             step_mode: `live`, `direct` or `puppet` pins the mode; `auto` starts live and lets clients choose.
-            host: Interface to bind, an address or a name. Other than loopback needs `curve` or `insecure_no_auth`.
-            curve: Encrypt all traffic and let in only clients with the right keys.
-            insecure_no_auth: Serve whoever reaches the interface: they can do all that a client can.
-            limits: How much is done for clients.
-            step_port: Port of requests; 0 picks a free one, here and below.
-            state_port: Port of the state stream. Like the next two it is bound while the server is open, and silent
-                outside play.
+            host: Interface to bind, an address or a name. Anything but loopback requires `curve` or `insecure_no_auth`.
+            curve: Encrypt all traffic and accept only clients with the right keys.
+            insecure_no_auth: Serve everyone who can reach the interface, with all rights of a client.
+            limits: Limits on what clients can request.
+            step_port: Port of requests; 0 selects a free port, as for the other ports.
+            state_port: Port of the state stream. Like the next two, it is bound while the server is open, and sends
+                nothing outside play.
             ctrl_port: Port of streamed controls.
             info_port: Port of the info stream.
             camera_port: Port of the first camera's images; the other cameras get the free ports after it.
-            saved_dir: Folder of levels and imported models; None for a temporary one that goes when the server closes.
+            saved_dir: Folder of levels and imported models; None for a temporary one that is removed when the server
+                closes.
             model_roots: Folders below which clients may import MJCF files. None for the folders of `models`, or the
-                current folder where those name none.
-            controllers: Controller by actor id or articulation key; `*` stands for all others. They come before the
-                level's and the MJCF's. With `play` a name that fits nothing is refused, else it is logged when play
-                starts: the actor may be spawned until then.
-            camera_modes: What a camera's pixels mean, by `ACTOR/CAMERA`.
-            camera_size: Width and height of cameras whose MJCF gives none, pixels; default 640 by 480.
-            render_quality: `fast`, without shadows, reflections and smooth edges; `high`, with them; or `auto`: `fast`
-                where the processor draws, `high` on a graphics card.
-            mjcf_options: Honour the `<option>` of the first model; else the alpha ignores all, the beta merges them.
+                current folder if those contain no files.
+            controllers: Controller by actor id or articulation key; `*` matches all others. They take precedence over
+                those of the level and the MJCF. With `play`, a name that matches nothing is refused; otherwise it is
+                logged when play starts, because the actor may be spawned before that.
+            camera_modes: Meaning of the pixels by `ACTOR/CAMERA`.
+            camera_size: Width and height of cameras without a resolution in their MJCF, pixels; default 640 by 480.
+            render_quality: `fast`, without shadows, reflections and antialiasing; `high`, with them; or `auto`: `fast`
+                with software rendering, `high` on a graphics card.
+            mjcf_options: Use the `<option>` of the first model. Otherwise the alpha ignores all, and the beta merges
+                them.
             actor_names: Name articulations after their MJCF's model name (`robot`, `robot_1`) or as the plugin does
                 (`robot_C_0`, `robot_C_1`).
-            faults: What is to go wrong with replies and published messages, for tests; may change while the server
+            faults: Faults injected into replies and published messages, for tests; they may change while the server
                 runs.
-            shm_dir: Directory below which the server makes one of its own for shared-memory regions; a tmpfs such as
-                `/dev/shm` spares the disk. None for no shared memory.
-            dialect: Generation of the plugin to speak for: `alpha` (June 2026) or `beta` (August 2026).
-            user_channels: First value of the level's user channels by `ROBOT/CHANNEL` or `scene/CHANNEL`; its kind is
-                the channel's. For the beta.
-            randomise: What varies from reset to reset, by the seed of the reset: a `Randomisation`, or a TOML file.
-            instance_id: What this server is called among several; by default `live`, or after its index.
-            instance_index: Number of this server among several, which gives it ports of its own where none are asked
-                for: 5559 + 10 times the index for requests, then state, then cameras.
+            shm_dir: Directory in which the server creates its own directory for shared-memory regions; a tmpfs such as
+                `/dev/shm` avoids disk writes. None for no shared memory.
+            dialect: Wire dialect of the plugin: `alpha` (June 2026) or `beta` (August 2026).
+            user_channels: Initial values of the level's user channels by `ROBOT/CHANNEL` or `scene/CHANNEL`. The kind
+                of the value is that of the channel. Beta only.
+            randomise: Variations drawn at each reset from its seed: a `Randomisation`, or a TOML file.
+            instance_id: Name of this server among several; by default `live`, or derived from its index.
+            instance_index: Number of this server among several. It determines the ports that are not given: 5559 + 10
+                times the index for requests, then state, then cameras.
 
         Raises:
-            ValueError: An invalid port, mode, size, dialect, channel, index or randomisation, two levels, or both
-                `curve` and `insecure_no_auth`.
-            OSError: The file of a randomisation cannot be read.
+            ValueError: A port, mode, size, dialect, channel, index or randomisation is invalid, there are two levels,
+                or both `curve` and `insecure_no_auth` are given.
+            OSError: The randomisation file cannot be read.
         """
         names = tuple(os.fspath(model) for model in models)
         if sum(map(is_level, names)) > 1:
@@ -211,16 +213,16 @@ class SimulatedServer:
     # Life
 
     def start(self) -> Self:
-        """Open the server and return it once it answers; without effect while it is open.
+        """Open the server and return it once it answers; no effect if it is already open.
 
-        After `close` it starts afresh, from the models.
+        After `close` it starts again from the models.
 
         Raises:
-            PortInUse: Somebody has a port.
+            PortInUse: A port is in use.
             OSError: The host is not an address of this machine, or `saved_dir` cannot be used.
             UnprotectedServer: The host is not loopback, and neither `curve` nor `insecure_no_auth` was given.
             KeyFileError: A key file cannot be used.
-            ModelError: A model is missing or broken, or play was asked for and MuJoCo rejects the scene.
+            ModelError: A model is missing or broken, or `play` is set and MuJoCo rejects the scene.
         """
         with self._lock:
             if self._opened is None:
@@ -229,9 +231,9 @@ class SimulatedServer:
         return self
 
     def close(self) -> None:
-        """Close the server within about a second, whatever is under way; without effect while it is closed.
+        """Close the server within about a second, whatever it is doing; no effect if it is already closed.
 
-        A request under way is answered `shutting_down` where it can be broken off.
+        A request in progress is answered with `shutting_down` if it can be aborted.
         """
         with self._lock:
             opened, self._opened = self._opened, None
@@ -241,15 +243,15 @@ class SimulatedServer:
                 opened.close()
 
     def restore(self) -> None:
-        """Bring the server back to how it was after `start`, for the next test; without effect while it is closed.
+        """Restore the state after `start`, for the next test; no effect if the server is closed.
 
-        The session is ended, play starts afresh from the level's initial state or is stopped, and nothing is left of
-        modes, options, controllers, recordings, drawings and faults. That takes milliseconds. Where a level was
-        edited or a file written, or where the server hangs or has failed, it is closed and started again instead,
-        after which free ports have other numbers. Files in a `saved_dir` of the caller's own stay.
+        Ends the session, restarts play from the level's initial state or stops it, and resets modes, options,
+        controllers, recordings, drawings and faults. This takes milliseconds. If a level was edited, a file was
+        written, or the server hangs or has failed, the server is closed and started again instead; automatically
+        chosen ports then change. Files in a `saved_dir` that the caller gave are kept.
 
         Raises:
-            OSError, ModelError: It could not be started again; see `start`.
+            OSError, ModelError: The server could not be started again; see `start`.
         """
         with self._lock:
             opened = self._opened
@@ -258,15 +260,15 @@ class SimulatedServer:
             self.start()
 
     def snapshot(self, size: tuple[int, int] = (1280, 720), *, frame_all: bool = False) -> NDArray[np.uint8]:
-        """Draw the viewport: what the editor would show, with debug drawing, overlay text and what is selected.
+        """Draw the viewport as the editor would show it, with debug drawings, overlay text and the selection.
 
         The camera and the view mode are those that the `viewport` ops have set. During play it shows the simulation,
-        else the level as authored. In `collision` mode are the geoms that collide, meshes as their convex hulls. It
-        blocks for as long as drawing takes; in async code call it with `anyio.to_thread.run_sync(server.snapshot)`.
+        otherwise the level as authored. `collision` mode shows the colliding geoms, with meshes as convex hulls. Blocks
+        until the picture is drawn; in async code call `anyio.to_thread.run_sync(server.snapshot)`.
 
         Args:
             size: Width and height, pixels.
-            frame_all: Move the camera for this picture so that everything is in it; it is not turned.
+            frame_all: Move the camera for this picture, without turning it, so that everything is visible.
 
         Returns:
             Red, green, blue and alpha, rows from the top, shape (height, width, 4).
@@ -283,7 +285,7 @@ class SimulatedServer:
 
     @property
     def failure(self) -> str | None:
-        """Which of its threads died, and of what; None while all run, and while the server is closed.
+        """Which thread of the server died, and why; None while all of them run, and while the server is closed.
 
         A server that has failed refuses every request with `internal_error` and this text, until it is closed and
         started again.
@@ -292,9 +294,9 @@ class SimulatedServer:
         return None if opened is None else opened.health.failure
 
     def add_failure_callback(self, callback: Callable[[str], None]) -> None:
-        """Call `callback` with `failure` when a thread of the server dies, on that thread; at once if one has died.
+        """Call `callback` with `failure` when a thread of the server dies, on that thread; immediately if one has died.
 
-        It counts until the server is closed.
+        The callback is removed when the server closes.
 
         Raises:
             RuntimeError: The server is closed.
@@ -302,9 +304,9 @@ class SimulatedServer:
         self._running.health.add_callback(callback)
 
     def add_request_callback(self, callback: Callable[[ServedRequest], None]) -> None:
-        """Call `callback` with each request that was answered, on the thread that answers, until the server is closed.
+        """Call `callback` with each answered request, on the thread that answers, until the server is closed.
 
-        It must be quick: the next request waits for it. What it raises is logged and changes nothing.
+        It must be fast, because the next request waits for it. Exceptions that it raises are logged and ignored.
 
         Raises:
             RuntimeError: The server is closed.
@@ -319,7 +321,7 @@ class SimulatedServer:
 
     @property
     def can_render(self) -> bool:
-        """Whether pictures can be drawn on this machine; finding out takes about a second, once per process."""
+        """Whether this machine can draw pictures; the check takes about a second, once per process."""
         return find_backend() is not None
 
     def __enter__(self) -> Self:
@@ -334,7 +336,7 @@ class SimulatedServer:
         try:
             await anyio.to_thread.run_sync(self.start)
         except BaseException:
-            # Cancelled while it started: nobody else would close it.
+            # Cancelled during the start: nothing else would close it.
             await self._aclose()
             raise
         return self
@@ -351,7 +353,7 @@ class SimulatedServer:
     def __del__(self) -> None:
         if getattr(self, "_opened", None) is not None:
             # Without `source`, which would keep the object from its finalizer for as long as the warning is kept.
-            warnings.warn(f"{self!r} was not closed; it was made at {self._made_at}", ResourceWarning, stacklevel=2)
+            warnings.warn(f"{self!r} was not closed; it was created at {self._made_at}", ResourceWarning, stacklevel=2)
 
     # Where it is
 
@@ -387,7 +389,7 @@ class SimulatedServer:
 
     @property
     def scene_warnings(self) -> tuple[str, ...]:
-        """What compiling the scene that plays gave occasion to say, as options of a model that have no effect."""
+        """Warnings from compiling the current scene, for example about options of a model that have no effect."""
         return self._running.scene_warnings
 
     @property
@@ -397,29 +399,29 @@ class SimulatedServer:
 
     @property
     def shm_dir(self) -> Path | None:
-        """Directory of the shared-memory regions, one of this server alone; None without shared memory."""
+        """Directory of the shared-memory regions, used by this server only; None without shared memory."""
         memory = self._running.memory
         return None if memory is None else memory.directory
 
     @property
     def open_to(self) -> str:
-        """Who can use the server, in words: this machine alone, holders of keys, or anyone on an interface."""
+        """Who can use the server, as text: this machine only, holders of keys, or anyone on an interface."""
         host, curve_keys = self._running.host, self._running.curve_keys
         where = "this machine" if is_loopback(host) else _INTERFACES.get(host, f"the network at {host}")
         if curve_keys is None:
             return f"any program on {where}" if is_loopback(host) else f"anyone on {where}, without authentication"
-        who = "whoever has the server's key" if curve_keys.clients is None else f"{curve_keys.clients} client key(s)"
+        who = "everyone with the server's key" if curve_keys.clients is None else f"{curve_keys.clients} client key(s)"
         return f"{who} on {where}, encrypted"
 
     @property
     def faults(self) -> Faults | None:
-        """What goes wrong, as given at the start."""
+        """The `faults` argument."""
         return self._config.faults
 
     def client_options(self) -> dict[str, Any]:
-        """Return what a client needs to reach this server: `URLabClient(**server.client_options())`.
+        """Return the arguments for a client of this server: `URLabClient(**server.client_options())`.
 
-        With `curve` that includes the server's public key. A client that must show who it is adds its `client_key`.
+        With `curve` they include the server's public key. If the server requires client keys, add `client_key`.
         """
         curve_keys = self._running.curve_keys
         return ({} if curve_keys is None else {"server_key": curve_keys.public_key}) | {

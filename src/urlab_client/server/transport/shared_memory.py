@@ -1,8 +1,8 @@
 """The shared-memory transport of a server: requests and replies in two regions, state and pictures in others.
 
-For `SimulatedServer`. One thread watches the request region. With our own client it sleeps until the doorbell rings, or
-on Windows the named event is set; for clients without one, as the plugin's, it looks every 100 µs while they are at
-work and every 5 ms otherwise.
+For `SimulatedServer`. One thread watches the request region. For this package's client it sleeps until the doorbell
+rings, or on Windows until the named event is set. For clients without a doorbell, such as the plugin's, it polls every
+100 µs while they are active and every 5 ms otherwise.
 """
 
 from __future__ import annotations
@@ -43,57 +43,57 @@ logger: logging.Logger = logging.getLogger("urlab_client.server")
 Answer = Callable[[bytes], bytes]
 
 MAX_REPLY_BYTES: Final = RPC_STRIDE - SIZE_PREFIX
-"""Largest reply that fits its slot."""
+"""Largest reply that fits into its slot."""
 
-BUSY_POLL_S: Final = 1e-4
+ACTIVE_POLL_S: Final = 1e-4
 IDLE_POLL_S: Final = 5e-3
-RUNG_POLL_S: Final = 0.05
-"""Between two looks at the requests: while a client without a doorbell is at work, when nobody is there, and when
-somebody with a doorbell is."""
+DOORBELL_POLL_S: Final = 0.05
+"""Polling intervals: while a client without a doorbell is active, without any client, and with doorbell clients
+only."""
 
-AT_WORK_S: Final = 1.0
-"""How long after a request its client counts as at work."""
+ACTIVE_S: Final = 1.0
+"""How long after a request a client without a doorbell counts as active."""
 
-BRISK_S: Final = 2e-4
-"""Requests that follow each other so quickly are waited for without sleep: waking up takes as long as an answer."""
+SPIN_S: Final = 2e-4
+"""How long to spin for the next request after a fast one: waking up takes as long as an answer."""
 
 STATE_PERIOD_S: Final = 0.1
 PICTURE_PERIOD_S: Final = 10.0
-"""How often state and pictures are published while all clients have a doorbell and none wants them."""
+"""How often state and pictures are published while all clients have a doorbell and none subscribed to them."""
 
 BLIND_PICTURE_PERIOD_S: Final = 0.5
-"""How often pictures are published while no client has a doorbell: a region has no list of its readers."""
+"""How often pictures are published while no client has a doorbell: a region does not know its readers."""
 
 MAX_LISTENERS: Final = 32
 
-DOOR_SHUT_S: Final = 1.0
-"""How long nobody new is let in after there was no descriptor for somebody."""
+ACCEPT_RETRY_S: Final = 1.0
+"""Pause between two attempts to accept clients when descriptors have run out."""
 
 _SELECTOR_STEP_S: Final = 1e-3
-"""Shorter waits than this are rounded up by `epoll`."""
+"""`epoll` rounds shorter waits up to this."""
 
 
 class SharedMemoryServer:
     """The regions of one server.
 
-    A region has no list of its readers. While no client has a doorbell, or one without it makes requests, every
-    snapshot is published, as by the plugin; pictures come thirty times a second while such a client makes requests,
-    else twice. Where all clients have a doorbell, those who want state or pictures get all of them; while nobody does,
-    state is published ten times a second and pictures every ten seconds.
+    A region does not know its readers. While no client has a doorbell, or a client without one sends requests, every
+    snapshot is published, as by the plugin. Pictures are published thirty times a second while such a client sends
+    requests, otherwise twice. If all clients have a doorbell, state and pictures are published as often as a client
+    subscribes to them; without subscribers, state is published ten times a second and pictures every ten seconds.
 
     Attributes:
-        directory: Where the regions are, absolute.
+        directory: Absolute path of the directory with the regions.
     """
 
     def __init__(self, base: Path, health: Health) -> None:
-        """Lay out the regions of requests and replies; `start` begins to serve.
+        """Create the regions of requests and replies; `start` begins to serve.
 
         Args:
-            base: Directory below which this server makes one of its own.
-            health: Told when requests cannot be served any more.
+            base: Directory in which this server creates its own directory.
+            health: Notified when the thread dies.
 
         Raises:
-            OSError: There is no room, or the base cannot be used.
+            OSError: The disk is full, or `base` cannot be used.
         """
         self._health = health
         with contextlib.ExitStack() as made:
@@ -106,10 +106,10 @@ class SharedMemoryServer:
             made.callback(self._replies.close)
             self._bell = _Bell(self.directory)
             made.pop_all()
-        self._unrung_at = -AT_WORK_S
+        self._active_at = -ACTIVE_S
         self._unannounced = False
-        self._served_at = -BRISK_S
-        self._brisk = False
+        self._served_at = -SPIN_S
+        self._spinning = False
         self._state: RegionFile | None = None
         self._state_at = 0.0
         self._cameras: dict[str, RegionFile] = {}
@@ -119,7 +119,7 @@ class SharedMemoryServer:
         self._stopping = False
         self._released = False
         self._given_up = False
-        self._seen = 0  # whoever was quicker than the thread is not forgotten
+        self._seen = 0  # so that a request before the thread's start is served
         self._answer: Answer = bytes
         self.serving: ServingThread = ServingThread("urlab-shm", self._run)
 
@@ -127,8 +127,8 @@ class SharedMemoryServer:
         """Start the thread that serves.
 
         Args:
-            answer: Turns a request into its reply of at most `MAX_REPLY_BYTES`, or into nothing, so that it stays
-                unanswered; must not raise.
+            answer: Returns the reply to a request, at most `MAX_REPLY_BYTES`, or nothing to leave it unanswered; must
+                not raise.
         """
         self._answer = answer
         self.serving.start()
@@ -139,15 +139,15 @@ class SharedMemoryServer:
         return self.serving.alive
 
     def stop(self) -> None:
-        """Ask the thread to end after the request under way, without waiting."""
+        """Ask the thread to end after the current request, without waiting."""
         self._stopping = True
         self._bell.wake()
 
     def join(self, timeout: float) -> bool:
-        """Wait for the end after `stop` and remove the regions.
+        """Wait for the thread to end after `stop`, and remove the regions.
 
         Returns:
-            False when the request under way took longer.
+            False if the current request took longer.
         """
         if self.serving.started:
             ended = self.serving.join(timeout)
@@ -158,19 +158,19 @@ class SharedMemoryServer:
         self._release()
         return True
 
-    # State, on the thread that sends it.
+    # State, on the thread that publishes it.
 
     def wants_state(self) -> bool:
-        """Whether the snapshot of this tick is to be published. Cheap; called by physics."""
+        """Whether to publish the snapshot of this tick. Cheap, because physics calls it."""
         if self._released:
             return False
         if self._bell.wanted(doorbell.STATE) or not self._bell.listeners:
             return True
         now = time.monotonic()
-        return self._at_work(now) or now - self._state_at >= STATE_PERIOD_S
+        return self._active(now) or now - self._state_at >= STATE_PERIOD_S
 
     def publish_state(self, snapshot: bytes) -> None:
-        """Publish a snapshot; the first of a play session decides on the size of the region."""
+        """Publish a snapshot; the first one of a play session determines the size of the region."""
         self._state_at = time.monotonic()
         try:
             with self._lock:
@@ -192,25 +192,25 @@ class SharedMemoryServer:
             if state is not None:
                 state.close()
 
-    # Cameras, on the thread that draws for streams.
+    # Cameras, on the thread that draws for the streams.
 
     def show_cameras(self, resolutions: dict[str, tuple[int, int]], header_bytes: int = 0) -> None:
-        """Lay out the regions of these cameras, by `ARTICULATION/CAMERA`, in place of all others.
+        """Replace all camera regions by those of these cameras.
 
         Args:
-            resolutions: Width and height of each.
-            header_bytes: What stands before the pixels.
+            resolutions: Width and height by `ARTICULATION/CAMERA`.
+            header_bytes: Size of the header in front of the pixels.
         """
         with self._lock:
             for region in self._cameras.values():
                 region.close()
             self._cameras = {}
-        self._pictures_at = time.monotonic()  # whoever begins play comes before readers that nobody knows of
+        self._pictures_at = time.monotonic()  # no unknown reader can be there before play begins
         for key, size in resolutions.items():
             self.switch_camera(key, size, header_bytes)
 
     def switch_camera(self, key: str, size: tuple[int, int] | None, header_bytes: int = 0) -> None:
-        """Lay out the region of one camera, or with no size take it away; without effect where that is done already."""
+        """Create the region of a camera, or remove it if `size` is None; no effect if that is already done."""
         with self._lock:
             if size is None:
                 region = self._cameras.pop(key, None)
@@ -227,15 +227,15 @@ class SharedMemoryServer:
                 logger.warning("camera '%s' is not in shared memory: %s", key, error)
 
     def wanted_cameras(self) -> list[str]:
-        """Return the cameras whose pictures are to be published now."""
+        """Return the cameras whose pictures to publish now."""
         now = time.monotonic()
         period = PICTURE_PERIOD_S if self._bell.listeners else BLIND_PICTURE_PERIOD_S
-        if self._bell.wanted(doorbell.CAMERA) or self._at_work(now) or now - self._pictures_at >= period:
+        if self._bell.wanted(doorbell.CAMERA) or self._active(now) or now - self._pictures_at >= period:
             return list(self._cameras)
         return []
 
     def publish_picture(self, key: str, pixels: bytes) -> None:
-        """Publish a picture of a camera that was wanted."""
+        """Publish a picture of one of the `wanted_cameras`."""
         self._pictures_at = time.monotonic()
         with self._lock:
             region = self._cameras.get(key)
@@ -248,9 +248,9 @@ class SharedMemoryServer:
                 return
         self._bell.ring(doorbell.CAMERA)
 
-    def _at_work(self, now: float) -> bool:
-        """Whether a client without a doorbell makes requests."""
-        return now - self._unrung_at < AT_WORK_S
+    def _active(self, now: float) -> bool:
+        """Whether a client without a doorbell has sent a request recently."""
+        return now - self._active_at < ACTIVE_S
 
     # The thread.
 
@@ -259,55 +259,55 @@ class SharedMemoryServer:
             if owed is not None:
                 self._reply(owed)
             while not self._stopping:
-                if self._requests.sequence() == self._seen and not (self._brisk and self._follows(self._seen)):
+                if self._requests.sequence() == self._seen and not (self._spinning and self._spin(self._seen)):
                     rung = self._bell.wait(self._pause())
-                    self._learn(rung=rung)
+                    self._note_wait(rung=rung)
                     if self._requests.sequence() == self._seen:
                         continue
                     self._unannounced = not rung
-                self._brisk = time.monotonic() - self._served_at < BRISK_S and not crowded()
+                self._spinning = time.monotonic() - self._served_at < SPIN_S and not crowded()
                 if not self._serve():
                     return
                 self._served_at = time.monotonic()
         except (OSError, ValueError):
             logger.exception("shared memory failed; the server answers over ZMQ alone")
             self._give_up()
-        except BaseException as error:  # noqa: BLE001 - clients over ZMQ hear of it by the next request
+        except BaseException as error:  # noqa: BLE001 - clients over ZMQ learn of it with their next request
             self._health.report(error)
             self._give_up()
         finally:
             with self._lock:
                 given_up = self._given_up
-            if given_up and self.serving.is_current:  # nobody waits for this thread any more
+            if given_up and self.serving.is_current:  # `join` has stopped waiting for this thread
                 self._release()
 
     def _give_up(self) -> None:
         self._stopping = True
-        self._release()  # so that clients see it, too
+        self._release()  # so that clients notice
 
-    def _follows(self, seen: int) -> bool:
-        """Look for a while without sleep; return whether a request came."""
-        while time.monotonic() - self._served_at < BRISK_S:
+    def _spin(self, seen: int) -> bool:
+        """Poll for a short time without sleeping; return whether a request arrived."""
+        while time.monotonic() - self._served_at < SPIN_S:
             if self._requests.sequence() != seen:
                 return True
-            time.sleep(0)  # others may have the interpreter
+            time.sleep(0)  # releases the interpreter lock
         return False
 
-    def _learn(self, *, rung: bool) -> None:
-        """Conclude from a wait whether the client at work has a doorbell: a ring may come after its request is seen."""
+    def _note_wait(self, *, rung: bool) -> None:
+        """Update whether a client without a doorbell is active: a ring may arrive after its request was seen."""
         if rung:
-            self._unrung_at = -AT_WORK_S
+            self._active_at = -ACTIVE_S
         elif self._unannounced:
-            self._unrung_at = time.monotonic()
+            self._active_at = time.monotonic()
         self._unannounced = False
 
     def _pause(self) -> float:
-        if self._unannounced or self._at_work(time.monotonic()):
-            return BUSY_POLL_S
-        return RUNG_POLL_S if self._bell.listeners else IDLE_POLL_S
+        if self._unannounced or self._active(time.monotonic()):
+            return ACTIVE_POLL_S
+        return DOORBELL_POLL_S if self._bell.listeners else IDLE_POLL_S
 
     def _serve(self) -> bool:
-        """Answer the request that is there; return False if another thread has done so and serves now."""
+        """Answer the pending request; return False if another thread has done so and serves now."""
         self._seen, request = self._requests.read()
         if request is None:
             logger.warning("a request in shared memory could not be read and stays unanswered")
@@ -340,102 +340,103 @@ class SharedMemoryServer:
 class _Bell:
     """The server's end of the doorbell; see `urlab_client.protocol.doorbell`.
 
-    Windows has no Unix sockets in Python. There the plugin's named events tell of requests and replies.
+    Python has no Unix sockets on Windows. There the plugin's named events signal requests and replies.
     """
 
     def __init__(self, directory: Path) -> None:
         self._asked = NamedEvent(f"Local\\URLab_{directory.name}_req_ready", create=True)
         self._answered = NamedEvent(f"Local\\URLab_{directory.name}_rep_ready", create=True)
-        self._wants: dict[socket.socket, set[bytes]] = {}
+        self._subscriptions: dict[socket.socket, set[bytes]] = {}
         self._lock = threading.Lock()
         self._selector = selectors.DefaultSelector()
-        self._door = self._listen(directory / doorbell.FILE)
-        self._door_shut_until = 0.0
-        self._woken, self._waker = socket.socketpair()
-        for end in (self._woken, self._waker):
+        self._listener = self._listen(directory / doorbell.FILE)
+        self._accept_after = 0.0
+        self._wake_reader, self._wake_writer = socket.socketpair()
+        for end in (self._wake_reader, self._wake_writer):
             end.setblocking(False)
-        self._selector.register(self._woken, selectors.EVENT_READ)
-        self._open_door()
+        self._selector.register(self._wake_reader, selectors.EVENT_READ)
+        self._start_accepting()
 
     @property
     def listeners(self) -> int:
-        """How many clients are connected."""
-        return len(self._wants)
+        """Number of connected clients."""
+        return len(self._subscriptions)
 
     def wanted(self, ring: bytes) -> bool:
-        """Whether a client asked to be told of these publications."""
-        return any(ring in wants for wants in tuple(self._wants.values()))
+        """Whether a client subscribed to these publications."""
+        return any(ring in wants for wants in tuple(self._subscriptions.values()))
 
     def ring(self, ring: bytes) -> None:
-        """Tell the clients, without waiting for any. From any thread."""
+        """Notify the clients without blocking. Thread-safe."""
         if ring == doorbell.REPLY:
             self._answered.set()
         with self._lock:
-            for client, wants in self._wants.items():
+            for client, wants in self._subscriptions.items():
                 if ring == doorbell.REPLY or ring in wants:
-                    with contextlib.suppress(OSError):  # it has rings waiting, or is gone
+                    with contextlib.suppress(OSError):  # its buffer is full, or it is gone
                         client.send(ring)
 
     def wake(self) -> None:
-        """End `wait`. From any thread."""
+        """End `wait`. Thread-safe."""
         self._asked.set()
         with contextlib.suppress(OSError):
-            self._waker.send(b"\0")
+            self._wake_writer.send(b"\0")
 
     def wait(self, seconds: float) -> bool:
-        """Wait until a client rings, or for so long; return whether one announced a request."""
+        """Wait until a client rings, or for some seconds; return whether one announced a request."""
         if self._asked.exists:
             return self._asked.wait(seconds)
-        if self._door_shut_until and time.monotonic() >= self._door_shut_until:
-            self._open_door()
+        if self._accept_after and time.monotonic() >= self._accept_after:
+            self._start_accepting()
         if seconds < _SELECTOR_STEP_S:
             time.sleep(seconds)
             seconds = 0.0
         ready = self._selector.select(seconds)
-        return sum(self._attend(cast("socket.socket", key.fileobj)) for key, _ in ready) > 0
+        return sum(self._read(cast("socket.socket", key.fileobj)) for key, _ in ready) > 0
 
     def close(self) -> None:
-        """Let everybody go and remove the socket."""
+        """Disconnect all clients and remove the socket."""
         self._asked.close()
         self._answered.close()
         with self._lock:
-            for client in self._wants:
+            for client in self._subscriptions:
                 client.close()
-            self._wants.clear()
-        if self._door is not None:
+            self._subscriptions.clear()
+        if self._listener is not None:
             with contextlib.suppress(OSError):
-                os.unlink(self._door.getsockname())
-            self._door.close()
+                os.unlink(self._listener.getsockname())
+            self._listener.close()
         self._selector.close()
-        self._woken.close()
-        self._waker.close()
+        self._wake_reader.close()
+        self._wake_writer.close()
 
-    def _open_door(self) -> None:
-        self._door_shut_until = 0.0
-        if self._door is not None:
-            self._selector.register(self._door, selectors.EVENT_READ)
+    def _start_accepting(self) -> None:
+        self._accept_after = 0.0
+        if self._listener is not None:
+            self._selector.register(self._listener, selectors.EVENT_READ)
 
     def _listen(self, path: Path) -> socket.socket | None:
         if not hasattr(socket, "AF_UNIX"):
             return None
         if len(os.fsencode(path)) > doorbell.MAX_PATH_BYTES:
-            logger.info("no doorbell: %s is too long a path for a socket; clients poll", path)
+            logger.info("no doorbell: the path %s is too long for a socket; clients poll", path)
             return None
-        door = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
-            door.bind(os.fspath(path))
+            listener.bind(os.fspath(path))
             path.chmod(0o600)
-            door.listen(MAX_LISTENERS)
-            door.setblocking(False)
+            listener.listen(MAX_LISTENERS)
+            listener.setblocking(False)
         except OSError as error:
-            door.close()
+            listener.close()
             logger.info("no doorbell: %s; clients poll", error)
             return None
-        return door
+        return listener
 
-    def _attend(self, source: socket.socket) -> bool:
-        if source is self._door:
-            self._admit(source)
+    def _read(self, source: socket.socket) -> bool:
+        """Handle a readable socket; return whether its client announced a request."""
+        if source is self._listener:
+            self._accept(source)
             return False
         try:
             data = source.recv(4096)
@@ -443,36 +444,36 @@ class _Bell:
             return False
         except OSError:
             data = b""
-        if source is self._woken:
+        if source is self._wake_reader:
             return False
         if not data:
             self._selector.unregister(source)
             with self._lock:
-                self._wants.pop(source, None)
+                self._subscriptions.pop(source, None)
                 source.close()
             return False
         if doorbell.WANT_STATE in data:
-            self._wants[source].add(doorbell.STATE)
+            self._subscriptions[source].add(doorbell.STATE)
         if doorbell.WANT_CAMERAS in data:
-            self._wants[source].add(doorbell.CAMERA)
+            self._subscriptions[source].add(doorbell.CAMERA)
         return doorbell.REQUEST in data
 
-    def _admit(self, door: socket.socket) -> None:
+    def _accept(self, listener: socket.socket) -> None:
         try:
-            client, _ = door.accept()
+            client, _ = listener.accept()
         except BlockingIOError:
             return
-        except OSError as error:  # no descriptor left: asking again at once would be a busy loop
+        except OSError as error:  # no descriptor left: retrying immediately would be a busy loop
             logger.warning("a client could not be accepted at the doorbell: %s", error)
-            self._selector.unregister(door)
-            self._door_shut_until = time.monotonic() + DOOR_SHUT_S
+            self._selector.unregister(listener)
+            self._accept_after = time.monotonic() + ACCEPT_RETRY_S
             return
-        if len(self._wants) >= MAX_LISTENERS:
+        if len(self._subscriptions) >= MAX_LISTENERS:
             client.close()
             return
         client.setblocking(False)
         self._selector.register(client, selectors.EVENT_READ)
         with self._lock:
-            self._wants[client] = set()
+            self._subscriptions[client] = set()
         with contextlib.suppress(OSError):
-            client.send(doorbell.REPLY)  # its first request may have been answered before it was let in
+            client.send(doorbell.REPLY)  # its first request may have been answered before it was accepted
