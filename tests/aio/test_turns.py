@@ -216,7 +216,7 @@ async def test_a_handshake_lost_with_its_connection_is_named(client: URLabClient
     await until(lambda: cut.applied)
     await until(lambda: not client.connected, look=0)
     await cancelled(discovering)
-    with pytest.raises(SessionTakenOver, match=r"A handshake of this client .* Call discover\(\)"):
+    with pytest.raises(SessionTakenOver, match=r"An abandoned handshake of this client .* Call discover\(\)"):
         await client.step()
     await client.discover()
     assert (await client.step(3)).step == 3

@@ -96,7 +96,7 @@ def test_a_target_out_of_reach_is_reported_with_the_nearest(ik: InverseKinematic
 @pytest.mark.parametrize(
     ("arguments", "options", "said"),
     [
-        (([0.4, math.nan, 0.4],), {}, "position takes finite numbers, got nan at 1"),
+        (([0.4, math.nan, 0.4],), {}, "position takes finite numbers, got nan at index 1"),
         (([0.4, 0.4],), {}, r"position takes 3 numbers, got an array of shape \(2,\)"),
         (([0.4, 0.0, 0.4], [0, 0, 0, 0]), {}, "quaternion is all zeros"),
         (([0.4, 0.0, 0.4], [math.inf, 0, 0, 0]), {}, "quaternion takes finite numbers"),
