@@ -35,8 +35,8 @@ from urlab_client.protocol.base import Floats
 __all__ = ["main"]
 
 HIDDEN = 32
-LEAST_SPREAD = 0.1  # rad or m: limits the influence of values that hardly vary in the demonstrations
-LEAST_MOVE = 1e-3  # rad or m
+MIN_SPREAD = 0.1  # rad or m: limits the influence of values that hardly vary in the demonstrations
+MIN_MOVE = 1e-3  # rad or m
 
 DECLARATION = """\
 # Inputs of the network in reach.onnx: the observations of urlab/Reach-v0, in the same order.
@@ -118,9 +118,9 @@ class Cloned:
     def __init__(self, observations: Floats, actions: Floats, driven: list[int], seen: list[int], seed: int) -> None:
         self.driven, self.seen, self.size = driven, seen, observations.shape[1]
         part = observations[:, seen]
-        self.mean, self.spread = part.mean(axis=0), np.maximum(part.std(axis=0), LEAST_SPREAD)
+        self.mean, self.spread = part.mean(axis=0), np.maximum(part.std(axis=0), MIN_SPREAD)
         moves = actions - observations[:, driven]
-        self.move_mean, self.move_spread = moves.mean(axis=0), np.maximum(moves.std(axis=0), LEAST_MOVE)
+        self.move_mean, self.move_spread = moves.mean(axis=0), np.maximum(moves.std(axis=0), MIN_MOVE)
         rng = np.random.default_rng(seed)
         sizes = [len(seen), HIDDEN, HIDDEN, actions.shape[1]]
         self.weights = [rng.normal(size=(a, b)) / np.sqrt(a) for a, b in itertools.pairwise(sizes)]

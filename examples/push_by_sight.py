@@ -200,7 +200,7 @@ def hand_of(joints: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 @dataclass
-class Shown:
+class Samples:
     """States and the script's action in each, as lists of arrays with one row per episode."""
 
     joints: list[np.ndarray] = field(default_factory=list)
@@ -222,7 +222,7 @@ class Shown:
         return {name: torch.tensor(v if name == "part" else np.float32(v)) for name, v in found.items()}
 
 
-def practise(envs: Any, script: Script, shown: Shown, *, seed: int, driver: Sight | None, rng: Any) -> float:
+def collect(envs: Any, script: Script, samples: Samples, *, seed: int, driver: Sight | None, rng: Any) -> float:
     """Run an episode in each environment and store the script's action for each state; return the success rate.
 
     The `driver` acts, given the block's position with a small error; without a driver, the script acts with added
@@ -237,7 +237,7 @@ def practise(envs: Any, script: Script, shown: Shown, *, seed: int, driver: Sigh
         pictures = {}
         if "cameras" in seen:
             pictures["part"] = seen["cameras"][CAMERA][:, ROWS, COLUMNS]
-        shown.add(joints=joints, target=target, block=block, lead=wanted[:, :6] - joints, **pictures)
+        samples.add(joints=joints, target=target, block=block, lead=wanted[:, :6] - joints, **pictures)
         wander = 0.8 * wander + rng.normal(scale=0.012, size=wander.shape)
         driven = wanted[:, :6] + wander
         if driver is not None:
@@ -401,15 +401,15 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     script = Script(batch.model)
     figures: dict[str, Any] = {"rounds": []}
     seeing, blind = Sight(blind=False), Sight(blind=True)
-    shown, began = Shown(), time.perf_counter()
+    samples, began = Samples(), time.perf_counter()
     for number in range(options.rounds):
         seed = FIRST_SEED * options.seed + 1000 * number
-        rate = practise(batch, script, shown, seed=seed, driver=seeing if number else None, rng=rng)
-        error = learn_to_act(seeing, shown.tensors(), updates=options.updates)
+        rate = collect(batch, script, samples, seed=seed, driver=seeing if number else None, rng=rng)
+        error = learn_to_act(seeing, samples.tensors(), updates=options.updates)
         figures["rounds"].append({"success_rate": round(rate, 3), "error_rad": round(error, 5)})
         print(figures["rounds"][-1], flush=True)
-    learn_to_act(seeing, shown.tensors(), updates=4 * options.updates)
-    learn_to_act(blind, shown.tensors(), updates=2 * options.updates)
+    learn_to_act(seeing, samples.tensors(), updates=4 * options.updates)
+    learn_to_act(blind, samples.tensors(), updates=2 * options.updates)
     figures["practising_s"] = round(time.perf_counter() - began)
 
     began = time.perf_counter()
@@ -420,15 +420,15 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
         autoreset_mode=disabled,
         step_timeout=60.0,  # with software rendering the first picture is slow
     )
-    looked = Shown()
+    picture_samples = Samples()
     for first in range(0, options.looks, options.servers):
         seed = FIRST_SEED * options.seed + 500_000 + first
         driver = None if first < options.looks // 3 else seeing
-        practise(envs, script, looked, seed=seed, driver=driver, rng=rng)
-    figures["pictures"] = len(looked.part) * options.servers
+        collect(envs, script, picture_samples, seed=seed, driver=driver, rng=rng)
+    figures["pictures"] = len(picture_samples.part) * options.servers
     figures["drawing_s"] = round(time.perf_counter() - began)
     began = time.perf_counter()
-    figures["error_of_sight_m"] = round(learn_to_look(seeing, looked.tensors(), updates=options.updates), 5)
+    figures["error_of_sight_m"] = round(learn_to_look(seeing, picture_samples.tensors(), updates=options.updates), 5)
     figures["learning_to_look_s"] = round(time.perf_counter() - began)
     for name, network in {"push": seeing, "blind": blind}.items():
         save(network, options.output / f"{name}.onnx")

@@ -351,7 +351,7 @@ def _actuator(robot: PolicyRobot, joint: Joint, source: str) -> Actuator:
     if len(found) != 1 or found[0].ctrl_local.stop - found[0].ctrl_local.start != 1:
         raise PolicyMismatch(
             f"{source}: action.joints: {len(found)} actuators of {robot.prefix!r} drive {joint.name!r}; "
-            "it takes one, with one input."
+            "it needs exactly one, with one input."
         )
     return found[0]
 

@@ -243,7 +243,7 @@ class _Session:
 
     def _view(self, time: float) -> TeleopView:
         position, quaternion = self._hand.ik.pose()
-        goal, success = self._start.look()
+        goal, success = self._start.goal_and_success()
         return TeleopView(
             episode=self._episode,
             time=time,
@@ -259,7 +259,7 @@ class _Session:
         self._episode += 1
         self._tally = self._tally.replace(**{verdict: getattr(self._tally, verdict) + 1})
         if self._recorder is not None:
-            await self._recorder.mark(verdict, goal=self._start.look()[0])
+            await self._recorder.mark(verdict, goal=self._start.goal_and_success()[0])
 
 
 class _Start:
@@ -276,7 +276,7 @@ class _Start:
             articulation.ctrl_array[:] = 0.0
         await self._client.reset()
 
-    def look(self) -> tuple[Mapping[str, Floats], bool | None]:
+    def goal_and_success(self) -> tuple[Mapping[str, Floats], bool | None]:
         """Return the goal of the episode, and whether the current state is a success."""
         return {}, None
 
@@ -307,7 +307,7 @@ class _TaskStart(_Start):
         seed = None if self._episode.randomise is None else int(rng.integers(2**31))
         await self._episode.reset(rng, seed=seed)
 
-    def look(self) -> tuple[Mapping[str, Floats], bool | None]:
+    def goal_and_success(self) -> tuple[Mapping[str, Floats], bool | None]:
         states = self._episode.states()
         found = self._task.success(states)
         return {name: values[0] for name, values in states.goal.items()}, None if found is None else bool(found[0])
