@@ -360,9 +360,9 @@ BOT = ("per_articulation", "bot")
     ("place", "value", "problem"),
     [
         (("time",), float("nan"), "the simulation time is nan"),
-        ((*BOT, "qpos"), [0.0] * 7, "qpos of articulation 'bot' has 7 values, its model has 8"),
-        ((*BOT, "actuator_force"), [0.0] * 3, "actuator_force of articulation 'bot' has 3 values, its model has 2"),
-        ((*BOT, "sensors"), {"tip": [0.0]}, "sensor 'tip' of articulation 'bot' has 1 values, its model has 3"),
+        ((*BOT, "qpos"), [0.0] * 7, "qpos of articulation 'bot' has 7 values, but its model has 8"),
+        ((*BOT, "actuator_force"), [0.0] * 3, "actuator_force of articulation 'bot' has 3 values, but its model has 2"),
+        ((*BOT, "sensors"), {"tip": [0.0]}, "sensor 'tip' of articulation 'bot' has 1 values, but its model has 3"),
         (("entities", "crate", "qvel"), [0.0] * 7, "qvel of entity 'crate' has 7 values, not 6"),
         (("perturbation", "body_id"), 1e9, "a perturbation of body 1000000000"),
         (("perturbation", "xfrc"), [float("nan")] * 6, "a perturbation of body 1 by"),
@@ -574,7 +574,7 @@ def test_positions_that_nobody_can_have_written(direct: Session, count: int) -> 
     ask = direct.client.runtime.set_qpos
     error = direct.ask("set_qpos", {**written, "qpos": [1.0] * count}, lambda: ask("bot", [1.0] * 8, by_name=True))
     assert isinstance(error, ProtocolError)
-    assert f"qpos of articulation 'bot' has {count} values, its model has 8" in str(error)
+    assert f"qpos of articulation 'bot' has {count} values, but its model has 8" in str(error)
     assert same(before, look(direct.client))
 
 

@@ -416,7 +416,7 @@ async def test_a_vector_of_the_wrong_length_spoils_the_whole_reply(plugin: Any, 
         broken["per_articulation"]["robot"]["qpos"][0] = 99.0
         broken["per_articulation"]["arm_C_0"]["qvel"].append(1.0)
         scripted.on("step", broken)
-        with pytest.raises(ProtocolError, match=r"qvel of articulation 'arm_C_0' has 9 values, its model has 8"):
+        with pytest.raises(ProtocolError, match=r"qvel of articulation 'arm_C_0' has 9 values, but its model has 8"):
             await client.step()
         assert client.articulations["robot"].qpos_array[0] == 0.0
 

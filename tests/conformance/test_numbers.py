@@ -53,7 +53,7 @@ async def client(connect: Any, server: SimulatedServer) -> Any:
         (NAN, ValueError, "actuator 'swing' of 'bot' takes a finite number, got nan"),
         (-INF, ValueError, "takes a finite number, got -inf"),
         (np.float32("nan"), ValueError, "takes a finite number, got nan"),
-        ([NAN], ValueError, "takes finite numbers, got nan at 0"),
+        ([NAN], ValueError, "takes finite numbers, got nan at index 0"),
         (None, TypeError, "actuator 'swing' of 'bot' takes a number, got None"),
         ("fast", TypeError, "takes numbers, got"),
         ([None], TypeError, r"takes numbers, got \[None\]"),
