@@ -117,7 +117,7 @@ def urlab_aio_client(request: pytest.FixtureRequest) -> AsyncURLabClient:
         runner = "anyio"
     else:
         pytest.fail(
-            "urlab_aio_client needs a plugin that runs async tests: install pytest-asyncio, or mark the test with anyio",
+            "urlab_aio_client needs a plugin for async tests: install pytest-asyncio, or mark the test with anyio",
             pytrace=False,
         )
     return request.getfixturevalue(f"_urlab_aio_client_{runner}")
