@@ -208,7 +208,7 @@ class InverseKinematics:
             f"{self._kind} {self.frame!r} of {self._robot.name!r} does not reach {_listed(aim)} m: the nearest found "
             f"is {best.position_error:.3f} m away{angle}, after {starts} starts.",
             best,
-            hint="Choose a target within reach, or pass nearest=True to go as near as possible.",
+            hint="Choose a target within reach, or pass nearest=True for the nearest solution.",
         )
 
     def _present(self) -> Floats:
@@ -300,7 +300,7 @@ def _robot(client: URLabClient | AsyncClient, key: str | None) -> URLabArticulat
     if len(robots) != 1:
         raise URLabError(
             f"Name the articulation: the scene has {', '.join(robots) or 'none'}.",
-            hint="InverseKinematics(client, KEY).",
+            hint="Call InverseKinematics(client, KEY).",
         )
     return next(iter(robots.values()))
 
