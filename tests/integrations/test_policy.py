@@ -348,7 +348,7 @@ def test_a_goal_and_the_way_to_it_are_observed_and_what_is_left_is_told(arm: URL
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("high = [1.0, 1.0, 1.0]", "high = [1.0, 1.0]", "default, low and high need the same number of numbers"),
+        ("high = [1.0, 1.0, 1.0]", "high = [1.0, 1.0]", "default, low and high must have the same length"),
         ("high = [1.0, 1.0, 1.0]", "high = [0.2, 1.0, 1.0]", "default .* is not between low and high"),
         (GOAL.partition("[goal]")[2], "\n[action]", "missing required field `default`"),
         ('relative_to = "grip_position"', 'relative_to = "grip_orientation"', "has 4 numbers, the goal 3"),

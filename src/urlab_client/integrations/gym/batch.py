@@ -125,7 +125,8 @@ class URLabBatchEnv(Vectorized):
             RenderingUnavailable: Cameras are observed, and this machine cannot draw.
             MissingExtra: `engine` needs an extra that is not installed.
             KeyError: A camera is unknown.
-            ValueError: An option is out of range, the model varies with `warp`, or the scene has no camera to render.
+            ValueError: An option is out of range, `warp` is combined with a varying model, or the scene has no camera
+                to render.
         """
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, not {num_envs}")

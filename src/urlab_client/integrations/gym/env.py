@@ -46,9 +46,9 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
     for example `env.unwrapped.articulations`.
 
     A reset returns the simulation to its initial state, or to the keyframe named by `options={"keyframe": NAME}`, and
-    clears the set-points. `reset_noise` then adds uniform noise to the joint positions, within the joint ranges. Only
-    this noise depends on the seed. Physics is deterministic: the same seed and actions give the same observations,
-    bit for bit, on the same build of MuJoCo.
+    clears the set-points. `reset_noise` then adds uniform noise to the joint positions, within the joint ranges. The
+    seed determines only this noise and what the task and `randomise` draw. Physics is deterministic: the same seed and
+    actions give the same observations, bit for bit, on the same build of MuJoCo.
 
     With `render_mode="rgb_array"`, `render` returns the frame of `render_camera`. Each step draws this frame, which
     takes time. Images never affect the physics.
@@ -204,7 +204,7 @@ class URLabEnv(gymnasium.Env[Observation, Any]):
         """Start an episode.
 
         Args:
-            seed: Seed of the noise. None continues with the current generator.
+            seed: Seed of everything that the episodes draw. None continues with the current generator.
             options: `keyframe`: name of the keyframe to start from.
 
         Raises:

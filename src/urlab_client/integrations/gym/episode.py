@@ -112,7 +112,7 @@ class EnvEpisode:
         if client.step_mode not in (StepMode.DIRECT, StepMode.PUPPET):
             raise URLabError(
                 f"An environment steps physics itself, but the step mode is {client.step_mode}.",
-                hint="Create the client with step_mode='direct'.",
+                hint="Make the client with step_mode='direct'.",
             )
         self.client = client
         self.frames: dict[str, Pixels] = {}

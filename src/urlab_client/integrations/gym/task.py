@@ -1,4 +1,4 @@
-"""`Task`: what robots are to do, written once for single environments, servers and batches."""
+"""`Task`: starts, goals, rewards and ends of episodes, defined once for all kinds of environments."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ class _Session:
     async def step(self, set_points: Mapping[str, Floats], forces: Mapping[str, Floats]) -> Observation:
         """Apply set-points and forces for one action."""
         if self.episode is None:
-            raise URLabError("The environment failed before.", hint="Reset it to start it again.")
+            raise URLabError("The environment failed earlier.", hint="Reset it to start it again.")
         return await self.episode.act(set_points, forces)
 
     def reopen(self) -> asyncio.Task[None]:

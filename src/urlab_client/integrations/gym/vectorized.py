@@ -126,7 +126,7 @@ class Vectorized(VectorEnv[Observation, Any, Any], ABC):
         options = dict(options or {})
         mask = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, dtype=bool)))
         if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
-            raise ValueError(f"reset_mask needs {self.num_envs} booleans, one of them true")
+            raise ValueError(f"reset_mask needs {self.num_envs} booleans, at least one of them true")
         self._keyframe = keyframe_option(options)
         seeds = (
             [None if seed is None else seed + i for i in range(self.num_envs)] if not isinstance(seed, list) else seed

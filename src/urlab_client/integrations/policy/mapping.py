@@ -102,7 +102,7 @@ class PolicyMapping:
         if not robot.joints:
             raise PolicyMismatch(
                 f"{source}: the joints of {self._robot!r} are not known.",
-                hint="Create the client with local_model=True and call discover() during play.",
+                hint="Make the client with local_model=True and call discover() during play.",
             )
         self.joints: list[Joint] = self._joints(robot, spec.action.joints, "action.joints")
         self.actuators: list[Actuator] = [_actuator(robot, joint, source) for joint in self.joints]
@@ -351,7 +351,7 @@ def _actuator(robot: PolicyRobot, joint: Joint, source: str) -> Actuator:
     if len(found) != 1 or found[0].ctrl_local.stop - found[0].ctrl_local.start != 1:
         raise PolicyMismatch(
             f"{source}: action.joints: {len(found)} actuators of {robot.prefix!r} drive {joint.name!r}; "
-            "it takes one, with one input."
+            "it needs exactly one, with one input."
         )
     return found[0]
 

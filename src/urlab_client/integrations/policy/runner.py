@@ -106,7 +106,7 @@ def require(client: AsyncClient, policy: Policy, articulation: str | None = None
         wanted = " or ".join(map(repr, map(str, spec.step_modes)))
         raise PolicyMismatch(
             f"{source}: the session steps in {str(client.step_mode)!r} mode; step_modes requires {wanted}.",
-            hint=f"Create the client with step_mode={str(spec.step_modes[0])!r}. If the server pins its mode, change "
+            hint=f"Make the client with step_mode={str(spec.step_modes[0])!r}. If the server pins its mode, change "
             "the mode there.",
         )
     timestep = float(client.model.opt.timestep)

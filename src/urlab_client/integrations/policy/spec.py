@@ -132,7 +132,7 @@ class Goal(Struct, kw_only=True, forbid_unknown_fields=True, frozen=True):
 
     def __post_init__(self) -> None:
         if not len(self.default) == len(self.low) == len(self.high):
-            raise ValueError("default, low and high need the same number of numbers")
+            raise ValueError("default, low and high must have the same length")
         if not all(low <= value <= high for low, value, high in zip(self.low, self.default, self.high, strict=True)):
             raise ValueError(f"default {self.default} is not between low and high")
 
