@@ -428,7 +428,7 @@ async def test_keyframes_by_their_short_name(plugin: Any, connect: Any) -> None:
         assert plugin.requests[-1]["keyframe_name"] == "robot_2_squat"
         with pytest.raises(UnknownKeyframe, match="could mean robot_home, arm_C_0_home"):
             await client.reset(keyframe_name="home")
-        with pytest.raises(UnknownKeyframe, match="only: robot_home, arm_C_0_home, robot_2_squat"):
+        with pytest.raises(UnknownKeyframe, match="the keyframes are: robot_home, arm_C_0_home, robot_2_squat"):
             await client.reset(keyframe_name="sleep")
 
 

@@ -263,7 +263,7 @@ async def test_a_cancelled_start_is_told(faults: Faults, served: tuple[Simulated
         await client.sim.stop()
         await cancelled(await sent(client, "begin_pie", client.sim.start(), faults))
         for call in (client.step(3), client.reset(), client.runtime.forward()):
-            with pytest.raises(NoSession, match=r"sim.start\(\) was broken off.*resync\(\)"):
+            with pytest.raises(NoSession, match=r"sim.start\(\) was interrupted.*resync\(\)"):
                 await call
         await client.sim.start()
         assert (await client.step(3)).step == client.step_count == 3
